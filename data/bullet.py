@@ -1,0 +1,370 @@
+"""Sample and simulate scenes with Bullet, in the manner of CLEVRER's collision scenes.
+
+A scene is a pure function of (seed, index, GENERATOR_VERSION) and the benchmark's object and
+collision limits. `pybullet` is imported where the world is made, so that reading a built benchmark
+needs no simulator.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import pairwise, product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from conf.schema import BenchmarkConfig
+from data.geometry import BOUNDING_RADIUS, CUBE_HALF, RADIUS, Camera, visibility
+from data.records import COLORS, FPS, FRAMES, MATERIALS, SHAPES, Collision, Scene, SceneObject
+
+if TYPE_CHECKING:
+    from pybullet_utils.bullet_client import BulletClient
+
+GENERATOR_VERSION = "1"
+"""Changes whenever the same seed and index would give another scene."""
+
+SUBSTEPS = 7
+"""Physics steps a frame: 175 Hz, as in CLEVRER's raw records."""
+SOLVER_ITERATIONS = 20
+GRAVITY = 9.81
+GROUND_FRICTION, OBJECT_FRICTION = 0.1, 0.3
+RESTITUTION = {"rubber": 0.5, "metal": 0.7}
+FRICTION_DECELERATION = GROUND_FRICTION * OBJECT_FRICTION * GRAVITY
+
+AT_REST = 0.35
+"""Share of the added objects that start at rest."""
+SPEED = (1.0, 3.0)
+"""Speeds at the start, simulator units a second."""
+CONTACT_FREE_FRAMES = 5
+"""A pair's contact is a new event only after more frames than this without one."""
+COLLISIONS = {2: 0.63, 3: 0.33, 4: 0.04}
+"""How often a scene aims at how many collisions, as a sample of CLEVRER's release has them."""
+PLACEMENTS = 40
+"""Tries to place one object before the scene is begun again."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """An object and how it starts: ground position, yaw in radians, ground velocity."""
+
+    look: SceneObject
+    position: tuple[float, float]
+    yaw: float
+    velocity: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What Bullet did with some bodies: arrays (F, N, ...) as in `Scene`, and first contacts."""
+
+    positions: np.ndarray
+    quaternions: np.ndarray
+    velocities: np.ndarray
+    angular_velocities: np.ndarray
+    collisions: tuple[Collision, ...]
+    touching_at_start: bool
+    repeated_pair: bool
+
+
+def connect() -> BulletClient:
+    """A Bullet client without a window, its greetings on standard output swallowed."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+    try:
+        import pybullet
+        from pybullet_utils.bullet_client import BulletClient
+
+        return BulletClient(pybullet.DIRECT)
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+class World:
+    """A Bullet world without a window, used for one simulation after another."""
+
+    def __init__(self) -> None:
+        self._bullet = connect()
+
+    def simulate(self, bodies: list[Body], frames: int = FRAMES) -> Motion:
+        """Run `bodies` for `frames` frames. The same bodies give the same bits every time."""
+        handles = self._place(bodies)
+        recorded = np.zeros((frames, len(bodies), 13))
+        contacts: dict[tuple[int, int], list[int]] = {}
+        recorded[0] = self._state(handles)
+        touching_at_start = self._overlapping(handles)
+        for frame in range(1, frames):
+            near = _near_pairs(recorded[frame - 1, :, :3])
+            for _ in range(SUBSTEPS):
+                self._bullet.stepSimulation()
+                for i, j in near:
+                    points = self._bullet.getContactPoints(handles[i], handles[j])
+                    # Bullet keeps points of pairs that no longer press on each other; only a
+                    # force is a contact.
+                    if any(point[9] > 0 for point in points):
+                        frames_of_pair = contacts.setdefault((i, j), [])
+                        if not frames_of_pair or frames_of_pair[-1] != frame:
+                            frames_of_pair.append(frame)
+            recorded[frame] = self._state(handles)
+        collisions, repeated = _debounce(contacts)
+        return Motion(
+            positions=recorded[..., 0:3],
+            quaternions=recorded[..., 3:7],
+            velocities=recorded[..., 7:10],
+            angular_velocities=recorded[..., 10:13],
+            collisions=collisions,
+            touching_at_start=touching_at_start,
+            repeated_pair=repeated,
+        )
+
+    def _place(self, bodies: list[Body]) -> list[int]:
+        bullet = self._bullet
+        bullet.resetSimulation()
+        bullet.setGravity(0, 0, -GRAVITY)
+        # A residual threshold of 0 keeps the number of iterations from depending on objects that
+        # an object never meets: without it, removing one object moves all the others.
+        bullet.setPhysicsEngineParameter(
+            fixedTimeStep=1 / (FPS * SUBSTEPS),
+            numSolverIterations=SOLVER_ITERATIONS,
+            solverResidualThreshold=0,
+            deterministicOverlappingPairs=1,
+        )
+        ground = bullet.createMultiBody(0, bullet.createCollisionShape(bullet.GEOM_PLANE))
+        bullet.changeDynamics(ground, -1, lateralFriction=GROUND_FRICTION, restitution=0)
+        return [self._add(body) for body in bodies]
+
+    def _add(self, body: Body) -> int:
+        bullet = self._bullet
+        shape, height = body.look.shape, CUBE_HALF if body.look.shape == "cube" else RADIUS
+        if shape == "sphere":
+            form = bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=RADIUS)
+        elif shape == "cube":
+            form = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=[CUBE_HALF] * 3)
+        else:
+            form = bullet.createCollisionShape(
+                bullet.GEOM_CYLINDER, radius=RADIUS, height=2 * RADIUS
+            )
+        turn = bullet.getQuaternionFromEuler([0, 0, body.yaw])
+        handle = bullet.createMultiBody(1.0, form, -1, [*body.position, height], turn)
+        bullet.changeDynamics(
+            handle,
+            -1,
+            lateralFriction=OBJECT_FRICTION,
+            rollingFriction=0,
+            spinningFriction=0,
+            restitution=RESTITUTION[body.look.material],
+            linearDamping=0,
+            angularDamping=0,
+        )
+        bullet.resetBaseVelocity(handle, [*body.velocity, 0.0], [0, 0, 0])
+        return handle
+
+    def _state(self, handles: list[int]) -> np.ndarray:
+        bullet = self._bullet
+        rows = []
+        for handle in handles:
+            position, turn = bullet.getBasePositionAndOrientation(handle)
+            linear, angular = bullet.getBaseVelocity(handle)
+            rows.append([*position, *turn, *linear, *angular])
+        return np.array(rows)
+
+    def _overlapping(self, handles: list[int]) -> bool:
+        return any(
+            self._bullet.getClosestPoints(a, b, 0.02)
+            for k, a in enumerate(handles)
+            for b in handles[k + 1 :]
+        )
+
+
+@cache
+def world() -> World:
+    """This process's world."""
+    return World()
+
+
+def _near_pairs(positions: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs that could touch within the next frame. No object moves faster than 6 units a second,
+    so a pair further apart than its outlines plus half a unit cannot, and is not polled."""
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+    reach = 2 * max(BOUNDING_RADIUS.values()) + 0.5
+    return [(int(i), int(j)) for i, j in np.argwhere(np.triu(apart < reach, 1))]
+
+
+def _debounce(contacts: dict[tuple[int, int], list[int]]) -> tuple[tuple[Collision, ...], bool]:
+    events, repeated = [], False
+    for pair, frames in contacts.items():
+        events.append(Collision(frames[0], pair))
+        repeated |= any(
+            later - earlier > CONTACT_FREE_FRAMES + 1 for earlier, later in pairwise(frames)
+        )
+    return tuple(sorted(events, key=lambda c: (c.frame, c.objects))), repeated
+
+
+def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> list[Body]:
+    """The bodies of scene `index`: one that moves, then one after the other placed or aimed so
+    that it meets an earlier one, until the scene has its collisions; the rest stand by.
+
+    Scenes whose pairs touch at the start or meet again are thrown away and begun anew.
+    """
+    rng = np.random.default_rng([seed, index])
+    every_look = [SceneObject(*look) for look in product(SHAPES, MATERIALS, COLORS)]
+    while True:
+        count = int(rng.integers(limits.min_objects, limits.max_objects + 1))
+        looks = [every_look[k] for k in rng.choice(len(every_look), count, replace=False)]
+        goal = int(rng.choice(list(COLLISIONS), p=list(COLLISIONS.values())))
+        most = limits.max_collisions
+        bodies = [_entering(looks[0], rng)]
+        motion = world().simulate(bodies)
+        for look in looks[1:]:
+            grown = _add_body(bodies, motion, look, rng, min(goal, most), most)
+            if grown is None:
+                break
+            bodies, motion = grown
+        if len(bodies) == count and motion.collisions:
+            return bodies
+
+
+def _entering(look: SceneObject, rng: np.random.Generator) -> Body:
+    """A body that comes in from outside the view, towards its middle."""
+    bearing = rng.uniform(0, 2 * np.pi)
+    start = np.array([-0.7, 0.0]) + rng.uniform(2.6, 4.0) * _unit(bearing)
+    goal = np.array([-0.7, 0.0]) + rng.uniform(-1, 1, 2)
+    direction = (goal - start) / np.linalg.norm(goal - start)
+    return _moving(look, start, direction, rng.uniform(*SPEED), rng)
+
+
+def _add_body(
+    bodies: list[Body],
+    motion: Motion,
+    look: SceneObject,
+    rng: np.random.Generator,
+    goal: int,
+    most: int,
+) -> tuple[list[Body], Motion] | None:
+    """`bodies` with one more, and their motion: one that meets another while there are fewer than
+    `goal` collisions, then one that meets none. None where no place was found."""
+    wanted = len(motion.collisions) < goal
+    for _ in range(PLACEMENTS):
+        body = _meeting(look, motion, rng) if wanted else _standing_by(look, motion, rng)
+        if body is None:
+            continue
+        trial = [*bodies, body]
+        result = world().simulate(trial)
+        met = any(len(bodies) in c.objects for c in result.collisions)
+        if (
+            not result.touching_at_start
+            and not result.repeated_pair
+            and len(result.collisions) <= most
+            and met == wanted
+        ):
+            return trial, result
+    return None
+
+
+def _meeting(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
+    """A body that should meet one of the others at a moment in view: at rest in its way, or aimed
+    at where it will be."""
+    other = int(rng.integers(motion.positions.shape[1]))
+    frame = int(rng.integers(15, 111))
+    place = motion.positions[frame, other, :2] + rng.normal(0, 0.1, 2)
+    if not _on_screen(place):
+        return None
+    if rng.random() < AT_REST:
+        if np.linalg.norm(motion.velocities[frame, other]) < 0.3:
+            return None
+        return Body(look, _pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
+    seconds = frame / FPS
+    speed = rng.uniform(*SPEED)
+    if speed - FRICTION_DECELERATION * seconds < 0.3:
+        return None
+    travel = speed * seconds - FRICTION_DECELERATION * seconds**2 / 2
+    direction = _unit(rng.uniform(0, 2 * np.pi))
+    return _moving(look, place - travel * direction, direction, speed, rng)
+
+
+def _standing_by(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
+    """A body at rest on screen, clear of every path."""
+    place = np.array([rng.uniform(-3.5, 1.2), rng.uniform(-2.2, 2.2)])
+    clear = np.linalg.norm(motion.positions[..., :2] - place, axis=-1).min() > 0.7
+    if not (clear and _on_screen(place)):
+        return None
+    return Body(look, _pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
+
+
+def _moving(
+    look: SceneObject,
+    start: np.ndarray,
+    direction: np.ndarray,
+    speed: float,
+    rng: np.random.Generator,
+) -> Body:
+    return Body(look, _pair(start), rng.uniform(0, 2 * np.pi), _pair(speed * direction))
+
+
+def _on_screen(place: np.ndarray) -> bool:
+    camera = Camera()
+    pixel, depth = camera.project(np.array([*place, RADIUS]))
+    margin = 20
+    return bool(
+        depth > 1
+        and margin < pixel[0] < camera.width - margin
+        and margin < pixel[1] < camera.height - margin
+    )
+
+
+def _unit(angle: float) -> np.ndarray:
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def _pair(values: np.ndarray) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def scene_id(seed: int, index: int) -> str:
+    return f"s{seed}-{index:06d}"
+
+
+def simulate_scene(seed: int, index: int, split: str, limits: BenchmarkConfig) -> Scene:
+    """Scene `index` of `seed` with its whole oracle."""
+    bodies = sample_bodies(seed, index, limits)
+    return record(scene_id(seed, index), split, bodies)
+
+
+def without(seed: int, index: int, split: str, limits: BenchmarkConfig, removed: int) -> Scene:
+    """The counterfactual of a scene: run again with object `removed` absent. What that object
+    never touched, directly or through others, moves bit for bit as before."""
+    bodies = sample_bodies(seed, index, limits)
+    name = f"{scene_id(seed, index)}-without-{removed}"
+    return record(name, split, bodies[:removed] + bodies[removed + 1 :])
+
+
+def record(name: str, split: str, bodies: list[Body]) -> Scene:
+    """Simulate bodies and observe them with the camera: a scene."""
+    motion = world().simulate(bodies)
+    objects = tuple(body.look for body in bodies)
+    camera = Camera()
+    in_view, fraction = visibility(objects, motion.positions, motion.quaternions, camera)
+    image_positions, _ = camera.project(motion.positions)
+    scene = Scene(
+        scene_id=name,
+        split=split,
+        objects=objects,
+        collisions=motion.collisions,
+        positions=motion.positions,
+        quaternions=motion.quaternions,
+        velocities=motion.velocities,
+        angular_velocities=motion.angular_velocities,
+        image_positions=image_positions,
+        in_view=in_view,
+        visible_fraction=fraction,
+        image_size=(camera.width, camera.height),
+    )
+    return replace(scene, **{k: getattr(scene, k).astype(np.float32) for k in _FLOATS})
+
+
+_FLOATS = tuple(name for name in Scene.ARRAYS if name != "in_view")

@@ -1,0 +1,42 @@
+"""The time family: which frame shows the scene one or two seconds after the observation ends."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data.records import SELECTION_SECOND, Scene
+from data.selection.drafts import Draft, pick_apart, same_scene
+
+CELLS = {"1s": 1, "2s": 2}
+"""Seconds from the observation's end to the target, by subtype."""
+
+
+def question(seconds: int) -> str:
+    spelled = "1 second" if seconds == 1 else f"{seconds} seconds"
+    return (
+        "Watch the 1-second observation video. Which image best shows what the scene will look "
+        f"like {spelled} after the observation ends?"
+    )
+
+
+def draft(subtype: str, scene: Scene, rng: np.random.Generator, least: float) -> Draft | None:
+    """An item whose prefix is the scene's first second; distractors are later moments of the same
+    scene."""
+    seconds = CELLS[subtype]
+    start, stop = 0, SELECTION_SECOND - 1
+    target = start + SELECTION_SECOND + SELECTION_SECOND * seconds
+    picked = pick_apart(scene, target, rng.permutation(np.arange(stop + 1, scene.frames)), least)
+    if picked is None:
+        return None
+    frames, apart = picked
+    return Draft(
+        scene,
+        "time",
+        subtype,
+        question(seconds),
+        (start, stop),
+        target,
+        same_scene(scene, frames, "same_time"),
+        apart,
+        {"distractors": "same_time", "horizon": target - stop},
+    )

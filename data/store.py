@@ -1,0 +1,187 @@
+"""A benchmark on disk.
+
+    store/<name>/
+        manifest.json        what it is: config, versions, counts, a SHA-256 for every file below
+        scenes/<id>.npz      one scene's oracle
+        frames/<id>.zip      that scene's rendered frames, one PNG each, named by frame index
+        selection.parquet retrieval.parquet database.parquet
+        rationales.jsonl     appended by the teacher, not part of the manifest
+
+A store is written in a folder beside it and renamed when it is whole, every part atomically, so
+that a killed build goes on with the parts it has.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from conf.errors import UserError
+from data.bullet import GENERATOR_VERSION
+from data.records import (
+    Collision,
+    FrameRef,
+    RetrievalQuery,
+    Scene,
+    SceneObject,
+    SelectionItem,
+)
+from data.render import RENDERER_VERSION
+
+MANIFEST = "manifest.json"
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with open(partial, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except OSError:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def save_scene(scene: Scene, path: Path) -> None:
+    header = {
+        "scene_id": scene.scene_id,
+        "split": scene.split,
+        "objects": [vars(o) for o in scene.objects],
+        "collisions": [{"frame": c.frame, "objects": c.objects} for c in scene.collisions],
+        "image_size": scene.image_size,
+    }
+    arrays = {name: getattr(scene, name) for name in Scene.ARRAYS}
+    buffer = io.BytesIO()
+    np.savez(buffer, header=np.array(json.dumps(header)), **arrays)
+    write_atomically(path, buffer.getvalue())
+
+
+def load_scene(path: Path) -> Scene:
+    with np.load(path) as file:
+        header = json.loads(str(file["header"]))
+        return Scene(
+            scene_id=header["scene_id"],
+            split=header["split"],
+            objects=tuple(SceneObject(**o) for o in header["objects"]),
+            collisions=tuple(
+                Collision(c["frame"], tuple(c["objects"])) for c in header["collisions"]
+            ),
+            image_size=tuple(header["image_size"]),
+            **{name: file[name] for name in Scene.ARRAYS},
+        )
+
+
+def save_rows(rows: list[dict[str, Any]], path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    sink = io.BytesIO()
+    pq.write_table(pa.Table.from_pylist(rows), sink, compression="zstd")
+    write_atomically(path, sink.getvalue())
+
+
+def load_rows(path: Path) -> list[dict[str, Any]]:
+    import pyarrow.parquet as pq
+
+    return pq.read_table(path).to_pylist()
+
+
+def digest(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file below `folder` but its manifest and rationales, by relative path."""
+    paths = sorted(
+        p for p in folder.rglob("*") if p.is_file() and p.name not in (MANIFEST, "rationales.jsonl")
+    )
+    names = [p.relative_to(folder).as_posix() for p in paths]
+    with ThreadPoolExecutor(4) as pool:
+        return dict(zip(names, pool.map(digest, paths), strict=True))
+
+
+@dataclass(frozen=True)
+class Store:
+    """A built and verified benchmark."""
+
+    folder: Path
+    manifest: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        return self.folder.name
+
+    @property
+    def identity(self) -> str:
+        """A short hash of everything in the benchmark."""
+        return hashlib.sha256(json.dumps(self.manifest["files"]).encode()).hexdigest()[:16]
+
+    def scene_ids(self, split: str) -> list[str]:
+        return self.manifest["scenes"][split]
+
+    def scene(self, scene_id: str) -> Scene:
+        return _cached_scene(self.folder / "scenes" / f"{scene_id}.npz")
+
+    def selection(self, split: str | None = None) -> list[SelectionItem]:
+        rows = load_rows(self.folder / "selection.parquet")
+        return [SelectionItem.from_row(r) for r in rows if split in (None, r["split"])]
+
+    def retrieval(self, split: str | None = None) -> list[RetrievalQuery]:
+        rows = load_rows(self.folder / "retrieval.parquet")
+        return [RetrievalQuery.from_row(r) for r in rows if split in (None, r["split"])]
+
+    def database(self, name: str = "test") -> list[FrameRef]:
+        rows = load_rows(self.folder / "database.parquet")
+        return [FrameRef(r["scene_id"], r["frame"]) for r in rows if r["database"] == name]
+
+
+@lru_cache(maxsize=512)
+def _cached_scene(path: Path) -> Scene:
+    return load_scene(path)
+
+
+def open_store(folder: Path) -> Store:
+    """Open a built benchmark and verify every part of it.
+
+    Raises:
+        UserError: there is none, another generator made it, or a part is missing or damaged.
+    """
+    path = folder / MANIFEST
+    rebuild = f"delete {folder} and build it again with python -m data.build"
+    if not path.exists():
+        raise UserError(f"{folder} holds no benchmark: {MANIFEST} is missing; {rebuild}")
+    try:
+        manifest = json.loads(path.read_text())
+        files = manifest["files"]
+    except (json.JSONDecodeError, KeyError) as error:
+        raise UserError(f"{path} is damaged and cannot be read; {rebuild}") from error
+    for key, current in (("generator", GENERATOR_VERSION), ("renderer", RENDERER_VERSION)):
+        if manifest[key] != current:
+            raise UserError(
+                f"{folder} was built by {key} version {manifest[key]}, this is version {current}; "
+                f"{rebuild}"
+            )
+    found = digests(folder)
+    missing = [name for name in files if name not in found]
+    damaged = [name for name in files if name in found and found[name] != files[name]]
+    if missing or damaged:
+        named = (missing + damaged)[0]
+        what = "missing" if missing else "damaged (its content differs from the manifest)"
+        more = len(missing) + len(damaged) - 1
+        others = f", and {more} more parts are not whole" if more else ""
+        raise UserError(f"{folder / named} is {what}{others}; {rebuild}")
+    return Store(folder, manifest)
