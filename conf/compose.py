@@ -1,0 +1,212 @@
+"""Composes a command's settings and refuses what its schema does not hold.
+
+Hydra lets `+key=` and `++key=` past a structured schema, and names no neighbour of a mistyped key.
+So every override is held against the schema first, and what Hydra composed is merged into the
+schema once more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_module
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+
+import conf.launcher  # noqa: F401  registers the launcher that run_folder.yaml names
+from conf.errors import SettingsError
+from conf.keys import dict_above, has_key, keys, nearest
+
+OVERLAYS = ("exp", "sweep")
+"""Groups that any command takes, as `+exp=cot`."""
+
+
+def register(command: str, schema: type) -> None:
+    """Let `conf/<name>.yaml` begin its defaults with `<name>_schema`."""
+    ConfigStore.instance().store(name=f"{short(command)}_schema", node=schema)
+
+
+def short(command: str) -> str:
+    """sft for train.sft: the name of its config and of its folder of runs."""
+    return command.rpartition(".")[2]
+
+
+def compose(command: str, schema: type, overrides: list[str]) -> Any:
+    """The settings of one run as an instance of `schema`. Raises SettingsError."""
+    with _hydra(command, schema) as loader:
+        _check_overrides(command, schema, _parse(overrides, loader), loader)
+        return _compose_one(command, schema, overrides)
+
+
+def preflight(command: str, schema: type, overrides: list[str], sweep: bool) -> None:
+    """Compose and check one run, or each job of a sweep. Raises SettingsError."""
+    with _hydra(command, schema) as loader:
+        parsed = _parse(overrides, loader)
+        for override in [] if sweep else filter(Override.is_sweep_override, parsed):
+            raise SettingsError(
+                f"{override.input_line} is a sweep: run it with -m, or write a list as "
+                f"{_typed_key(override)}=[a,b]"
+            )
+        _check_overrides(command, schema, parsed, loader)
+        for job in _jobs(parsed) if sweep else [overrides]:
+            _compose_one(command, schema, job)
+
+
+def options(command: str, schema: type) -> dict[str, list[str]]:
+    """The groups that a command takes, and the names to choose from in each."""
+    with _hydra(command, schema) as loader:
+        return {
+            group: loader.get_group_options(group)
+            for group in loader.list_groups("")
+            if (has_key(schema, group) or group in OVERLAYS) and loader.get_group_options(group)
+        }
+
+
+def strict(cfg: DictConfig, schema: type) -> Any:
+    """The composed settings as an instance of `schema`.
+
+    Raises SettingsError for keys that the schema does not hold, wrong types, missing values, and
+    whatever the dataclasses' own `check()` finds.
+    """
+    try:
+        plain = OmegaConf.to_container(cfg, resolve=True)
+        merged = OmegaConf.merge(OmegaConf.structured(schema), plain)
+    except OmegaConfBaseException as error:
+        raise SettingsError(_omegaconf_problem(error, schema)) from error
+    if missing := sorted(OmegaConf.missing_keys(merged)):
+        raise SettingsError("\n".join(f"{key} is not set: give {key}=..." for key in missing))
+    settings = OmegaConf.to_object(merged)
+    if problems := list(_checked(settings)):
+        raise SettingsError("\n".join(problems))
+    return settings
+
+
+@contextmanager
+def _hydra(command: str, schema: type) -> Iterator[ConfigLoader]:
+    register(command, schema)
+    with initialize_config_module("conf", job_name=short(command), version_base="1.3"):
+        yield GlobalHydra.instance().config_loader()
+
+
+def _parse(overrides: list[str], loader: ConfigLoader) -> list[Override]:
+    try:
+        return OverridesParser.create(config_loader=loader).parse_overrides(overrides)
+    except OverrideParseException as error:
+        reason = str(error).partition("\n")[0]
+        raise SettingsError(f"{error.override} cannot be read: {reason}") from error
+
+
+def _check_overrides(
+    command: str, schema: type, overrides: Iterable[Override], loader: ConfigLoader
+) -> None:
+    problems = []
+    for override in overrides:
+        if not override.is_hydra_override():
+            problems += _override_problems(command, schema, override, loader)
+    if problems:
+        raise SettingsError("\n".join(problems))
+
+
+def _override_problems(
+    command: str, schema: type, override: Override, loader: ConfigLoader
+) -> list[str]:
+    key = override.key_or_group
+    # `student={...}` sets values below student, `student=tiny` chooses a preset.
+    chosen = [] if isinstance(override._value, dict) else _chosen(override)
+    options = loader.get_group_options(key)
+    if options and not (override.is_delete() or override._value is None or not chosen):
+        root = (override.package or key).partition(".")[0]
+        if root not in OVERLAYS and not has_key(schema, root):
+            return [f"{_typed_key(override)}: {command} takes no {root}"]
+        if root not in OVERLAYS and override.is_add():
+            return [f"{override.input_line}: a {root} is chosen already, leave out the +"]
+        if root in OVERLAYS and not (override.is_add() or override.is_force_add()):
+            return [f"{override.input_line}: lay it over with a +, as +{override.input_line}"]
+        return [
+            f"{_typed_key(override)}={name}: no such {key}, the options are {', '.join(options)}"
+            for name in chosen
+            if name not in options
+        ]
+    if has_key(schema, key) or key in OVERLAYS:
+        return []
+    guess = nearest(key, [*keys(schema), *OVERLAYS])
+    hint = f", did you mean {'+' if guess in OVERLAYS else ''}{guess}?" if guess else ""
+    return [f"{_typed_key(override)}: {command} has no such key{hint}"]
+
+
+def _chosen(override: Override) -> list[str]:
+    """The names that a group override chooses, each of a sweep's included."""
+    if override.is_discrete_sweep():
+        return [str(value) for value in override.sweep_string_iterator()]
+    value = override.value()
+    return [str(name) for name in value] if isinstance(value, list) else [str(value)]
+
+
+def _typed_key(override: Override) -> str:
+    return str(override.input_line).partition("=")[0]
+
+
+def _jobs(overrides: list[Override]) -> list[list[str]]:
+    """Each job of a sweep; where a sweeper draws from an interval, its start stands for it."""
+    drawn = [o for o in overrides if o.is_sweep_override() and not o.is_discrete_sweep()]
+    [jobs] = BasicSweeper.split_arguments([o for o in overrides if o not in drawn], None)
+    starts = [f"{o.get_key_element()}={o.value().start}" for o in drawn]
+    return [[*job, *starts] for job in jobs]
+
+
+def _compose_one(command: str, schema: type, overrides: list[str]) -> Any:
+    try:
+        return strict(hydra_compose(short(command), overrides), schema)
+    except HydraException as error:
+        raise SettingsError(_hydra_problem(error, schema)) from error
+    except OmegaConfBaseException as error:
+        raise SettingsError(_omegaconf_problem(error, schema)) from error
+    except (AssertionError, AttributeError) as error:
+        # OmegaConf 2.3 fails like this below a dataclass that a preset has set to null.
+        below = [o for o in overrides if "." in o.partition("=")[0]]
+        raise SettingsError(
+            f"{' '.join(below)}: cannot be set below a key that is null here, choose a preset "
+            "that has it"
+        ) from error
+
+
+def _hydra_problem(error: HydraException, schema: type) -> str:
+    text = " ".join(str(error).partition("Config search path")[0].split())
+    text = text.partition(" full_key:")[0].removeprefix("Error merging override ")
+    cause = error.__cause__
+    if not isinstance(cause, OmegaConfBaseException):
+        return text
+    key = text.partition("=")[0]
+    if "is not a subclass" in str(cause) and (above := dict_above(schema, key.lstrip("+"))):
+        return f"{text}: give new names as +{above}={{NAME: {{...}}}}"
+    problem = _omegaconf_problem(cause, schema)
+    return f"{text}: {problem.removeprefix(f'{key}: ')}"
+
+
+def _omegaconf_problem(error: OmegaConfBaseException, schema: type) -> str:
+    text, key = str(error).partition("\n")[0], error.full_key
+    if not isinstance(error, ConfigAttributeError | ConfigKeyError):
+        return f"{key}: {text}" if key else text
+    guess = None if dict_above(schema, key) else nearest(key, keys(schema))
+    return f"{key}: no such key{f', did you mean {guess}?' if guess else ''}"
+
+
+def _checked(settings: Any) -> Iterator[str]:
+    """What `check()` finds, of the nested dataclasses first."""
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if is_dataclass(value):
+            yield from _checked(value)
+    if hasattr(settings, "check"):
+        yield from settings.check()

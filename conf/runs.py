@@ -1,0 +1,168 @@
+"""A run's folder: its name, what is written into it, and whether it can be gone on with."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from conf.errors import SettingsError, UserError
+
+ELSEWHERE = ("run", "store", "checkpoints", "workers")
+"""Keys that say where and how fast a run goes, not what comes out of it."""
+
+PACKAGES = (
+    "torch",
+    "transformers",
+    "peft",
+    "bitsandbytes",
+    "accelerate",
+    "sentence-transformers",
+    "trl",
+    "hydra-core",
+    "omegaconf",
+    "numpy",
+    "pybullet",
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    name: str
+    """Of the folder below checkpoints/<command>/, such as exp=cot."""
+    folder: Path
+
+
+def run_name(run: str | None, overrides: Sequence[str]) -> str:
+    """The given name, or one made of the overrides in the order they were typed."""
+    if run is not None:
+        return run
+    told = [o.lstrip("+") for o in overrides]
+    told = [o for o in told if o.partition("=")[0] not in ELSEWHERE]
+    name = re.sub(r"[^A-Za-z0-9_.,=+-]", "-", ",".join(told)) or "default"
+    if len(name) > 120:
+        digest = hashlib.sha256(name.encode()).hexdigest()[:8]
+        name = f"{name[:111]}-{digest}"
+    return name
+
+
+OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+
+
+def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[str]) -> None:
+    """Write a run's settings and record, first or again.
+
+    Raises SettingsError where the folder holds a run with other settings, and UserError where it
+    cannot be written.
+    """
+    if other := differences(run.folder, settings):
+        raise SettingsError(
+            f"{run.folder} holds a run with other settings: {'; '.join(other[:3])}. "
+            "Choose another folder with run=NAME, or delete this one."
+        )
+    try:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        write_text(run.folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(settings)))
+        write_json(run.folder / "run.json", _record(run.folder, settings, command, overrides))
+    except OSError as error:
+        raise UserError(f"cannot write the run's folder {run.folder}: {error.strerror}") from error
+
+
+def differences(folder: Path, settings: dict[str, Any]) -> list[str]:
+    """Each setting that a run in `folder` was started with and that is another one now."""
+    path = folder / "config.yaml"
+    if not path.exists():
+        return []
+    there = _flat(OmegaConf.to_container(OmegaConf.load(path)))
+    now = _flat(settings)
+    absent = object()
+    return [
+        f"{key} is {_shown(there, key)} there and {_shown(now, key)} now"
+        for key in sorted(there.keys() | now.keys())
+        if key not in ELSEWHERE and there.get(key, absent) != now.get(key, absent)
+    ]
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON with sorted keys, whole or not at all."""
+    write_text(path, json.dumps(value, indent=2, sort_keys=True) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all."""
+    part = path.with_name(path.name + ".tmp")
+    part.write_text(text, encoding="utf-8")
+    os.replace(part, path)
+
+
+def _flat(value: Any, key: str = "") -> dict[str, Any]:
+    if not isinstance(value, dict) or not value:
+        return {key: value}
+    return {
+        k: v for name, inner in value.items() for k, v in _flat(inner, _join(key, name)).items()
+    }
+
+
+def _join(key: str, name: Any) -> str:
+    return f"{key}.{name}" if key else str(name)
+
+
+def _shown(flat: dict[str, Any], key: str) -> str:
+    return json.dumps(flat[key]) if key in flat else "absent"
+
+
+def _record(
+    folder: Path, settings: dict[str, Any], command: str, overrides: list[str]
+) -> dict[str, Any]:
+    path = folder / "run.json"
+    earlier = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+    return {
+        "command": command,
+        "overrides": overrides,
+        "seed": settings["seed"],
+        "git": _git(),
+        "python": platform.python_version(),
+        "executable": sys.executable,
+        "platform": platform.platform(),
+        "packages": {name: v for name in PACKAGES if (v := _version(name))},
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "earlier_starts": [*earlier["earlier_starts"], earlier["started"]] if earlier else [],
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _git() -> dict[str, Any] | None:
+    """The commit that the code stands at, and whether it was changed since; None outside git."""
+    try:
+        commit = _git_output("rev-parse", "HEAD")
+        return {"commit": commit, "dirty": bool(_git_output("status", "--porcelain"))}
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _git_output(*arguments: str) -> str:
+    return subprocess.run(
+        ["git", *arguments],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.strip()

@@ -1,0 +1,394 @@
+"""Every setting of every command: one dataclass a command and a group, with its unit and default.
+
+Defaults here are the paper's values; a preset (`conf/<group>/<name>.yaml`) states what differs.
+`check()` returns one sentence for each combination of values that cannot work, naming the keys as
+a user types them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from omegaconf import MISSING
+
+
+@dataclass
+class Quota:
+    """How many items or queries a cell gets in each split."""
+
+    train: int = 0
+    test: int = 0
+
+
+@dataclass
+class SelectionConfig:
+    """Cells of the selection track and their quotas. A cell's name is its item's `subtype`."""
+
+    min_displacement: float = 12.0
+    """Least displacement (px at 336 x 336) between any two candidates, in some object."""
+    event: dict[str, Quota] = field(default_factory=dict)
+    time: dict[str, Quota] = field(default_factory=dict)
+    window: dict[str, Quota] = field(default_factory=dict)
+
+
+@dataclass
+class RetrievalTrackConfig:
+    """Builders of the retrieval track (spec names 1 to 6) and the test database."""
+
+    builders: dict[str, Quota] = field(default_factory=dict)
+    hard_negatives: int = 3
+    """Same-scene wrong-time frames a query."""
+    database: int = 10_000
+    """Frames of the test database; it always holds every test target."""
+
+
+@dataclass
+class BenchmarkConfig:
+    name: str = MISSING
+    """Name of the folder below `store`."""
+    seed: int = 0
+    scenes: int = 10_000
+    test_share: float = 0.2
+    min_objects: int = 4
+    max_objects: int = 6
+    max_collisions: int = 3
+    width: int = 480
+    height: int = 320
+    prefix_frames: int = 12
+    """Frames of a prefix that are rendered ahead, evenly spread."""
+    selection: SelectionConfig = field(default_factory=SelectionConfig)
+    retrieval: RetrievalTrackConfig = field(default_factory=RetrievalTrackConfig)
+
+    def check(self) -> list[str]:
+        problems = []
+        if not 0 < self.test_share < 1:
+            problems.append(f"benchmark.test_share={self.test_share} must lie between 0 and 1")
+        if self.scenes < 4:
+            problems.append(f"benchmark.scenes={self.scenes}: at least 4 scenes are needed")
+        if not 2 <= self.min_objects <= self.max_objects:
+            problems.append(
+                f"benchmark.min_objects={self.min_objects} and "
+                f"benchmark.max_objects={self.max_objects}: need 2 <= min <= max"
+            )
+        if self.prefix_frames < 2:
+            problems.append(f"benchmark.prefix_frames={self.prefix_frames} must be 2 or more")
+        return problems
+
+
+@dataclass
+class TeacherConfig:
+    name: str = MISSING
+    """Recorded with every rationale."""
+    url: str | None = None
+    """An OpenAI-compatible server, such as http://127.0.0.1:8000/v1; null for the built-in
+    narrator."""
+    model: str | None = None
+    """The model's name at the server."""
+    seed: int = 0
+    min_words: int = 80
+    max_words: int = 250
+    attempts: int = 4
+    """Answers asked for at most for an item before it is set aside."""
+    temperature: float = 0.7
+    top_p: float = 0.8
+    top_k: int = 20
+    max_tokens: int = 640
+    concurrency: int = 128
+    """Requests in flight."""
+    timeout: float = 120.0
+    """Seconds that one request may take."""
+    patience: float = 600.0
+    """Seconds to wait for a server that is down before giving up."""
+
+    def check(self) -> list[str]:
+        problems = []
+        if (self.url is None) != (self.model is None):
+            problems.append("teacher.url and teacher.model go together: set both or neither")
+        if not 0 < self.min_words <= self.max_words:
+            problems.append(
+                f"teacher.min_words={self.min_words} and teacher.max_words={self.max_words}: "
+                "need 0 < min <= max"
+            )
+        if self.attempts < 1:
+            problems.append(f"teacher.attempts={self.attempts} must be 1 or more")
+        return problems
+
+
+@dataclass
+class ArchitectureConfig:
+    """Sizes of a Qwen3-VL built offline from a seed, with its tokenizer and processor."""
+
+    seed: int = 0
+    vocabulary: int = 1024
+    hidden: int = 192
+    layers: int = 4
+    heads: int = 6
+    kv_heads: int = 6
+    head: int = 32
+    """Size of one attention head; half of it is split over time, height and width."""
+    feed_forward: int = 512
+    vision_hidden: int = 128
+    vision_layers: int = 3
+    vision_heads: int = 4
+    vision_feed_forward: int = 384
+
+
+@dataclass
+class LoraConfig:
+    rank: int = 16
+    alpha: int = 32
+    dropout: float = 0.0
+    targets: str = (
+        r"(model\.)*language_model\.layers\.\d+\."
+        r"(self_attn\.[qkvo]_proj|mlp\.(gate|up|down)_proj)"
+    )
+    """Anchored pattern over module names: the language tower's projections only."""
+
+
+@dataclass
+class StudentConfig:
+    name: str = MISSING
+    model: str | None = None
+    """A folder, or a hub name that is in the local cache; null builds `architecture`."""
+    revision: str | None = None
+    trust_remote_code: bool = False
+    """Whether code that a model ships may run."""
+    architecture: ArchitectureConfig | None = None
+    quantization: str = "nf4"
+    """nf4 or none."""
+    lora: LoraConfig | None = field(default_factory=LoraConfig)
+    """null trains the whole model."""
+    image_size: int = 336
+    """Frames reach the model at image_size x image_size px, before the processor's grid."""
+    frames: int = 12
+    """Frames a prefix, evenly spread."""
+    max_length: int = 3072
+    """Tokens a sample; a longer one is refused, never cut."""
+    max_new_tokens: int = 512
+
+    def check(self) -> list[str]:
+        return _backbone_problems("student", self)
+
+
+@dataclass
+class RetrieverConfig:
+    name: str = MISSING
+    model: str | None = None
+    revision: str | None = None
+    trust_remote_code: bool = False
+    architecture: ArchitectureConfig | None = None
+    quantization: str = "nf4"
+    lora: LoraConfig | None = field(default_factory=LoraConfig)
+    image_size: int = 336
+    frames: int = 12
+    max_length: int = 3072
+    widths: list[int] = field(default_factory=lambda: [4096, 2048, 1024, 512, 256, 128, 64])
+    """Matryoshka widths, widest first."""
+    query_instruction: str = "Retrieve images or text relevant to the user's query."
+    frame_instruction: str = "Represent the user's input."
+
+    def check(self) -> list[str]:
+        problems = _backbone_problems("retriever", self)
+        if sorted(set(self.widths), reverse=True) != list(self.widths):
+            problems.append(f"retriever.widths={self.widths} must fall strictly, widest first")
+        return problems
+
+
+def _backbone_problems(group: str, cfg: StudentConfig | RetrieverConfig) -> list[str]:
+    problems = []
+    if (cfg.model is None) == (cfg.architecture is None):
+        problems.append(
+            f"{group}.model and {group}.architecture: give exactly one, a model to load or sizes "
+            "to build"
+        )
+    if cfg.quantization not in ("nf4", "none"):
+        problems.append(f"{group}.quantization={cfg.quantization}: the options are nf4 and none")
+    if cfg.quantization == "nf4" and cfg.lora is None:
+        problems.append(
+            f"{group}.quantization=nf4 with {group}.lora=null: 4-bit weights cannot be trained "
+            f"whole, set {group}.quantization=none or give {group}.lora"
+        )
+    if cfg.quantization == "nf4" and cfg.architecture is not None:
+        problems.append(
+            f"{group}.quantization=nf4 with {group}.architecture: a model built from a seed is "
+            f"trained whole, set {group}.quantization=none"
+        )
+    if cfg.image_size < 32:
+        problems.append(f"{group}.image_size={cfg.image_size} must be 32 or more")
+    if cfg.frames < 2:
+        problems.append(f"{group}.frames={cfg.frames} must be 2 or more")
+    return problems
+
+
+@dataclass
+class TrainConfig:
+    """Settings that both trainers share."""
+
+    lr: float = 2e-5
+    schedule: str = "cosine"
+    """cosine, linear or constant, after the warm-up."""
+    warmup: float = 0.03
+    """Share of the steps."""
+    weight_decay: float = 0.0
+    max_grad_norm: float = 1.0
+    epochs: float = 3.0
+    max_steps: int = -1
+    """Optimizer steps; -1 leaves it to `epochs`."""
+    micro_batch: int = 1
+    accumulation: int = 16
+    precision: str = "bf16"
+    """bf16 or fp32: what the passes compute in; adapters and optimizer stay fp32."""
+    gradient_checkpointing: bool = True
+    evaluations: int = 10
+    """Evaluations, evenly spread over the run, each followed by a checkpoint."""
+    keep: int = 2
+    """Checkpoints kept."""
+    workers: int = 0
+    """Processes that prepare batches."""
+    report_to: list[str] = field(default_factory=list)
+    """Trackers of transformers' Trainer, such as tensorboard, wandb or trackio."""
+
+    def check(self) -> list[str]:
+        problems = []
+        if self.lr <= 0:
+            problems.append(f"train.lr={self.lr} must be above 0")
+        if self.schedule not in ("cosine", "linear", "constant"):
+            problems.append(
+                f"train.schedule={self.schedule}: the options are cosine, linear and constant"
+            )
+        if self.precision not in ("bf16", "fp32"):
+            problems.append(f"train.precision={self.precision}: the options are bf16 and fp32")
+        if min(self.micro_batch, self.accumulation, self.evaluations, self.keep) < 1:
+            problems.append(
+                "train.micro_batch, train.accumulation, train.evaluations and train.keep "
+                "must be 1 or more"
+            )
+        return problems
+
+
+@dataclass
+class SftTrainConfig(TrainConfig):
+    regime: str = "cot"
+    """cot (rationale and answer), answer_only, or describe (the recipe of the tiny base)."""
+    validation_items: int = 64
+    """Training-split items of held-out training scenes that measure the run."""
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        if self.regime not in ("cot", "answer_only", "describe"):
+            problems.append(
+                f"train.regime={self.regime}: the options are cot, answer_only and describe"
+            )
+        return problems
+
+
+@dataclass
+class ContrastiveTrainConfig(TrainConfig):
+    batch: int = 512
+    """Queries a step; each is contrasted with every target and hard negative of the batch."""
+    mini_batch: int = 8
+    """Samples that pass the model at once in the cached loss; moves memory, not the gradient."""
+    hard_negatives: int = 1
+    """Same-scene wrong-time frames a query."""
+    scale: float = 50.0
+    """Inverse temperature of the cosine similarities."""
+    validation_queries: int = 128
+    """Queries of held-out training scenes that measure the run."""
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        if self.accumulation != 1:
+            problems.append(
+                f"train.accumulation={self.accumulation}: the cached loss already splits "
+                "train.batch into train.mini_batch, leave train.accumulation=1"
+            )
+        if not 1 <= self.mini_batch <= self.batch:
+            problems.append(
+                f"train.mini_batch={self.mini_batch} must lie between 1 and "
+                f"train.batch={self.batch}"
+            )
+        return problems
+
+
+@dataclass
+class CommandConfig:
+    """What every command takes."""
+
+    seed: int = 0
+    run: str | None = None
+    """Folder of the run below checkpoints/<command>/; made from the overrides when null."""
+    store: str = "store"
+    """Folder of the built benchmarks."""
+    checkpoints: str = "checkpoints"
+    """Folder of the runs."""
+    workers: int = 2
+    """Processes that simulate, render and narrate."""
+
+
+@dataclass
+class BuildCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+
+
+@dataclass
+class NarrateCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    teacher: TeacherConfig = MISSING
+
+
+@dataclass
+class SftCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    teacher: TeacherConfig = MISSING
+    student: StudentConfig = MISSING
+    train: SftTrainConfig = field(default_factory=SftTrainConfig)
+
+
+@dataclass
+class ContrastiveCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    retriever: RetrieverConfig = MISSING
+    train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
+
+    def check(self) -> list[str]:
+        if self.train.hard_negatives > self.benchmark.retrieval.hard_negatives:
+            return [
+                f"train.hard_negatives={self.train.hard_negatives} is more than "
+                f"benchmark.retrieval.hard_negatives={self.benchmark.retrieval.hard_negatives}"
+            ]
+        return []
+
+
+@dataclass
+class SelectCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    student: StudentConfig = MISSING
+    model: str | None = None
+    """A run folder of train.sft or a model folder; null takes the student's base."""
+    modes: list[str] = field(default_factory=lambda: ["reasoning", "answer"])
+    """reasoning (rationale, then answer) and answer (at once), each measured by itself."""
+    batch: int = 16
+    """Items that pass the model at once."""
+    limit: int | None = None
+    """Test items at most; null takes all."""
+
+    def check(self) -> list[str]:
+        problems = []
+        if not self.modes or not set(self.modes) <= {"reasoning", "answer"}:
+            problems.append(f"modes={self.modes}: the options are reasoning and answer")
+        if self.batch < 1:
+            problems.append(f"batch={self.batch} must be 1 or more")
+        return problems
+
+
+@dataclass
+class RetrieveCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    retriever: RetrieverConfig = MISSING
+    model: str | None = None
+    """A run folder of train.contrastive or a model folder; null takes the retriever's base."""
+    batch: int = 64
+    """Queries or frames that pass the model at once."""
+
+    def check(self) -> list[str]:
+        return [] if self.batch >= 1 else [f"batch={self.batch} must be 1 or more"]

@@ -1,0 +1,140 @@
+"""A command from its command line: real processes, with a toy for `main`."""
+
+import csv
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    shutil.copy(Path(__file__).with_name("toy.py"), tmp_path)
+    return tmp_path
+
+
+def toy(room: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "toy", *arguments], cwd=room, capture_output=True, text=True
+    )
+
+
+def test_a_run_leaves_its_record_and_can_be_run_again(room):
+    done = toy(room, "x=2", "workers=1")
+    assert (done.returncode, done.stdout) == (0, "")
+    assert done.stderr == "x is 2.0 in checkpoints/toy/x=2\n"
+    folder = room / "checkpoints/toy/x=2"
+    assert {p.name for p in folder.iterdir()} == {
+        "config.yaml",
+        "metrics.json",
+        "run.json",
+        "run.log",
+    }
+    assert json.loads((folder / "metrics.json").read_text())["loss"] == 4
+    assert json.loads((folder / "run.json").read_text())["overrides"] == ["x=2", "workers=1"]
+    assert "x is 2.0" in (folder / "run.log").read_text()
+    assert toy(room, "x=2").returncode == 0
+    refused = toy(room, "x=3", "run='x=2'")
+    assert refused.returncode == 2
+    assert "error: checkpoints/toy/x=2 holds a run with other settings: x is 2.0 there" in (
+        refused.stderr
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["end=mistake"], 1, "error: this end is a mistake: set end=well\n"),
+        (["end=disk"], 1, "error: some/file: No space left on device\n"),
+        (["end=interrupt"], 130, "interrupted; run the same command again to go on\n"),
+        (["+teacher.sed=1"], 2, "+teacher.sed: toy has no such key, did you mean teacher.seed?\n"),
+        (["checkpoints=toy.py"], 1, "error: toy.py/toy/default: Not a directory\n"),
+    ],
+)
+def test_a_mistake_is_a_sentence(room, arguments, code, said):
+    done = toy(room, *arguments)
+    assert done.returncode == code
+    assert done.stderr.endswith(said)
+    assert "Traceback" not in done.stderr
+
+
+def test_a_bug_keeps_its_traceback(room):
+    done = toy(room, "end=bug")
+    assert done.returncode == 1
+    assert "Traceback" in done.stderr
+    assert done.stderr.endswith("ValueError: a bug\n")
+
+
+def test_help_tells_the_settings_and_imports_nothing_heavy(room):
+    script = (
+        "import runpy, sys; sys.argv = ['toy', '--help', 'x=5']\n"
+        "runpy.run_module('toy', run_name='__main__', alter_sys=True)\n"
+        "heavy = {'torch', 'transformers', 'pybullet', 'matplotlib'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=room, capture_output=True, text=True, check=True
+    )
+    assert "A toy that squares x." in done.stdout
+    assert "teacher: qwen3_32b, template" in done.stdout
+    assert any(
+        line.split() == ["x", "=", "5.0", "How", "much."] for line in done.stdout.split("\n")
+    )
+    assert not (room / "checkpoints").exists()
+
+
+def test_a_sweep_outlives_a_failed_job_and_goes_on(room):
+    sweep = ("-m", "x=1,2", "end=well,bug", "run=s")
+    done = toy(room, *sweep)
+    assert done.returncode == 1
+    assert "#1 x=1 end=bug: failed" in done.stderr
+    assert "ValueError: a bug" in done.stderr
+    folder = room / "checkpoints/toy/s"
+    rows = list(csv.DictReader((folder / "sweep.csv").open()))
+    assert [(r["x"], r["end"], r["status"], r["loss"]) for r in rows] == [
+        ("1", "well", "done", "1.0"),
+        ("1", "bug", "failed", ""),
+        ("2", "well", "done", "4.0"),
+        ("2", "bug", "failed", ""),
+    ]
+    table = (folder / "sweep.txt").read_text()
+    assert table == done.stdout
+    assert table.splitlines()[1].split()[:6] == ["0", "1", "well", "1*", "1*", "1"]
+    assert (folder / "sweep.png").stat().st_size > 1000
+    assert "x is 2.0" in (folder / "2/output.log").read_text()
+    assert "x: 2.0" in (folder / "2/config.yaml").read_text()
+
+    again = toy(room, *sweep)
+    assert "#0 x=1 end=well: finished before, skipped" in again.stderr
+    assert "#1 x=1 end=bug: started" in again.stderr
+    assert json.loads((folder / "0/run.json").read_text())["earlier_starts"] == []
+
+
+def test_a_sweep_without_a_name_is_named_by_its_overrides(room):
+    done = toy(room, "-m", "x=1,2")
+    assert done.returncode == 0
+    assert (room / "checkpoints/toy/x=1,2/1/metrics.json").exists()
+
+
+def test_a_killed_sweep_takes_its_child_along(room):
+    sweep = subprocess.Popen(
+        [sys.executable, "-m", "toy", "-m", "x=1,2", "end=never"],
+        cwd=room,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    output = room / "checkpoints/toy/x=1,2,end=never/0/output.log"
+    until = time.monotonic() + 10
+    while not (output.exists() and output.read_text()) and time.monotonic() < until:
+        time.sleep(0.05)
+    started = time.monotonic()
+    sweep.send_signal(signal.SIGTERM)
+    assert sweep.wait(timeout=10) == 130
+    assert time.monotonic() - started < 5
+    assert not (output.parent / "job.json").exists()
+    assert not (output.parent.parent / "1").exists()

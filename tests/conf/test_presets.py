@@ -1,0 +1,85 @@
+"""Every yaml file composes, by the command that its first comment names."""
+
+import shlex
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from conf import schema
+from conf.compose import compose
+
+CONF = Path(str(files("conf")))
+SCHEMAS = {
+    "data.build": schema.BuildCommand,
+    "teacher.narrate": schema.NarrateCommand,
+    "train.sft": schema.SftCommand,
+    "train.contrastive": schema.ContrastiveCommand,
+    "evaluation.select": schema.SelectCommand,
+    "evaluation.retrieve": schema.RetrieveCommand,
+}
+
+
+def settings(line: str):
+    python, m, command, *overrides = shlex.split(line)
+    assert (python, m) == ("python", "-m")
+    return compose(command, SCHEMAS[command], overrides)
+
+
+@pytest.mark.parametrize(
+    "path", sorted(CONF.rglob("*.yaml")), ids=lambda p: str(p.relative_to(CONF))
+)
+def test_a_file_names_a_command_that_composes_it(path):
+    lines = path.read_text().splitlines()
+    line = lines[1] if lines[0].startswith("# @package") else lines[0]
+    assert line.startswith("# python -m ")
+    settings(line.removeprefix("# "))
+    group = path.parent.name
+    if group == "exp":
+        assert f"+exp={path.stem}" in line
+    elif path.parent == CONF and path.stem != "run_folder":
+        assert line == f"# python -m {next(c for c in SCHEMAS if c.endswith('.' + path.stem))}"
+
+
+def test_a_student_brings_its_recipe():
+    tiny = settings("python -m train.sft")
+    paper = settings("python -m train.sft student=qwen3_vl_8b")
+    assert (tiny.train.lr, tiny.train.micro_batch, tiny.train.accumulation) == (1e-3, 8, 2)
+    assert tiny.train.regime == "cot"
+    assert (paper.train.lr, paper.train.micro_batch, paper.train.accumulation) == (2e-5, 1, 16)
+    assert (paper.train.epochs, paper.train.precision) == (3, "bf16")
+    assert (paper.student.lora.rank, paper.student.lora.alpha) == (16, 32)
+    assert (paper.student.frames, paper.student.image_size, paper.student.max_length) == (
+        12,
+        336,
+        3072,
+    )
+
+
+def test_a_typed_value_and_an_overlay_win_over_a_recipe():
+    assert settings("python -m train.sft student=qwen3_vl_8b train.lr=3e-4").train.lr == 3e-4
+    base = settings("python -m train.sft +exp=base")
+    assert base.student.name == "tiny_scratch"
+    assert base.student.architecture == schema.ArchitectureConfig()
+    assert base.train.regime == "describe"
+
+
+def test_a_retriever_brings_its_recipe():
+    tiny = settings("python -m train.contrastive")
+    paper = settings("python -m train.contrastive retriever=qwen3_vl_emb_8b")
+    assert (tiny.train.batch, tiny.train.lr, tiny.retriever.widths[0]) == (64, 2e-3, 128)
+    assert tiny.retriever.architecture.vocabulary == 1024
+    assert (paper.train.batch, paper.train.mini_batch, paper.train.lr) == (512, 8, 2e-5)
+
+
+def test_the_paper_quotas_add_up():
+    benchmark = settings("python -m data.build benchmark=dynapix").benchmark
+    window = benchmark.selection.window
+    assert len(window) == 24
+    for group, test in {"G1": 178, "G2": 269, "G3": 173, "G4": 84}.items():
+        assert sum(q.test for cell, q in window.items() if cell.startswith(group)) == test
+    builders = benchmark.retrieval.builders
+    assert sorted(builders) == ["1", "2", "3", "4", "5", "6"]
+    assert sum(q.train for q in builders.values()) == 22_500
+    assert sum(q.test for q in builders.values()) == 2_002
+    assert benchmark.selection.event["future_offset_gap10"] == schema.Quota(163, 35)

@@ -1,0 +1,77 @@
+"""A run's folder is named by its command and holds what was run."""
+
+import json
+
+import pytest
+
+from conf.errors import SettingsError, UserError
+from conf.runs import Run, open_run, run_name
+from conf.sweep import best, report, varying
+
+SETTINGS = {"seed": 0, "run": None, "store": "store", "checkpoints": "c", "workers": 2, "x": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "name"),
+    [
+        ([], "default"),
+        (["+exp=cot"], "exp=cot"),
+        (["train.lr=1e-3", "+exp=cot"], "train.lr=1e-3,exp=cot"),
+        (["store=/big", "workers=8", "checkpoints=c"], "default"),
+        (["student.model=Qwen/Qwen3 VL"], "student.model=Qwen-Qwen3-VL"),
+    ],
+)
+def test_a_run_is_named_by_its_overrides(overrides, name):
+    assert run_name(None, overrides) == name
+    assert run_name("mine", overrides) == "mine"
+
+
+def test_a_long_name_is_cut_and_stays_distinct():
+    one, two = (run_name(None, ["train.lr=1"] * 40 + [f"seed={seed}"]) for seed in (1, 2))
+    assert len(one) == len(two) == 120
+    assert one != two
+
+
+def test_a_run_is_recorded_and_each_start_kept(tmp_path):
+    run = Run("r", tmp_path / "r")
+    open_run(run, SETTINGS, "train.sft", ["x=1"])
+    first = json.loads((run.folder / "run.json").read_text())
+    assert first["earlier_starts"] == []
+    assert first["packages"]["hydra-core"].startswith("1.3")
+    open_run(run, SETTINGS | {"workers": 8, "store": "/big"}, "train.sft", ["x=1"])
+    again = json.loads((run.folder / "run.json").read_text())
+    assert again["earlier_starts"] == [first["started"]]
+    assert not list(run.folder.glob("*.tmp"))
+
+
+def test_other_settings_are_refused_with_both_values(tmp_path):
+    run = Run("r", tmp_path / "r")
+    open_run(run, SETTINGS | {"train": {"lr": 1.0}}, "train.sft", [])
+    with pytest.raises(SettingsError) as caught:
+        open_run(run, SETTINGS | {"train": {"lr": 2.0}}, "train.sft", [])
+    assert "train.lr is 1.0 there and 2.0 now" in str(caught.value)
+    assert "run=NAME" in str(caught.value)
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="file/r: Not a directory"):
+        open_run(Run("r", tmp_path / "file" / "r"), SETTINGS, "train.sft", [])
+
+
+def test_the_best_of_a_metric_goes_by_its_name():
+    values = [2.0, 1.0, float("nan")]
+    assert best("eval_loss", values) == 1.0
+    assert best("median_rank", values) == 1.0
+    assert best("accuracy", values) == 2.0
+    assert best("accuracy", [float("nan")]) is None
+
+
+def test_only_what_varies_is_a_column():
+    jobs = [["+exp=cot", "x=1", "y=3"], ["+exp=cot", "x=2", "y=3"]]
+    assert varying(jobs) == [{"x": "1"}, {"x": "2"}]
+
+
+def test_a_folder_without_a_sweep_is_told(tmp_path):
+    with pytest.raises(UserError, match="holds no sweep"):
+        report(tmp_path)

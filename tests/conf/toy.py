@@ -1,0 +1,47 @@
+"""A toy that squares x."""
+
+import logging
+import time
+from dataclasses import dataclass, field
+
+from hydra.core.config_store import ConfigStore
+
+from conf.entry import Run, command
+from conf.errors import UserError
+from conf.schema import CommandConfig, TeacherConfig
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class ToyCommand(CommandConfig):
+    x: float = 1.0
+    """How much."""
+    end: str = "well"
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+
+
+defaults = ["toy_schema", "run_folder", {"teacher": "template"}, "_self_"]
+ConfigStore.instance().store(name="toy", node={"defaults": defaults})
+
+
+@command("toy", ToyCommand)
+def main(cfg: ToyCommand, run: Run) -> dict[str, float]:
+    assert isinstance(cfg.teacher, TeacherConfig)
+    log.info("x is %s in %s", cfg.x, run.folder)
+    match cfg.end:
+        case "mistake":
+            raise UserError("this end is a mistake: set end=well")
+        case "bug":
+            raise ValueError("a bug")
+        case "disk":
+            raise OSError(28, "No space left on device", "some/file")
+        case "interrupt":
+            raise KeyboardInterrupt
+        case "never":
+            time.sleep(60)
+    return {"loss": cfg.x**2, "accuracy": 1 / cfg.x, "objective": cfg.x}
+
+
+if __name__ == "__main__":
+    main()
