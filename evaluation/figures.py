@@ -1,0 +1,230 @@
+"""Figures of a report. Each function draws one and writes it to `path` in its suffix's format.
+
+Figures are built without pyplot, so drawing leaves no global state and needs no display.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from data.records import FAMILIES
+from evaluation import paper
+from evaluation.tables import RECALLS, UNTRAINED, RetrievalRow, SelectionRow
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from PIL.Image import Image
+
+DPI = 150
+COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377")
+"""Told apart with any colour vision (Paul Tol's bright set)."""
+INK, FAINT, RIGHT, WRONG = "#333333", "#bbbbbb", "#228833", "#cc3311"
+STRIP = 6
+"""Prefix frames in one line of an item's figure."""
+
+
+def selection_figure(rows: Sequence[SelectionRow], path: Path | str) -> None:
+    """Bars of accuracy (%) by family with 95% Wilson whiskers, one colour a row of `rows`; the
+    chance line; and the paper's reasoning student as hollow diamonds."""
+    figure = _figure(8, 4.4)
+    axes = figure.add_subplot()
+    axes.spines[["top", "right"]].set_visible(False)
+    width = 0.84 / (len(rows) + 1)
+    for i, row in enumerate(rows):
+        for at, family in enumerate(FAMILIES):
+            found = row.families.get(family)
+            if found is None:
+                continue
+            x, value = at + (i - len(rows) / 2) * width, 100 * found.value
+            label = f"{row.name} ({row.mode})" if family == next(iter(row.families)) else None
+            axes.bar(x, value, width * 0.9, color=_color(row.name, i), label=label)
+            middle, reach = 50 * (found.high + found.low), 50 * (found.high - found.low)
+            axes.errorbar(x, middle, reach, fmt="none", ecolor=INK, capsize=3, elinewidth=1.2)
+            _number(axes, x, 100 * found.high, value)
+    for at, family in enumerate(FAMILIES):
+        x, value = at + len(rows) / 2 * width, getattr(paper.COT, family)
+        label = f"paper: {paper.COT.name}, 8B" if at == 0 else None
+        axes.scatter(
+            x, value, 60, marker="D", color="white", edgecolors=INK, linewidths=1.5, label=label
+        )
+        _number(axes, x, value + 1.5, value)
+    axes.axhline(25, color=INK, linestyle="--", linewidth=1, zorder=0)
+    axes.annotate(
+        "chance", (1, 25), (4, 0), xycoords=("axes fraction", "data"), textcoords="offset points",
+        va="center", fontsize=9, color=INK,
+    )  # fmt: skip
+    axes.set_xticks(range(len(FAMILIES)), [f.capitalize() for f in FAMILIES])
+    axes.tick_params(axis="x", length=0)
+    axes.set_xlim(-0.5, len(FAMILIES) - 0.5)
+    axes.set_ylim(0, 108)
+    axes.set_yticks(range(0, 101, 25))
+    axes.set_ylabel("Accuracy (%)")
+    _legend(figure, axes)
+    figure.savefig(path)
+
+
+def retrieval_figure(rows: Sequence[RetrievalRow], path: Path | str) -> None:
+    """Recall@1, @10 and @50 (%) over embedding width, one panel each; untrained rows are dashed.
+
+    Rows without a width are left out.
+    """
+    from matplotlib.ticker import NullLocator
+
+    rows = sorted((r for r in rows if r.width), key=lambda r: r.width)
+    names = sorted({r.name for r in rows}, key=lambda name: (name == UNTRAINED, name))
+    widths = sorted({r.width for r in rows})
+    figure = _figure(9, 3.8)
+    panels = figure.subplots(1, len(RECALLS), sharey=True)
+    for axes, k in zip(panels, RECALLS, strict=True):
+        for i, name in enumerate(names):
+            points = [(r.width, 100 * getattr(r, f"recall_{k}")) for r in rows if r.name == name]
+            untrained = name == UNTRAINED
+            axes.plot(
+                *zip(*points, strict=True),
+                color=_color(name, i),
+                linestyle="--" if untrained else "-",
+                marker="o",
+                markersize=5,
+                markerfacecolor="white" if untrained else None,
+                linewidth=1.8,
+                label=name,
+                clip_on=False,
+            )
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(widths, [str(w) for w in widths], rotation=45 if len(widths) > 4 else 0)
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.set_title(f"Recall@{k}", fontsize=11)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", color="#eeeeee")
+    panels[0].set_ylim(0, None)
+    panels[0].set_ylabel("Queries (%)")
+    figure.supxlabel("Embedding width", fontsize=10)
+    _legend(figure, panels[0])
+    figure.savefig(path)
+
+
+def item_figure(
+    prefix_images: Sequence[Image],
+    candidate_images: Sequence[Image],
+    letters: str,
+    answer: str,
+    chosen: str | None,
+    question: str,
+    path: Path | str,
+) -> None:
+    """One selection item: the prefix in order of time, the question, and the candidates below.
+
+    The target is framed green, a wrong choice red; `chosen` is None where there was no answer.
+    """
+    images = [*prefix_images, *candidate_images]
+    height_share = images[0].height / images[0].width
+    lines = -(-len(prefix_images) // STRIP)
+    across = min(len(prefix_images), STRIP)
+    page, wide = 9.0, 9.0 / len(candidate_images)
+    title = textwrap.wrap(question, 100)
+    heights = [
+        0.25 + lines * page / across * height_share,
+        0.35 + 0.2 * len(title),
+        0.3 + wide * height_share,
+    ]
+    figure = _figure(page, sum(heights))
+    top, middle, bottom = figure.subfigures(3, 1, height_ratios=heights)
+
+    for axes in top.subplots(lines, across, squeeze=False).flat:
+        axes.set_axis_off()
+    for axes, image in zip(top.axes, prefix_images, strict=False):
+        axes.imshow(image)
+    middle.text(0.01, 0.5, "\n".join(title), ha="left", va="center", fontsize=12, color=INK)
+
+    panels = bottom.subplots(1, len(candidate_images), squeeze=False)[0]
+    for axes, image, letter in zip(panels, candidate_images, letters, strict=True):
+        axes.imshow(image)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        notes = [n for n, holds in (("target", answer), ("chosen", chosen)) if letter == holds]
+        color = RIGHT if letter == answer else WRONG if letter == chosen else None
+        axes.set_title(
+            f"{letter}  {', '.join(notes)}", fontsize=11, loc="left", color=color or INK,
+            fontweight="bold" if color else "normal",
+        )  # fmt: skip
+        axes.spines[:].set(visible=True, edgecolor=color or FAINT, linewidth=4 if color else 0.8)
+    if chosen is None:
+        bottom.text(0.99, 0.99, "no answer", ha="right", va="top", fontsize=11, color=WRONG)
+    figure.savefig(path)
+
+
+def losses_figure(records: Sequence[dict[str, float]], path: Path | str) -> None:
+    """Training and evaluation loss over steps, and a panel for each other `eval_` measure.
+
+    Args:
+        records: lines of a run's metrics, each with `step` and some of `loss`, `eval_loss` and
+            others; a resumed run's later line for a step replaces the earlier one.
+    """
+    others = sorted({k for r in records for k in r if k.startswith("eval_")} - _NOT_SHOWN)
+    figure = _figure(6.5, 3.4 + 1.7 * len(others))
+    panels = figure.subplots(
+        1 + len(others), 1, sharex=True, squeeze=False, height_ratios=[2, *[1] * len(others)]
+    )[:, 0]
+    _curve(panels[0], records, "loss", color=COLORS[0], linewidth=1.3, label="training")
+    _curve(
+        panels[0], records, "eval_loss", color=COLORS[1], linewidth=1.8, marker="o", markersize=4,
+        label="held out",
+    )  # fmt: skip
+    panels[0].set_ylabel("Loss")
+    if panels[0].get_legend_handles_labels()[0]:
+        panels[0].legend(frameon=False)
+    for axes, key in zip(panels[1:], others, strict=True):
+        _curve(axes, records, key, color=COLORS[2], linewidth=1.8, marker="o", markersize=4)
+        name = key.removeprefix("eval_").replace("_", " ")
+        axes.set_ylabel(textwrap.fill(name[:1].upper() + name[1:], 14))
+    for axes in panels:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", color="#eeeeee")
+    panels[-1].set_xlabel("Step")
+    figure.savefig(path)
+
+
+_NOT_SHOWN = {"eval_loss", "eval_runtime", "eval_samples_per_second", "eval_steps_per_second"}
+
+
+def _curve(axes: Axes, records: Sequence[dict[str, float]], key: str, **style) -> None:
+    points = {r["step"]: r[key] for r in records if r.get(key) is not None}
+    if points:
+        axes.plot(*zip(*sorted(points.items()), strict=True), **style)
+
+
+def _figure(width: float, height: float) -> Figure:
+    """An empty figure of width x height inches that draws with Agg."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _color(name: str, index: int) -> str:
+    return "#999999" if name == UNTRAINED else COLORS[index % len(COLORS)]
+
+
+def _number(axes: Axes, x: float, y: float, value: float) -> None:
+    axes.text(x, y + 1.5, f"{value:.0f}", ha="center", va="bottom", fontsize=9, color=INK)
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    """A legend above the plot, where it covers nothing."""
+    handles, labels = axes.get_legend_handles_labels()
+    # Markers are listed before bars, whatever the order they were drawn in: keep the paper last.
+    order = sorted(range(len(labels)), key=lambda i: labels[i].startswith("paper"))
+    figure.legend(
+        [handles[i] for i in order],
+        [labels[i] for i in order],
+        loc="outside upper left",
+        ncols=2,
+        fontsize=9,
+        frameon=False,
+    )

@@ -1,0 +1,216 @@
+"""Accuracy, ranks and intervals. Everything is a share between 0 and 1 unless it says otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import digamma
+
+from data.records import FAMILIES
+
+
+def gold_scores(scores: np.ndarray, gold: np.ndarray) -> np.ndarray:
+    """The fp32 scores (queries,) of the gold columns; NaN where there is none (`gold` < 0).
+
+    Args:
+        scores: (queries, frames), numpy or a CPU tensor that numpy can read.
+        gold: (queries,) column indices.
+
+    Raises:
+        ValueError: shapes that do not fit, or a gold column past the last frame.
+    """
+    scores, gold = np.asarray(scores, np.float32), np.asarray(gold)
+    if scores.ndim != 2 or gold.shape != scores.shape[:1]:
+        raise ValueError(
+            f"scores {scores.shape} and gold {gold.shape}: "
+            "expected (queries, frames) and (queries,)"
+        )
+    if gold.size and gold.max() >= scores.shape[1]:
+        raise ValueError(f"gold column {gold.max()} is past the last of {scores.shape[1]} frames")
+    own = scores[np.arange(len(gold)), np.maximum(gold, 0)]
+    return np.where(gold < 0, np.float32(np.nan), own)
+
+
+def compare(scores: np.ndarray, gold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How many columns score above, and exactly as, each query's gold score.
+
+    The sums over blocks of columns are those of the whole matrix, which is how a database is ranked
+    a block at a time. Over all columns the second count holds the gold frame itself: subtract 1 for
+    the tied others. NaN is neither above nor equal.
+
+    Args:
+        scores: (queries, frames), a block of any width.
+        gold: (queries,) scores from `gold_scores`. They must come out of the same product
+            as `scores`: one computed apart can differ in its last bit and tie with nothing, or
+            lose to itself.
+
+    Returns:
+        Two integer arrays (queries,).
+    """
+    scores = np.asarray(scores, np.float32)
+    gold = np.asarray(gold, np.float32)[:, None]
+    return (scores > gold).sum(1), (scores == gold).sum(1)
+
+
+def ranks_of(scores: np.ndarray, gold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Frames strictly above the gold frame, and other frames tied with it: two (queries,) arrays.
+
+    Both are 0 for a query without a gold score; `gold_scores` says which those are (NaN).
+    Arguments and errors are those of `gold_scores`.
+    """
+    greater, equal = compare(scores, gold_scores(scores, gold))
+    return greater, np.maximum(equal - 1, 0)
+
+
+def expected_hits(greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, k: int) -> np.ndarray:
+    """Each query's chance (queries,) to be among the first `k` when ties fall at random.
+
+    With k = 1 this is the credit of a similarity scorer on a selection item: 1/m where the right
+    candidate is one of m maxima.
+    """
+    hits = np.clip((k - np.asarray(greater)) / (np.asarray(tied) + 1), 0, 1)
+    return np.where(valid, hits, 0.0)
+
+
+def metrics_from_counts(
+    greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, frames: int, ks: Sequence[int]
+) -> dict[str, float]:
+    """Means over all queries, misses among them.
+
+    Args:
+        greater, tied: (queries,) counts as `ranks_of` gives them.
+        valid: (queries,) False for a miss: a query that was not answered or whose gold score is
+            NaN. It has no hit, a reciprocal rank of 0 and the last rank, `frames`.
+        frames: size of the database.
+        ks: cut-offs of the recalls.
+
+    Returns:
+        `recall@k` for each k, `mrr`, `median_rank` (1 is best; ties count half) and `tie_rate`, the
+        share of queries whose gold frame ties with another.
+
+    Raises:
+        ValueError: no query at all.
+    """
+    greater, tied, valid = np.asarray(greater), np.asarray(tied), np.asarray(valid, bool)
+    if not len(greater):
+        raise ValueError("no queries to measure")
+    harmonic = digamma(greater + tied + 2) - digamma(greater + 1)
+    ranks = np.where(valid, greater + 1 + tied / 2, frames)
+    return {
+        **{f"recall@{k}": float(expected_hits(greater, tied, valid, k).mean()) for k in ks},
+        "mrr": float(np.where(valid, harmonic / (tied + 1), 0.0).mean()),
+        "median_rank": float(np.median(ranks)),
+        "tie_rate": float((valid & (tied > 0)).mean()),
+    }
+
+
+def rank_metrics(scores: np.ndarray, gold: np.ndarray, ks: Sequence[int]) -> dict[str, float]:
+    """`metrics_from_counts` of one score matrix (queries, frames) and its gold columns (queries,).
+
+    A negative gold column or a NaN gold score is a miss. Scores are compared in fp32.
+
+    Raises:
+        ValueError: no query, shapes that do not fit, or a gold column past the last frame.
+    """
+    valid = ~np.isnan(gold_scores(scores, gold))
+    return metrics_from_counts(*ranks_of(scores, gold), valid, np.shape(scores)[1], ks)
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A share of `n` with its 95% interval."""
+
+    value: float
+    low: float
+    high: float
+    n: int
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Accuracy by family, in the order event, time, window; a family without items is left out."""
+
+    families: dict[str, Interval]
+    macro: float
+    micro: Interval
+
+
+def wilson(successes: float, n: int) -> tuple[float, float]:
+    """The 95% Wilson interval of `successes` out of `n`; (0, 1) where n is 0."""
+    # Imported here: it takes longer to load than all else that a command needs for its --help.
+    from statsmodels.stats.proportion import proportion_confint
+
+    if n == 0:
+        return 0.0, 1.0
+    low, high = proportion_confint(successes, n, method="wilson")
+    return float(low), float(high)
+
+
+def accuracy_by(groups: Sequence[str], correct: Sequence[float]) -> dict[str, Interval]:
+    """Accuracy of each group of items, in order of name.
+
+    Args:
+        groups: a name an item: its family, subtype or horizon.
+        correct: its credit, a bool or the 1/m of a tie among m.
+
+    Raises:
+        ValueError: not one credit an item.
+    """
+    groups, correct = np.asarray(groups, str), np.asarray(correct, float)
+    if groups.shape != correct.shape:
+        raise ValueError(f"{len(groups)} groups for {len(correct)} items")
+    return {str(g): _interval(correct[groups == g]) for g in np.unique(groups)}
+
+
+def accuracy_table(families: Sequence[str], correct: Sequence[float]) -> Accuracy:
+    """Accuracy by family, their plain mean (macro) over the families present, and over all items
+    (micro).
+
+    Raises:
+        ValueError: no items, not one credit an item, or a family that does not exist.
+    """
+    found = accuracy_by(families, correct)
+    if not found or set(found) - set(FAMILIES):
+        raise ValueError(f"families {sorted(found)}: expected some of {', '.join(FAMILIES)}")
+    ordered = {f: found[f] for f in FAMILIES if f in found}
+    macro = float(np.mean([i.value for i in ordered.values()]))
+    return Accuracy(ordered, macro, _interval(np.asarray(correct, float)))
+
+
+def _interval(correct: np.ndarray) -> Interval:
+    return Interval(
+        float(correct.mean()), *wilson(float(correct.sum()), len(correct)), len(correct)
+    )
+
+
+def bootstrap_by_scene(
+    values: np.ndarray,
+    scenes: Sequence[str],
+    statistic: Callable[[np.ndarray], float],
+    seed: int,
+    resamples: int = 2000,
+) -> tuple[float, float]:
+    """The 95% percentile interval of a statistic when whole scenes are drawn again.
+
+    Items of one scene share its video, so drawing items would call the result surer than it is.
+
+    Args:
+        values: (items, ...) what `statistic` reads; it is handed the rows of the drawn scenes.
+        scenes: (items,) the scene of each row.
+
+    Raises:
+        ValueError: no items, or not one scene an item.
+    """
+    values, scenes = np.asarray(values), np.asarray(scenes)
+    if not len(values) or len(values) != len(scenes):
+        raise ValueError(f"{len(values)} values for {len(scenes)} scenes")
+    _, codes = np.unique(scenes, return_inverse=True)
+    order = np.argsort(codes, kind="stable")
+    rows = np.split(order, np.flatnonzero(np.diff(codes[order])) + 1)
+    rng = np.random.default_rng(seed)
+    drawn = rng.integers(len(rows), size=(resamples, len(rows)))
+    results = [statistic(values[np.concatenate([rows[i] for i in picks])]) for picks in drawn]
+    low, high = np.percentile(results, [2.5, 97.5])
+    return float(low), float(high)

@@ -1,0 +1,161 @@
+"""Result rows and the text tables that show them beside the paper's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from data.records import FAMILIES
+from evaluation import paper
+from evaluation.metrics import Accuracy, Interval
+
+RECALLS = (1, 10, 50)
+"""Cut-offs that the retrieval rows report."""
+UNTRAINED = "untrained"
+"""Name of the rows that a trained retriever is held against."""
+
+NAME_WIDTH = 40
+
+
+@dataclass(frozen=True)
+class SelectionRow:
+    """One model on one selection suite, in shares. What could not be parsed counts as wrong.
+
+    `mode` says how it was asked, such as answer, reasoning or similarity; `parse_rate` is None
+    where nothing is parsed; `n` is the number of items.
+    """
+
+    name: str
+    mode: str
+    families: dict[str, Interval]
+    macro: float
+    micro: Interval
+    parse_rate: float | None
+    n: int
+
+    @classmethod
+    def of(cls, name: str, mode: str, found: Accuracy, parse_rate: float | None) -> SelectionRow:
+        return cls(name, mode, found.families, found.macro, found.micro, parse_rate, found.micro.n)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class RetrievalRow:
+    """One retriever at one width (None for a pipeline without widths), recalls in shares."""
+
+    name: str
+    width: int | None
+    recall_1: float
+    recall_10: float
+    recall_50: float
+    mrr: float
+    median_rank: float
+    tie_rate: float
+    queries: int
+    frames: int
+
+    @classmethod
+    def of(
+        cls, name: str, width: int | None, metrics: dict[str, float], queries: int, frames: int
+    ) -> RetrievalRow:
+        """From what `rank_metrics` gives with `ks=RECALLS`."""
+        recalls = [metrics[f"recall@{k}"] for k in RECALLS]
+        rest = [metrics[key] for key in ("mrr", "median_rank", "tie_rate")]
+        return cls(name, width, *recalls, *rest, queries, frames)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def selection_table(rows: Sequence[SelectionRow]) -> str:
+    """The rows, and below them the paper's, in percent; at most 100 columns wide."""
+    own = []
+    for r in rows:
+        found = [*(r.families.get(f) for f in FAMILIES)]
+        shares = [*(i and i.value for i in found), r.macro, r.micro.value, r.parse_rate]
+        name = _short(r.name, NAME_WIDTH - len(r.mode) - 3)
+        own.append([f"{name} ({r.mode})", *map(_percent, shares), f"{r.n:,}"])
+        own.append(["  95% interval", *map(_range, found), "", _range(r.micro), "", ""])
+    reference = [
+        [r.name, *map(_printed, (r.event, r.time, r.window, r.macro, r.micro, r.parse_rate)), ""]
+        for r in (paper.CHANCE, *paper.SELECTION_DISTILLED, paper.HUMAN_MAJORITY)
+    ]
+    head = ["Selection accuracy, %", *(f.capitalize() for f in FAMILIES)]
+    table = _table(
+        [*head, "Macro", "Micro", "Parsed", "Items"],
+        {"": own, "paper (Qwen3-VL 8B, full benchmark)": reference},
+    )
+    return f"{table}\nIntervals are Wilson's; an answer that cannot be parsed is wrong."
+
+
+def retrieval_table(rows: Sequence[RetrievalRow]) -> str:
+    """The rows by width, widest first, each width's untrained row on top; then the paper's."""
+    ordered = sorted(rows, key=lambda r: (-(r.width or 0), r.name != UNTRAINED))
+    own = [
+        [
+            _short(r.name, NAME_WIDTH),
+            "-" if r.width is None else str(r.width),
+            *map(_percent, (r.recall_1, r.recall_10, r.recall_50)),
+            f"{r.mrr:.3f}",
+            f"{r.median_rank:g}",
+            _percent(r.tie_rate),
+            f"{r.queries:,}",
+            f"{r.frames:,}",
+        ]
+        for r in ordered
+    ]
+    reference = [
+        [
+            r.name,
+            "",
+            *map(_printed, (r.recall_1, r.recall_10, r.recall_50)),
+            f"{r.mrr:.3f}",
+            str(r.median_rank),
+            "",
+            "2,002",
+            "10,000",
+        ]
+        for r in paper.RETRIEVAL_DISTILLED
+    ]
+    recalls = [f"R@{k}" for k in RECALLS]
+    return _table(
+        ["Retrieval", "Width", *recalls, "MRR", "Median", "Tied", "Queries", "Frames"],
+        {"": own, "paper (Qwen3-VL 8B, full benchmark)": reference},
+    )
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f}"
+
+
+def _printed(percent: float | None) -> str:
+    return "-" if percent is None else f"{percent:.1f}"
+
+
+def _range(found: Interval | None) -> str:
+    return "" if found is None else f"{100 * found.low:.0f}-{100 * found.high:.0f}"
+
+
+def _table(head: list[str], parts: dict[str, list[list[str]]]) -> str:
+    """Aligned columns, the first to the left, one part after the other under its label."""
+    cells = [head, *(row for part in parts.values() for row in part)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = [_line(head, widths)]
+    rule = "-" * (sum(widths) + 2 * len(widths) - 2)
+    for label, part in parts.items():
+        lines += [rule, *([label] if label else []), *(_line(row, widths) for row in part)]
+    return "\n".join([*lines, rule])
+
+
+def _line(row: Iterable[str], widths: list[int]) -> str:
+    first, *rest = row
+    cells = [first.ljust(widths[0])]
+    cells += [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
+    return "  ".join(cells).rstrip()
+
+
+def _short(name: str, width: int) -> str:
+    return name if len(name) <= width else name[: width - 1] + "…"
