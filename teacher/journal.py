@@ -1,0 +1,81 @@
+"""The append-only file of a teacher's answers, one JSON line each, safe against a kill."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from conf.errors import UserError
+from data.records import Rationale
+
+
+class Journal:
+    """An open rationales.jsonl; `rationales` are the answers that it held when it was opened.
+
+    A torn last line, left by a kill, is ended or taken back; the answer it lost is asked for
+    again.
+
+    Raises:
+        UserError: another process is writing it, or a line before the last cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.file = open(path, "ab+")  # noqa: SIM115  closed by __exit__
+        try:
+            fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            self.file.close()
+            raise UserError(f"{path} is being written by another run; wait for it") from error
+        self._end_torn_line()
+        self.rationales = read_rationales(path)
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.file.close()
+
+    def append(self, rationales: Iterable[Rationale]) -> None:
+        """Write answers and wait until they are on the disk."""
+        lines = [json.dumps(r.to_row(), ensure_ascii=False) + "\n" for r in rationales]
+        # A teacher may answer with half of a surrogate pair, which UTF-8 cannot hold.
+        self.file.write("".join(lines).encode("utf-8", "replace"))
+        self.file.flush()
+        os.fsync(self.file.fileno())
+
+    def _end_torn_line(self) -> None:
+        self.file.seek(0)
+        content = self.file.read()
+        whole = content.rfind(b"\n") + 1
+        torn = content[whole:]
+        if not torn:
+            return
+        try:
+            Rationale.from_row(json.loads(torn))
+        except (ValueError, TypeError, KeyError):
+            self.file.truncate(whole)
+        else:
+            self.file.write(b"\n")
+        self.file.flush()
+
+
+def read_rationales(path: Path) -> list[Rationale]:
+    """Every answer in a rationales.jsonl.
+
+    Raises:
+        UserError: a line cannot be read; names the file and the line.
+    """
+    rationales = []
+    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
+        try:
+            rationales.append(Rationale.from_row(json.loads(line)))
+        except (ValueError, TypeError, KeyError) as error:
+            raise UserError(
+                f"{path}, line {number}: not a rationale ({error}); delete the line, and its "
+                "answer is asked for again"
+            ) from error
+    return rationales
