@@ -38,6 +38,10 @@ def load_frames(path: Path) -> dict[int, Image.Image]:
         }
 
 
+CACHE_BYTES = 2 << 30
+"""Memory that decoded frames may take in a process."""
+
+
 class Frames:
     """Pixels of a store's frames, decoded once and kept as long as they are used."""
 
@@ -45,8 +49,9 @@ class Frames:
         """With `size`, frames come as squares of size x size px, as models are shown them."""
         self._store = store
         self._size = size
-        # 2 GiB at 336 x 336; a tiny benchmark fits whole.
-        self._get = lru_cache(maxsize=6_000)(self._load)
+        config = store.manifest["config"]
+        frame_bytes = 3 * (size * size if size else config["width"] * config["height"])
+        self._get = lru_cache(maxsize=CACHE_BYTES // frame_bytes)(self._load)
 
     def array(self, scene_id: str, frame: int) -> np.ndarray:
         """(height, width, 3) uint8."""
@@ -59,7 +64,7 @@ class Frames:
         image = self._read(scene_id, frame) or self._draw(self._store.scene(scene_id), frame)
         if self._size is not None:
             image = image.resize((self._size, self._size), Image.Resampling.BICUBIC)
-        return np.asarray(image)
+        return np.array(image)
 
     def _read(self, scene_id: str, frame: int) -> Image.Image | None:
         path = self._store.folder / "frames" / f"{scene_id}.zip"

@@ -13,15 +13,13 @@ from typing import TYPE_CHECKING
 from data.records import FAMILIES
 from evaluation import paper
 from evaluation.tables import RECALLS, UNTRAINED, RetrievalRow, SelectionRow
+from train.plots import COLORS, empty_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from PIL.Image import Image
 
-DPI = 150
-COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377")
-"""Told apart with any colour vision (Paul Tol's bright set)."""
 INK, FAINT, RIGHT, WRONG = "#333333", "#bbbbbb", "#228833", "#cc3311"
 STRIP = 6
 """Prefix frames in one line of an item's figure."""
@@ -30,7 +28,7 @@ STRIP = 6
 def selection_figure(rows: Sequence[SelectionRow], path: Path | str) -> None:
     """Bars of accuracy (%) by family with 95% Wilson whiskers, one colour a row of `rows`; the
     chance line; and the paper's reasoning student as hollow diamonds."""
-    figure = _figure(8, 4.4)
+    figure = empty_figure(8, 4.4)
     axes = figure.add_subplot()
     axes.spines[["top", "right"]].set_visible(False)
     width = 0.84 / (len(rows) + 1)
@@ -77,7 +75,7 @@ def retrieval_figure(rows: Sequence[RetrievalRow], path: Path | str) -> None:
     rows = sorted((r for r in rows if r.width), key=lambda r: r.width)
     names = sorted({r.name for r in rows}, key=lambda name: (name == UNTRAINED, name))
     widths = sorted({r.width for r in rows})
-    figure = _figure(9, 3.8)
+    figure = empty_figure(9, 3.8)
     panels = figure.subplots(1, len(RECALLS), sharey=True)
     for axes, k in zip(panels, RECALLS, strict=True):
         for i, name in enumerate(names):
@@ -131,7 +129,7 @@ def item_figure(
         0.35 + 0.2 * len(title),
         0.3 + wide * height_share,
     ]
-    figure = _figure(page, sum(heights))
+    figure = empty_figure(page, sum(heights))
     top, middle, bottom = figure.subfigures(3, 1, height_ratios=heights)
 
     for axes in top.subplots(lines, across, squeeze=False).flat:
@@ -155,56 +153,6 @@ def item_figure(
     if chosen is None:
         bottom.text(0.99, 0.99, "no answer", ha="right", va="top", fontsize=11, color=WRONG)
     figure.savefig(path)
-
-
-def losses_figure(records: Sequence[dict[str, float]], path: Path | str) -> None:
-    """Training and evaluation loss over steps, and a panel for each other `eval_` measure.
-
-    Args:
-        records: lines of a run's metrics, each with `step` and some of `loss`, `eval_loss` and
-            others; a resumed run's later line for a step replaces the earlier one.
-    """
-    others = sorted({k for r in records for k in r if k.startswith("eval_")} - _NOT_SHOWN)
-    figure = _figure(6.5, 3.4 + 1.7 * len(others))
-    panels = figure.subplots(
-        1 + len(others), 1, sharex=True, squeeze=False, height_ratios=[2, *[1] * len(others)]
-    )[:, 0]
-    _curve(panels[0], records, "loss", color=COLORS[0], linewidth=1.3, label="training")
-    _curve(
-        panels[0], records, "eval_loss", color=COLORS[1], linewidth=1.8, marker="o", markersize=4,
-        label="held out",
-    )  # fmt: skip
-    panels[0].set_ylabel("Loss")
-    if panels[0].get_legend_handles_labels()[0]:
-        panels[0].legend(frameon=False)
-    for axes, key in zip(panels[1:], others, strict=True):
-        _curve(axes, records, key, color=COLORS[2], linewidth=1.8, marker="o", markersize=4)
-        name = key.removeprefix("eval_").replace("_", " ")
-        axes.set_ylabel(textwrap.fill(name[:1].upper() + name[1:], 14))
-    for axes in panels:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="y", color="#eeeeee")
-    panels[-1].set_xlabel("Step")
-    figure.savefig(path)
-
-
-_NOT_SHOWN = {"eval_loss", "eval_runtime", "eval_samples_per_second", "eval_steps_per_second"}
-
-
-def _curve(axes: Axes, records: Sequence[dict[str, float]], key: str, **style) -> None:
-    points = {r["step"]: r[key] for r in records if r.get(key) is not None}
-    if points:
-        axes.plot(*zip(*sorted(points.items()), strict=True), **style)
-
-
-def _figure(width: float, height: float) -> Figure:
-    """An empty figure of width x height inches that draws with Agg."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def _color(name: str, index: int) -> str:

@@ -1,0 +1,220 @@
+"""Load a student: base, 4-bit weights, adapters; and the audit of what was loaded."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+from torch import nn
+from transformers import (
+    AutoModelForImageTextToText,
+    AutoProcessor,
+    BitsAndBytesConfig,
+    PreTrainedModel,
+    ProcessorMixin,
+)
+from transformers.utils import logging as transformers_logging
+
+from conf.errors import UserError
+from conf.schema import LoraConfig, RetrieverConfig, StudentConfig
+from train.tiny import build_model, build_processor
+
+UNQUANTIZED = ["model.visual", "visual", "lm_head"]
+"""Modules that keep their precision. Matching is anchored at the name's start, so the tower is
+named both as it stands in the generative model and in the bare one."""
+DTYPES = {"bf16": torch.bfloat16, "fp32": torch.float32}
+TOWERS = ("vision", "language", "embeddings and head")
+
+Corpus = Callable[[], Iterable[str]]
+
+
+def load_base(
+    cfg: StudentConfig | RetrieverConfig, precision: str, corpus: Corpus
+) -> tuple[PreTrainedModel, ProcessorMixin]:
+    """The base that a preset names, or builds from a seed, with its processor.
+
+    `corpus` gives the texts that a built model's tokenizer is trained on.
+
+    Raises:
+        UserError: the model is neither a folder here nor in the hub's cache, and cannot be fetched.
+    """
+    transformers_logging.disable_progress_bar()
+    if cfg.architecture is not None:
+        processor = build_processor(corpus(), cfg.architecture.vocabulary, cfg.image_size)
+        return build_model(cfg.architecture, len(processor.tokenizer)), processor
+    origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
+    # Weights that are trained stay fp32 and are computed in lower precision by autocast.
+    whole = cfg.quantization == "none" and cfg.lora is None
+    dtype = torch.float32 if whole else DTYPES[precision]
+    quantization = None
+    if cfg.quantization == "nf4":
+        quantization = BitsAndBytesConfig(
+            load_in_4bit=True,
+            bnb_4bit_quant_type="nf4",
+            bnb_4bit_compute_dtype=dtype,
+            llm_int8_skip_modules=UNQUANTIZED,
+        )
+    try:
+        processor = AutoProcessor.from_pretrained(cfg.model, **origin)
+        model = AutoModelForImageTextToText.from_pretrained(
+            cfg.model,
+            dtype=dtype,
+            quantization_config=quantization,
+            use_safetensors=True,
+            **origin,
+        )
+    except (OSError, ValueError) as error:
+        raise _not_loaded(cfg, error) from error
+    pin_sizes(processor, cfg.image_size, cfg.frames)
+    processor.tokenizer.padding_side = "left"
+    return model, processor
+
+
+def _not_loaded(cfg: StudentConfig | RetrieverConfig, error: Exception) -> UserError:
+    group = "student" if isinstance(cfg, StudentConfig) else "retriever"
+    first = next(iter(str(error).strip().splitlines()), type(error).__name__)
+    folder = Path(cfg.model)
+    if folder.is_dir():
+        return UserError(f"{group}.model={cfg.model} cannot be loaded from that folder: {first}")
+    return UserError(
+        f"{group}.model={cfg.model} is not on this machine and cannot be fetched: there is no "
+        f"folder of that name, and the hub's cache does not hold it. Point at a local copy with "
+        f"{group}.model=FOLDER (config.json, *.safetensors, tokenizer and processor files), or "
+        f"fetch it where there is a network with: hf download {cfg.model}"
+    )
+
+
+def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
+    """Keep frames at the preset's size: a video processor's default size would shrink a prefix to
+    a budget, and an image processor's would not, so that one frame came in two sizes."""
+    pixels = image_size * image_size
+    smallest = 32 * 32
+    processor.image_processor.size = {"shortest_edge": smallest, "longest_edge": pixels}
+    processor.video_processor.size = {
+        "shortest_edge": smallest,
+        "longest_edge": pixels * (frames + frames % 2),
+    }
+    processor.video_processor.do_sample_frames = False
+    processor.video_processor.cap_pixels_per_frame = False
+
+
+def add_adapters(model: PreTrainedModel, lora: LoraConfig) -> nn.Module:
+    """Freeze the base and add LoRA to the language tower's projections. Adapters are fp32 even
+    over a bf16 base: updates of this size vanish in bf16's steps."""
+    import peft
+
+    model.requires_grad_(False)
+    return peft.get_peft_model(
+        model,
+        peft.LoraConfig(
+            r=lora.rank,
+            lora_alpha=lora.alpha,
+            lora_dropout=lora.dropout,
+            target_modules=lora.targets,
+            task_type="CAUSAL_LM",
+        ),
+    )
+
+
+def load_student(
+    cfg: StudentConfig, precision: str, corpus: Corpus
+) -> tuple[nn.Module, ProcessorMixin]:
+    """A student ready to train: its base, with adapters where the preset has them."""
+    base, processor = load_base(cfg, precision, corpus)
+    base.config.use_cache = False
+    return (add_adapters(base, cfg.lora) if cfg.lora else base), processor
+
+
+def save(model: nn.Module, processor: ProcessorMixin, folder: Path, precision: str) -> None:
+    """Write what was trained, the adapters or the whole model, and the processor that goes with
+    it. A whole model is written in the precision that it computed in."""
+    import peft
+
+    if not isinstance(model, peft.PeftModel):
+        model = model.to(DTYPES[precision])
+        model.config.use_cache = True
+    model.save_pretrained(folder)
+    processor.save_pretrained(folder)
+
+
+@dataclass
+class Tower:
+    """Parameters of one part of a model."""
+
+    parameters: int = 0
+    four_bit: int = 0
+    lora: int = 0
+    trainable: int = 0
+
+
+def count_towers(model: nn.Module) -> dict[str, Tower]:
+    """Parameters by tower. A 4-bit weight counts as the entries it stands for, not its bytes."""
+    towers = {name: Tower() for name in TOWERS}
+    for name, parameter in model.named_parameters():
+        tower = towers[_tower_of(name)]
+        packed = type(parameter).__name__ == "Params4bit"
+        entries = parameter.quant_state.shape.numel() if packed else parameter.numel()
+        tower.parameters += entries
+        tower.four_bit += entries if packed else 0
+        tower.lora += entries if "lora_" in name else 0
+        tower.trainable += entries if parameter.requires_grad else 0
+    return towers
+
+
+def _tower_of(name: str) -> str:
+    if re.search(r"(^|\.)visual\.", name):
+        return "vision"
+    return "language" if re.search(r"(^|\.)layers\.\d+\.", name) else "embeddings and head"
+
+
+def check_towers(towers: dict[str, Tower], cfg: StudentConfig | RetrieverConfig) -> None:
+    """Hold what was loaded against what the preset says.
+
+    Raises:
+        UserError: a tower is quantised, adapted or trained that should not be, or is not that
+            should.
+    """
+    nf4, lora = cfg.quantization == "nf4", cfg.lora is not None
+    problems = []
+    for name, tower in towers.items():
+        language = name == "language"
+        for what, found, wanted in (
+            ("4-bit", tower.four_bit > 0, nf4 and language),
+            ("LoRA", tower.lora > 0, lora and language),
+            ("trainable", tower.trainable > 0, language or not lora),
+        ):
+            if found != wanted:
+                problems.append(f"{name} has {'some' if found else 'no'} {what} parameters")
+        if lora and tower.trainable != tower.lora:
+            problems.append(f"{name} trains {tower.trainable - tower.lora} that are not LoRA")
+    if problems:
+        raise UserError(
+            f"the loaded model is not what preset {cfg.name} says: {'; '.join(problems)}. Look at "
+            "the quantization and lora.targets of the preset"
+        )
+
+
+def tower_table(towers: dict[str, Tower]) -> str:
+    columns = [f.name for f in fields(Tower)]
+    lines = [f"{'':<22}" + "".join(f"{c.replace('four_bit', '4-bit'):>14}" for c in columns)]
+    for name, tower in towers.items():
+        lines.append(f"{name:<22}" + "".join(f"{getattr(tower, c):>14,}" for c in columns))
+    return "\n".join(lines)
+
+
+def keep_big_blocks() -> None:
+    """Tell glibc to keep the memory of big tensors between steps. By default it gives every block
+    back to the kernel at once, and on a CPU half of a training step goes into page faults."""
+    if not sys.platform.startswith("linux"):
+        return
+    trim_threshold, top_pad, mmap_threshold = -1, -2, -3
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "mallopt"):
+        libc.mallopt(mmap_threshold, 1 << 30)
+        libc.mallopt(trim_threshold, (1 << 31) - 1)
+        libc.mallopt(top_pad, 64 << 20)

@@ -1,0 +1,161 @@
+"""What both trainers share: arguments, journal, progress, resuming, and the end of a run."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import torch
+from transformers import PrinterCallback, ProgressCallback, Trainer, TrainerCallback
+from transformers.trainer_callback import TrainerControl, TrainerState
+
+from conf.entry import Run
+from conf.errors import UserError
+from conf.schema import TrainConfig
+from train.plots import curves_figure
+
+log = logging.getLogger(__name__)
+
+JOURNAL = "metrics.jsonl"
+TIMINGS = ("_runtime", "_per_second", "total_flos")
+"""Ends of the logged names that no two runs share."""
+
+SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
+
+
+def arguments(train: TrainConfig, run: Run, seed: int, resuming: bool) -> dict[str, Any]:
+    """Arguments for `TrainingArguments` and its kin, from the settings that trainers share."""
+    # A share of the steps; 1 would mean every step.
+    every = min(1 / train.evaluations, 0.9999)
+    return {
+        "output_dir": str(run.folder),
+        "seed": seed,
+        "data_seed": seed,
+        "learning_rate": train.lr,
+        "lr_scheduler_type": SCHEDULES[train.schedule],
+        "warmup_steps": train.warmup,
+        "weight_decay": train.weight_decay,
+        "max_grad_norm": train.max_grad_norm,
+        "num_train_epochs": train.epochs,
+        "max_steps": train.max_steps,
+        "gradient_accumulation_steps": train.accumulation,
+        "bf16": train.precision == "bf16",
+        "use_cpu": not torch.cuda.is_available(),
+        "gradient_checkpointing": train.gradient_checkpointing,
+        "gradient_checkpointing_kwargs": {"use_reentrant": False},
+        "eval_strategy": "steps",
+        "eval_steps": every,
+        # A resumed run has its evaluation at the start in the journal already.
+        "eval_on_start": not resuming,
+        "save_strategy": "steps",
+        "save_steps": every,
+        "save_total_limit": train.keep,
+        "logging_steps": 1,
+        "dataloader_num_workers": train.workers,
+        "dataloader_pin_memory": torch.cuda.is_available(),
+        "remove_unused_columns": False,
+        "report_to": list(train.report_to) or "none",
+        "disable_tqdm": False,
+    }
+
+
+def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None) -> None:
+    """Train from the start or a checkpoint, writing the journal and the curves."""
+    trainer.remove_callback(ProgressCallback)
+    trainer.remove_callback(PrinterCallback)
+    trainer.add_callback(Bar())
+    trainer.add_callback(Journal(run.folder))
+    if checkpoint is not None:
+        log.info("going on from %s", checkpoint)
+    trainer.train(resume_from_checkpoint=str(checkpoint) if checkpoint else None)
+    curves_figure(read_journal(run.folder), run.folder / "curves.png")
+
+
+def evaluated(folder: Path) -> dict[str, float]:
+    """First and last value of everything that a run evaluated: `<name>` and `<name>_at_start`."""
+    records = [r for r in read_journal(folder) if any(k.startswith("eval_") for k in r)]
+    results: dict[str, float] = {}
+    for record in records:
+        for key, value in record.items():
+            if key.startswith("eval_"):
+                name = key.removeprefix("eval_")
+                results.setdefault(f"{name}_at_start", value)
+                results[name] = value
+    return results
+
+
+class Journal(TrainerCallback):
+    """Appends what the trainer logs to the run's metrics.jsonl, and on resuming drops the lines
+    past the checkpoint, so that the file is that of an undisturbed run."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / JOURNAL
+
+    def on_train_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        kept = [r for r in read_journal(self._path.parent) if r["step"] <= state.global_step]
+        resumed = state.global_step > 0
+        lines = [json.dumps(r) + "\n" for r in kept] if resumed else []
+        self._path.write_text("".join(lines))
+
+    def on_log(self, args, state: TrainerState, control: TrainerControl, logs=None, **_) -> None:
+        values = {k: v for k, v in (logs or {}).items() if not k.endswith(TIMINGS)}
+        with open(self._path, "a") as file:
+            file.write(json.dumps({"step": state.global_step, **values}) + "\n")
+
+
+class Bar(ProgressCallback):
+    """The trainer's bar with its newest figures in it."""
+
+    SHOWN = ("loss", "accuracy", "recall@10")
+
+    def __init__(self, max_str_len: int = 100) -> None:
+        super().__init__(max_str_len)
+        self._figures: dict[str, str] = {}
+
+    def on_prediction_step(self, args, state, control, **_) -> None:
+        """An evaluation's own bar would break the line of the run's."""
+
+    def on_log(self, args, state, control, logs=None, **_) -> None:
+        for name, value in (logs or {}).items():
+            if name.endswith(self.SHOWN):
+                self._figures[name.removeprefix("eval_")] = f"{value:.3g}"
+        if self.training_bar is not None:
+            self.training_bar.set_postfix(self._figures)
+
+
+def read_journal(folder: Path) -> list[dict[str, Any]]:
+    """The lines of a run's metrics.jsonl; a torn last line, left by a kill, is passed over."""
+    path = folder / JOURNAL
+    if not path.exists():
+        return []
+    records = []
+    for line in path.read_text().splitlines():
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return records
+
+
+def newest_checkpoint(folder: Path) -> Path | None:
+    """The newest whole checkpoint below a run's folder. The trainer writes its state last, so a
+    checkpoint without a readable one was cut off."""
+    numbered = [(int(p.name.rpartition("-")[2]), p) for p in folder.glob("checkpoint-*")]
+    for _, path in sorted(numbered, reverse=True):
+        try:
+            json.loads((path / "trainer_state.json").read_text())
+        except (OSError, json.JSONDecodeError):
+            continue
+        return path
+    return None
+
+
+def check_not_empty(samples: int, what: str) -> None:
+    """Raises UserError where nothing is left to train on."""
+    if samples == 0:
+        raise UserError(
+            f"there are no {what}: look at the shortfalls that python -m data.build prints and at "
+            "the rejects that python -m teacher.narrate prints"
+        )

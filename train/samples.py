@@ -1,0 +1,128 @@
+"""What a regime trains on and is measured on: lists of samples that are made when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+from torch.utils.data import Dataset
+
+from conf.schema import SftCommand, StudentConfig
+from data.frames import Frames
+from data.records import LETTERS, Rationale, SelectionItem
+from data.store import Store
+from teacher.template import describe
+from train.conversation import (
+    ASK,
+    DESCRIBE,
+    Sample,
+    answer_line,
+    description_sample,
+    selection_sample,
+)
+
+HELD_OUT = 0.1
+"""Share of the training scenes whose items measure a run."""
+WORDINGS = 3
+"""Ways in which each described window is worded for the tiny base."""
+
+MakeSample = Callable[[], Sample]
+
+
+class Samples(Dataset):
+    """Samples made when they are asked for, so that pixels are not held for all of them."""
+
+    def __init__(self, makers: Sequence[MakeSample]) -> None:
+        self._makers = makers
+
+    def __len__(self) -> int:
+        return len(self._makers)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self._makers[index]()
+
+
+def held_out_scenes(store: Store, share: float, seed: int) -> set[str]:
+    """A seeded share of the training scenes, kept from training to measure it. Test scenes are
+    never touched here."""
+    names = store.scene_ids("train")
+    count = max(1, round(share * len(names)))
+    picked = np.random.default_rng([seed, 1]).permutation(len(names))[:count]
+    return {names[k] for k in picked}
+
+
+def supervised_items(
+    items: list[SelectionItem], rationales: dict[str, Rationale], cfg: StudentConfig, frames: Frames
+) -> dict[str, list[MakeSample]]:
+    """Each item in reasoning mode, where it has a rationale, and in answer mode."""
+    made: dict[str, list[MakeSample]] = {"reasoning": [], "answer": []}
+    for item in items:
+        if rationale := rationales.get(item.item_id):
+            text = rationale.text
+            made["reasoning"].append(
+                partial(selection_sample, item, "reasoning", frames, cfg, text)
+            )
+        line = answer_line(item.letter)
+        made["answer"].append(partial(selection_sample, item, "answer", frames, cfg, line))
+    return made
+
+
+def descriptions(
+    store: Store, scenes: set[str], variants: int, cfg: StudentConfig, frames: Frames, seed: int
+) -> list[MakeSample]:
+    """The built-in narrator's descriptions of training scenes, each window worded `variants` ways:
+    what the tiny base learns to write. Windows are those that items and queries show."""
+    windows = {
+        (a.scene_id, a.prefix_start, a.prefix_stop, frame)
+        for a, frame in (
+            *((i, i.target_frame) for i in store.selection("train")),
+            *((q, q.target.frame) for q in store.retrieval("train")),
+        )
+        if a.scene_id in scenes
+    }
+    made: list[MakeSample] = []
+    for scene_id, start, stop, target in sorted(windows):
+        for variant in range(variants):
+            text = describe(store.scene(scene_id), start, stop, target, seed + variant)
+            if text is not None:
+                make = partial(description_sample, scene_id, start, stop, target, frames, cfg, text)
+                made.append(make)
+    return made
+
+
+def splits(
+    store: Store, rationales: list[Rationale], cfg: SftCommand, frames: Frames
+) -> tuple[Samples, dict[str, Samples]]:
+    """Training samples of a regime, and what measures it on held-out training scenes, by mode."""
+    held_out = held_out_scenes(store, HELD_OUT, cfg.seed)
+    others = set(store.scene_ids("train")) - held_out
+    limit = cfg.train.validation_items
+    if cfg.train.regime == "describe":
+        told = partial(descriptions, store, cfg=cfg.student, frames=frames, seed=cfg.seed)
+        validation = told(scenes=held_out, variants=1)[:limit]
+        return Samples(told(scenes=others, variants=WORDINGS)), {"describe": Samples(validation)}
+    by_item = {r.item_id: r for r in rationales}
+    items = store.selection("train")
+    # The items of every family stand together: a seeded order measures all of them alike.
+    order = np.random.default_rng([cfg.seed, 2]).permutation(len(items))
+    kept = [items[k] for k in order if items[k].scene_id in held_out][:limit]
+    training = supervised_items(
+        [i for i in items if i.scene_id in others], by_item, cfg.student, frames
+    )
+    validation = supervised_items(kept, by_item, cfg.student, frames)
+    # A CoT student learns both modes, so that it can be asked in either.
+    return (
+        Samples(training["reasoning"] + training["answer"]),
+        {mode: Samples(makers) for mode, makers in validation.items() if makers},
+    )
+
+
+def corpus(store: Store, rationales: list[Rationale]) -> list[str]:
+    """Texts for a tokenizer built from nothing: all that a student reads and writes."""
+    questions = sorted({item.question for item in store.selection("train")})
+    letters = [f"\nCandidate {x}: \n{answer_line(x)}" for x in LETTERS]
+    # Every digit and the timestamps' frame, often enough to be worth merges.
+    clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
+    prompts = [*questions, *letters, *ASK.values(), DESCRIBE, "user", "assistant", "Later: "]
+    return [*prompts * 20, *clock, *(r.text for r in rationales)]

@@ -1,0 +1,68 @@
+"""Train a student on rationales or answers: LoRA over a frozen, quantised base."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from conf.entry import Run, command
+from conf.schema import SftCommand
+
+log = logging.getLogger(__name__)
+
+
+@command("train.sft", SftCommand)
+def main(cfg: SftCommand, run: Run) -> dict[str, float]:
+    from data.build import ensure_benchmark
+    from teacher.narrate import ensure_rationales
+
+    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    rationales = []
+    if cfg.train.regime != "answer_only":
+        rationales = ensure_rationales(store, cfg.teacher, cfg.workers)
+
+    from transformers import Trainer, TrainingArguments
+
+    from data.frames import Frames
+    from train import backbone, loop, samples
+    from train.audit import audit
+    from train.collate import Collator, letter_ids
+    from train.sft_trainer import LetterChoice, token_mean
+
+    backbone.keep_big_blocks()
+    log.info("loading student %s", cfg.student.name)
+    model, processor = backbone.load_student(
+        cfg.student, cfg.train.precision, lambda: samples.corpus(store, rationales)
+    )
+    frames = Frames(store, cfg.student.image_size)
+    training, validation = samples.splits(store, rationales, cfg, frames)
+    loop.check_not_empty(len(training), f"samples for train.regime={cfg.train.regime}")
+    collator = Collator(processor, cfg.student.max_length)
+    log.info(audit(model, processor, cfg.student, training[0], collator))
+
+    # Descriptions end in no answer whose letter could be measured.
+    letters = None if cfg.train.regime == "describe" else LetterChoice(letter_ids(processor))
+    checkpoint = loop.newest_checkpoint(run.folder)
+    trainer = Trainer(
+        model=model,
+        args=TrainingArguments(
+            **loop.arguments(cfg.train, run, cfg.seed, resuming=checkpoint is not None),
+            per_device_train_batch_size=cfg.train.micro_batch,
+            per_device_eval_batch_size=cfg.train.micro_batch,
+            label_names=["labels"],
+        ),
+        data_collator=collator,
+        train_dataset=training,
+        eval_dataset=validation,
+        compute_loss_func=token_mean,
+        preprocess_logits_for_metrics=letters and letters.shrink,
+        compute_metrics=letters and letters.accuracy,
+    )
+    loop.train_and_log(trainer, run, checkpoint)
+    backbone.save(model, processor, run.folder / "student", cfg.train.precision)
+    log.info("the student is in %s", run.folder / "student")
+    return loop.evaluated(run.folder)
+
+
+if __name__ == "__main__":
+    main()

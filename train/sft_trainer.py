@@ -1,0 +1,51 @@
+"""What differs from transformers.Trainer for a student: the loss of an accumulated batch, and the
+measure of the answer's letter. Both go in through the Trainer's own arguments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch.nn.functional import cross_entropy
+from transformers import EvalPrediction
+
+from train.collate import IGNORED
+
+
+def token_mean(
+    outputs: Any, labels: torch.Tensor, num_items_in_batch: torch.Tensor | int | None = None
+) -> torch.Tensor:
+    """Cross entropy summed over a micro-batch's supervised tokens, over the count of those in the
+    whole accumulated batch, so that every token weighs the same whatever sample it is of.
+
+    Transformers averages this model's samples first, so that an answer of three tokens would weigh
+    as much as a whole rationale.
+    """
+    predicted, following = outputs.logits[:, :-1].flatten(0, 1), labels[:, 1:].flatten()
+    total = cross_entropy(predicted.float(), following, ignore_index=IGNORED, reduction="sum")
+    count = num_items_in_batch if num_items_in_batch is not None else (following != IGNORED).sum()
+    return total / count
+
+
+class LetterChoice:
+    """The letter that a student would answer, from the letters' logits where the answer's letter
+    stands; two numbers an item are kept, never the logits."""
+
+    def __init__(self, letters: list[int]) -> None:
+        self._letters = torch.tensor(letters)
+
+    def shrink(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+        """(B, 2) index of the chosen letter and of the right one.
+
+        The letter is the last supervised token but one, before the end of the turn.
+        """
+        letters = self._letters.to(logits.device)
+        position = labels.shape[1] - 2
+        chosen = logits[:, position - 1, letters].argmax(dim=-1)
+        right = (labels[:, position, None] == letters).int().argmax(dim=-1)
+        return torch.stack([chosen, right], dim=-1)
+
+    @staticmethod
+    def accuracy(prediction: EvalPrediction) -> dict[str, float]:
+        chosen, right = prediction.predictions[:, 0], prediction.predictions[:, 1]
+        return {"letter_accuracy": float((chosen == right).mean())}

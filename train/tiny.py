@@ -1,0 +1,139 @@
+"""A small, real Qwen3-VL built offline from sizes and a seed, with its tokenizer and processor.
+
+Everything is the standard classes of transformers, so that what works here works on the released
+models: the same module names, chat format, timestamps and vision tokens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
+from transformers import (
+    PreTrainedTokenizerFast,
+    Qwen2VLImageProcessor,
+    Qwen3VLConfig,
+    Qwen3VLForConditionalGeneration,
+    Qwen3VLProcessor,
+    Qwen3VLVideoProcessor,
+)
+
+from conf.schema import ArchitectureConfig
+
+SPECIAL_TOKENS = (
+    "<|endoftext|>",
+    "<|im_start|>",
+    "<|im_end|>",
+    "<|vision_start|>",
+    "<|vision_end|>",
+    "<|image_pad|>",
+    "<|video_pad|>",
+)
+# Qwen3-VL's chat format: roles between im_start and im_end, a placeholder for each medium.
+CHAT_TEMPLATE = (
+    "{%- for message in messages -%}"
+    "{{ '<|im_start|>' + message.role + '\\n' }}"
+    "{%- if message.content is string -%}{{ message.content }}"
+    "{%- else -%}"
+    "{%- for part in message.content -%}"
+    "{%- if part.type == 'image' -%}{{ '<|vision_start|><|image_pad|><|vision_end|>' }}"
+    "{%- elif part.type == 'video' -%}{{ '<|vision_start|><|video_pad|><|vision_end|>' }}"
+    "{%- elif part.type == 'text' -%}{{ part.text }}{%- endif -%}"
+    "{%- endfor -%}"
+    "{%- endif -%}"
+    "{{ '<|im_end|>\\n' }}"
+    "{%- endfor -%}"
+    "{%- if add_generation_prompt -%}{{ '<|im_start|>assistant\\n' }}{%- endif -%}"
+)
+PATCH, MERGE, TEMPORAL = 16, 2, 2
+
+
+def build_model(sizes: ArchitectureConfig, vocabulary: int) -> Qwen3VLForConditionalGeneration:
+    """A Qwen3-VL with random weights drawn from `sizes.seed`, in fp32.
+
+    `vocabulary` is the tokenizer's size; ids of special tokens are those of `build_processor`.
+    """
+    half = sizes.head // 2
+    height = width = half // 3
+    config = Qwen3VLConfig(
+        text_config={
+            "vocab_size": vocabulary,
+            "hidden_size": sizes.hidden,
+            "intermediate_size": sizes.feed_forward,
+            "num_hidden_layers": sizes.layers,
+            "num_attention_heads": sizes.heads,
+            "num_key_value_heads": sizes.kv_heads,
+            "head_dim": sizes.head,
+            "max_position_embeddings": 4096,
+            "rope_parameters": {
+                "rope_type": "default",
+                "rope_theta": 5e6,
+                "mrope_section": [half - height - width, height, width],
+                "mrope_interleaved": True,
+            },
+            "tie_word_embeddings": True,
+        },
+        vision_config={
+            "depth": sizes.vision_layers,
+            "hidden_size": sizes.vision_hidden,
+            "intermediate_size": sizes.vision_feed_forward,
+            "num_heads": sizes.vision_heads,
+            "out_hidden_size": sizes.hidden,
+            "patch_size": PATCH,
+            "spatial_merge_size": MERGE,
+            "temporal_patch_size": TEMPORAL,
+            "num_position_embeddings": 12 * 12,
+            "deepstack_visual_indexes": [sizes.vision_layers // 2],
+        },
+        image_token_id=SPECIAL_TOKENS.index("<|image_pad|>"),
+        video_token_id=SPECIAL_TOKENS.index("<|video_pad|>"),
+        vision_start_token_id=SPECIAL_TOKENS.index("<|vision_start|>"),
+        vision_end_token_id=SPECIAL_TOKENS.index("<|vision_end|>"),
+        tie_word_embeddings=True,
+    )
+    with torch.random.fork_rng():
+        torch.manual_seed(sizes.seed)
+        model = Qwen3VLForConditionalGeneration(config)
+    end = SPECIAL_TOKENS.index("<|im_end|>")
+    padding = SPECIAL_TOKENS.index("<|endoftext|>")
+    model.generation_config.update(eos_token_id=end, pad_token_id=padding)
+    return model
+
+
+def build_processor(corpus: Iterable[str], vocabulary: int, image_size: int) -> Qwen3VLProcessor:
+    """A processor whose byte-level BPE tokenizer was trained on `corpus`; the same texts in the
+    same order give the same tokenizer."""
+    tokenizer = Tokenizer(models.BPE())
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    tokenizer.decoder = decoders.ByteLevel()
+    trainer = trainers.BpeTrainer(
+        vocab_size=vocabulary,
+        special_tokens=list(SPECIAL_TOKENS),
+        initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()),
+        show_progress=False,
+    )
+    tokenizer.train_from_iterator(corpus, trainer)
+    fast = PreTrainedTokenizerFast(
+        tokenizer_object=tokenizer,
+        eos_token="<|im_end|>",
+        pad_token="<|endoftext|>",
+        padding_side="left",
+        clean_up_tokenization_spaces=False,
+        extra_special_tokens=list(SPECIAL_TOKENS[1:]),
+    )
+    pixels = image_size * image_size
+    shared = {"patch_size": PATCH, "merge_size": MERGE, "temporal_patch_size": TEMPORAL}
+    return Qwen3VLProcessor(
+        image_processor=Qwen2VLImageProcessor(
+            size={"shortest_edge": 32 * 32, "longest_edge": pixels}, **shared
+        ),
+        tokenizer=fast,
+        video_processor=Qwen3VLVideoProcessor(
+            size={"shortest_edge": 32 * 32, "longest_edge": pixels * 64},
+            do_sample_frames=False,
+            cap_pixels_per_frame=False,
+            **shared,
+        ),
+        chat_template=CHAT_TEMPLATE,
+    )
