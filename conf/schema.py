@@ -392,3 +392,8 @@ class RetrieveCommand(CommandConfig):
 
     def check(self) -> list[str]:
         return [] if self.batch >= 1 else [f"batch={self.batch} must be 1 or more"]
+
+
+@dataclass
+class ReportCommand(CommandConfig):
+    pass

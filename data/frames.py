@@ -57,6 +57,10 @@ class Frames:
         """(height, width, 3) uint8."""
         return self._get(scene_id, frame)
 
+    def stack(self, scene_id: str, frames: list[int]) -> np.ndarray:
+        """(T, height, width, 3) uint8."""
+        return np.stack([self.array(scene_id, frame) for frame in frames])
+
     def image(self, scene_id: str, frame: int) -> Image.Image:
         return Image.fromarray(self.array(scene_id, frame))
 

@@ -135,7 +135,7 @@ class BulletRenderer:
         away = -np.asarray(LIGHT[:2]) / LIGHT[2]
         for x, y, _ in positions:
             centre = np.array([x, y]) + 0.5 * RADIUS * away
-            distance = ((points - centre) ** 2).sum(axis=-1)
+            distance = (points[..., 0] - centre[0]) ** 2 + (points[..., 1] - centre[1]) ** 2
             shade *= 1 - SHADOW_DEPTH * np.exp(-distance / (2 * (0.85 * RADIUS) ** 2))
         return shade[..., None] * np.asarray(FLOOR, dtype=np.float32)
 

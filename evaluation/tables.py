@@ -41,6 +41,11 @@ class SelectionRow:
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
 
+    @classmethod
+    def from_dict(cls, row: dict[str, Any]) -> SelectionRow:
+        families = {name: Interval(**found) for name, found in row["families"].items()}
+        return cls(**{**row, "families": families, "micro": Interval(**row["micro"])})
+
 
 @dataclass(frozen=True)
 class RetrievalRow:

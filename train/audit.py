@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import re
 
+from sentence_transformers import SentenceTransformer
 from torch import nn
 from transformers import ProcessorMixin
 
-from conf.schema import StudentConfig
+from conf.errors import UserError
+from conf.schema import RetrieverConfig, StudentConfig
+from data.frames import Frames
+from data.records import RetrievalQuery
 from train.backbone import check_towers, count_towers, tower_table
 from train.collate import IGNORED, Collator
 from train.conversation import Sample
+from train.retriever import frame_input, query_input
 
 
 def audit(
@@ -40,6 +45,40 @@ def audit(
             f"frames of {cfg.image_size} x {cfg.image_size} px become {grids(batch, processor)}",
             f"a sample of {len(ids)} tokens, {supervised} of them supervised:",
             f"{squeeze(decode(prompt))}>>>{squeeze(decode(response))}<<<",
+        ]
+    )
+
+
+def audit_retriever(
+    model: SentenceTransformer, cfg: RetrieverConfig, query: RetrievalQuery, frames: Frames
+) -> str:
+    """The same for a retriever: counts, grids, and a decoded query and frame.
+
+    Raises:
+        UserError: the counts are not what the preset says, or the model is narrower than its
+            widest width.
+    """
+    towers = count_towers(model)
+    check_towers(towers, cfg)
+    width = model.get_embedding_dimension()
+    if max(cfg.widths) > width:
+        raise UserError(
+            f"retriever.widths={cfg.widths} starts wider than the model's embeddings of {width}"
+        )
+    processor = model[0].processor
+    asked = model.preprocess([query_input(query, frames, cfg)], prompt=cfg.query_instruction)
+    shown = model.preprocess([frame_input(query.target, frames)], prompt=cfg.frame_instruction)
+    decode = processor.tokenizer.decode
+    return "\n".join(
+        [
+            f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora else 'whole'})",
+            tower_table(towers),
+            f"frames of {cfg.image_size} x {cfg.image_size} px become "
+            f"{grids(asked | {k: shown[k] for k in ('image_grid_thw',)}, processor)}",
+            f"a query of {asked['input_ids'].shape[1]} tokens, embedded at the last one:",
+            squeeze(decode(asked["input_ids"][0])),
+            f"a frame of {shown['input_ids'].shape[1]} tokens:",
+            squeeze(decode(shown["input_ids"][0])),
         ]
     )
 

@@ -6,7 +6,7 @@ import ctypes
 import re
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -47,18 +47,12 @@ def load_base(
     if cfg.architecture is not None:
         processor = build_processor(corpus(), cfg.architecture.vocabulary, cfg.image_size)
         return build_model(cfg.architecture, len(processor.tokenizer)), processor
+    group = "student" if isinstance(cfg, StudentConfig) else "retriever"
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     # Weights that are trained stay fp32 and are computed in lower precision by autocast.
     whole = cfg.quantization == "none" and cfg.lora is None
     dtype = torch.float32 if whole else DTYPES[precision]
-    quantization = None
-    if cfg.quantization == "nf4":
-        quantization = BitsAndBytesConfig(
-            load_in_4bit=True,
-            bnb_4bit_quant_type="nf4",
-            bnb_4bit_compute_dtype=dtype,
-            llm_int8_skip_modules=UNQUANTIZED,
-        )
+    quantization = nf4_config(dtype) if cfg.quantization == "nf4" else None
     try:
         processor = AutoProcessor.from_pretrained(cfg.model, **origin)
         model = AutoModelForImageTextToText.from_pretrained(
@@ -69,23 +63,32 @@ def load_base(
             **origin,
         )
     except (OSError, ValueError) as error:
-        raise _not_loaded(cfg, error) from error
+        raise load_failure(group, cfg.model, error) from error
     pin_sizes(processor, cfg.image_size, cfg.frames)
     processor.tokenizer.padding_side = "left"
     return model, processor
 
 
-def _not_loaded(cfg: StudentConfig | RetrieverConfig, error: Exception) -> UserError:
-    group = "student" if isinstance(cfg, StudentConfig) else "retriever"
+def nf4_config(compute: torch.dtype) -> BitsAndBytesConfig:
+    """4-bit NF4 for the language tower; vision tower and head keep their precision."""
+    return BitsAndBytesConfig(
+        load_in_4bit=True,
+        bnb_4bit_quant_type="nf4",
+        bnb_4bit_compute_dtype=compute,
+        llm_int8_skip_modules=UNQUANTIZED,
+    )
+
+
+def load_failure(group: str, model: str, error: Exception) -> UserError:
+    """What to tell a user whose model did not load."""
     first = next(iter(str(error).strip().splitlines()), type(error).__name__)
-    folder = Path(cfg.model)
-    if folder.is_dir():
-        return UserError(f"{group}.model={cfg.model} cannot be loaded from that folder: {first}")
+    if Path(model).is_dir():
+        return UserError(f"{group}.model={model} cannot be loaded from that folder: {first}")
     return UserError(
-        f"{group}.model={cfg.model} is not on this machine and cannot be fetched: there is no "
+        f"{group}.model={model} is not on this machine and cannot be fetched: there is no "
         f"folder of that name, and the hub's cache does not hold it. Point at a local copy with "
         f"{group}.model=FOLDER (config.json, *.safetensors, tokenizer and processor files), or "
-        f"fetch it where there is a network with: hf download {cfg.model}"
+        f"fetch it where there is a network with: hf download {model}"
     )
 
 
@@ -128,6 +131,25 @@ def load_student(
     base, processor = load_base(cfg, precision, corpus)
     base.config.use_cache = False
     return (add_adapters(base, cfg.lora) if cfg.lora else base), processor
+
+
+def load_trained(
+    cfg: StudentConfig, precision: str, folder: Path
+) -> tuple[nn.Module, ProcessorMixin]:
+    """A trained student as `save` wrote it, ready to answer: adapters over their base, or a whole
+    model.
+
+    Raises:
+        UserError: `folder` holds no student, or its base is not on this machine.
+    """
+    import peft
+
+    if (folder / "adapter_config.json").exists():
+        base, processor = load_base(cfg, precision, list)
+        return peft.PeftModel.from_pretrained(base, folder).eval(), processor
+    whole = replace(cfg, model=str(folder), architecture=None, quantization="none", lora=None)
+    model, processor = load_base(whole, precision, list)
+    return model.eval(), processor
 
 
 def save(model: nn.Module, processor: ProcessorMixin, folder: Path, precision: str) -> None:

@@ -74,7 +74,7 @@ def selection_sample(
     return Sample(
         f"{item.item_id} ({mode})",
         content,
-        np.stack([frames.array(item.scene_id, f) for f in shown]),
+        frames.stack(item.scene_id, shown),
         shown,
         [frames.array(c.scene_id, c.frame) for c in item.candidates],
         response,
@@ -100,7 +100,7 @@ def description_sample(
             {"type": "image"},
             {"type": "text", "text": f"\n{DESCRIBE}"},
         ],
-        np.stack([frames.array(scene_id, f) for f in shown]),
+        frames.stack(scene_id, shown),
         shown,
         [frames.array(scene_id, target)],
         response,

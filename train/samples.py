@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from torch.utils.data import Dataset
@@ -28,6 +29,7 @@ WORDINGS = 3
 """Ways in which each described window is worded for the tiny base."""
 
 MakeSample = Callable[[], Sample]
+Row = TypeVar("Row")
 
 
 class Samples(Dataset):
@@ -43,13 +45,18 @@ class Samples(Dataset):
         return self._makers[index]()
 
 
-def held_out_scenes(store: Store, share: float, seed: int) -> set[str]:
+def held_out_scenes(store: Store, seed: int) -> set[str]:
     """A seeded share of the training scenes, kept from training to measure it. Test scenes are
     never touched here."""
     names = store.scene_ids("train")
-    count = max(1, round(share * len(names)))
+    count = max(1, round(HELD_OUT * len(names)))
     picked = np.random.default_rng([seed, 1]).permutation(len(names))[:count]
     return {names[k] for k in picked}
+
+
+def shuffled(rows: list[Row], seed: int) -> list[Row]:
+    """The rows in a seeded order."""
+    return [rows[k] for k in np.random.default_rng([seed, 2]).permutation(len(rows))]
 
 
 def supervised_items(
@@ -95,18 +102,17 @@ def splits(
     store: Store, rationales: list[Rationale], cfg: SftCommand, frames: Frames
 ) -> tuple[Samples, dict[str, Samples]]:
     """Training samples of a regime, and what measures it on held-out training scenes, by mode."""
-    held_out = held_out_scenes(store, HELD_OUT, cfg.seed)
+    held_out = held_out_scenes(store, cfg.seed)
     others = set(store.scene_ids("train")) - held_out
     limit = cfg.train.validation_items
     if cfg.train.regime == "describe":
         told = partial(descriptions, store, cfg=cfg.student, frames=frames, seed=cfg.seed)
-        validation = told(scenes=held_out, variants=1)[:limit]
+        validation = shuffled(told(scenes=held_out, variants=1), cfg.seed)[:limit]
         return Samples(told(scenes=others, variants=WORDINGS)), {"describe": Samples(validation)}
     by_item = {r.item_id: r for r in rationales}
     items = store.selection("train")
-    # The items of every family stand together: a seeded order measures all of them alike.
-    order = np.random.default_rng([cfg.seed, 2]).permutation(len(items))
-    kept = [items[k] for k in order if items[k].scene_id in held_out][:limit]
+    # The items of every family stand together: a shuffled slice measures all of them.
+    kept = shuffled([i for i in items if i.scene_id in held_out], cfg.seed)[:limit]
     training = supervised_items(
         [i for i in items if i.scene_id in others], by_item, cfg.student, frames
     )

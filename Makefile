@@ -1,0 +1,53 @@
+# Everything a user types. `make help` prints what stands behind each ##.
+PYTHON ?= python3.11
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: help setup run test check lint format base constraints clean
+
+help: ## Print this
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
+
+setup: $(READY) ## Make .venv with everything that is needed
+
+# The tested versions are wishes, not demands: where a machine's registry lacks one, the ranges hold.
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --upgrade uv
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --constraint constraints.txt --editable '.[test]'
+	@touch $(READY)
+
+run: setup ## Train and measure the tiny student and the tiny retriever, and report on both
+	$(BIN)/python -m train.sft +exp=cot
+	$(BIN)/python -m evaluation.select model=checkpoints/sft/exp=cot
+	$(BIN)/python -m train.contrastive
+	$(BIN)/python -m evaluation.retrieve model=checkpoints/contrastive/default
+	$(BIN)/python -m evaluation.report
+
+test: setup ## Run every test
+	$(BIN)/python -m pytest
+
+check: setup lint ## Lint, then run the quick tests
+	$(BIN)/python -m pytest -m "not slow"
+
+lint: setup ## Check format and style
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+
+format: setup ## Format and mend style
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+base: setup ## Train the tiny base anew and put it into checkpoints/bases/tiny
+	$(BIN)/python -m train.sft +exp=base
+	mkdir -p checkpoints/bases/tiny
+	cp -r checkpoints/sft/exp=base/student/. checkpoints/bases/tiny/
+	cp checkpoints/sft/exp=base/config.yaml checkpoints/sft/exp=base/run.json \
+	   checkpoints/sft/exp=base/metrics.jsonl checkpoints/sft/exp=base/curves.png checkpoints/bases/tiny/
+
+constraints: setup ## Write constraints.txt from the versions in .venv
+	$(BIN)/uv pip freeze --quiet --python $(BIN)/python --exclude-editable > constraints.txt
+
+clean: ## Remove built benchmarks and runs, not the environment
+	rm -rf store checkpoints/build checkpoints/narrate checkpoints/sft checkpoints/contrastive \
+	   checkpoints/select checkpoints/retrieve checkpoints/report

@@ -1,0 +1,107 @@
+"""Ask a student for its answers, and keep every one: an append-only file that a killed evaluation
+goes on from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import nn
+from tqdm import tqdm
+from transformers import ProcessorMixin
+
+from conf.schema import StudentConfig
+from data.frames import Frames
+from data.records import SelectionItem
+from evaluation.protocol import parse
+from train.backbone import DTYPES
+from train.collate import Collator
+from train.conversation import selection_sample
+
+ANSWER_TOKENS = 16
+"""New tokens at most in answer mode: the one line, and room to miss it."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a student said to one item in one mode. `letter` is None where no choice could be
+    read, and `reason` then says why."""
+
+    item_id: str
+    mode: str
+    text: str
+    letter: str | None
+    reason: str | None
+    right: bool
+
+
+class AnswerLog:
+    """The answers in a file, one JSON line each."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.answers: dict[tuple[str, str], Answer] = {}
+        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+        if lines and not lines[-1].endswith("\n"):
+            # Torn by a kill: the item is asked again.
+            path.write_text("".join(lines[:-1]))
+            lines = lines[:-1]
+        for line in lines:
+            answer = Answer(**json.loads(line))
+            self.answers[answer.item_id, answer.mode] = answer
+
+    def append(self, answers: list[Answer]) -> None:
+        with open(self._path, "a") as file:
+            file.writelines(json.dumps(asdict(a)) + "\n" for a in answers)
+        self.answers |= {(a.item_id, a.mode): a for a in answers}
+
+
+def ask_all(
+    model: nn.Module,
+    processor: ProcessorMixin,
+    items: list[SelectionItem],
+    mode: str,
+    frames: Frames,
+    cfg: StudentConfig,
+    precision: str,
+    batch: int,
+    log: AnswerLog,
+) -> list[Answer]:
+    """Every item's answer in `mode`, greedily decoded; items that the log holds are not asked."""
+    waiting = [i for i in items if (i.item_id, mode) not in log.answers]
+    limit = cfg.max_new_tokens if mode == "reasoning" else ANSWER_TOKENS
+    collator = Collator(processor, cfg.max_length)
+    with tqdm(total=len(items), initial=len(items) - len(waiting), desc=mode, unit="item") as bar:
+        for group in _groups(waiting, batch):
+            inputs = collator([selection_sample(i, mode, frames, cfg) for i in group])
+            texts = generate(model, processor, inputs, limit, precision)
+            log.append([_judge(i, mode, t) for i, t in zip(group, texts, strict=True)])
+            bar.update(len(group))
+    return [log.answers[i.item_id, mode] for i in items]
+
+
+def generate(
+    model: nn.Module, processor: ProcessorMixin, inputs: dict, limit: int, precision: str
+) -> list[str]:
+    """The texts that a model writes after left-padded prompts, `limit` tokens at most."""
+    device = next(model.parameters()).device
+    inputs = {name: value.to(device) for name, value in inputs.items() if name != "labels"}
+    autocast = torch.autocast(device.type, DTYPES[precision], enabled=precision == "bf16")
+    with torch.inference_mode(), autocast:
+        ids = model.generate(**inputs, max_new_tokens=limit, do_sample=False, use_cache=True)
+    new = ids[:, inputs["input_ids"].shape[1] :]
+    return processor.tokenizer.batch_decode(new, skip_special_tokens=True)
+
+
+def _judge(item: SelectionItem, mode: str, text: str) -> Answer:
+    choice = parse(text)
+    reason = str(choice.reason) if choice.letter is None and choice.reason else None
+    return Answer(item.item_id, mode, text, choice.letter, reason, choice.letter == item.letter)
+
+
+def _groups(items: list[SelectionItem], size: int) -> Iterator[list[SelectionItem]]:
+    for start in range(0, len(items), size):
+        yield items[start : start + size]

@@ -1,0 +1,104 @@
+"""Gather what was trained and measured below checkpoints/ on one page, with one picture."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+from conf.entry import Run, command
+from conf.errors import UserError
+from conf.runs import write_text
+from conf.schema import ReportCommand
+
+log = logging.getLogger(__name__)
+
+
+@command("evaluation.report", ReportCommand)
+def main(cfg: ReportCommand, run: Run) -> None:
+    root = Path(cfg.checkpoints)
+    selected, retrieved = _finished(root, "select"), _finished(root, "retrieve")
+    if not selected and not retrieved:
+        raise UserError(
+            f"nothing is measured below {root}: run python -m evaluation.select "
+            "model=checkpoints/sft/RUN or python -m evaluation.retrieve "
+            "model=checkpoints/contrastive/RUN first"
+        )
+    from evaluation.figures import retrieval_figure, selection_figure
+    from evaluation.tables import (
+        RetrievalRow,
+        SelectionRow,
+        retrieval_table,
+        selection_table,
+    )
+
+    choices = [SelectionRow.from_dict(r) for f in selected for r in _rows(f)]
+    ranks = [RetrievalRow(**r) for f in retrieved for r in _rows(f)]
+    ranks = list(dict.fromkeys(ranks))
+    trained = [f for kind in ("sft", "contrastive") for f in _finished(root, kind)]
+    parts = [training_table(trained)] if trained else []
+    pictures = [f / "curves.png" for f in trained]
+    if choices:
+        parts.append(selection_table(choices))
+        selection_figure(choices, run.folder / "selection.png")
+        pictures = [selected[-1] / "item.png", run.folder / "selection.png", *pictures]
+    if ranks:
+        parts.append(retrieval_table(ranks))
+        retrieval_figure(ranks, run.folder / "retrieval.png")
+        pictures.append(run.folder / "retrieval.png")
+    picture = run.folder / "report.png"
+    compose_page([p for p in pictures if p.exists()], picture)
+    page = "\n\n".join(parts) + f"\n\npicture: {picture}"
+    log.info("%s", page)
+    write_text(run.folder / "report.txt", page + "\n")
+
+
+def _finished(root: Path, command_name: str) -> list[Path]:
+    """The folders of a command's finished runs, oldest first."""
+    done = root.glob(f"{command_name}/*/metrics.json")
+    return [p.parent for p in sorted(done, key=lambda p: p.stat().st_mtime)]
+
+
+def _rows(folder: Path) -> list[dict[str, Any]]:
+    return json.loads((folder / "report.json").read_text())["rows"]
+
+
+def training_table(runs: list[Path]) -> str:
+    """What each run measured on held-out training scenes, at its start and at its end."""
+    lines = [f"{'Training (held-out scenes)':<44}{'start':>10}{'end':>10}"]
+    lines.append("-" * 64)
+    for folder in runs:
+        metrics = json.loads((folder / "metrics.json").read_text())
+        for name, value in metrics.items():
+            start = metrics.get(f"{name}_at_start")
+            if start is not None:
+                label = f"{folder.parent.name}/{folder.name} {name.replace('_', ' ')}"
+                lines.append(f"{label:<44}{start:>10.3f}{value:>10.3f}")
+    return "\n".join(lines)
+
+
+def compose_page(pictures: list[Path], path: Path) -> None:
+    """Paste pictures into one page of two columns, each column's pictures as wide as it."""
+    from PIL import Image
+
+    images = [Image.open(p).convert("RGB") for p in pictures]
+    width, gap = 1000, 30
+    scaled = [i.resize((width, round(i.height * width / i.width))) for i in images]
+    columns: list[list[Image.Image]] = [[], []]
+    heights = [gap, gap]
+    for image in scaled:
+        shorter = heights.index(min(heights))
+        columns[shorter].append(image)
+        heights[shorter] += image.height + gap
+    page = Image.new("RGB", (2 * width + 3 * gap, max(heights)), "white")
+    for k, column in enumerate(columns):
+        top = gap
+        for image in column:
+            page.paste(image, (gap + k * (width + gap), top))
+            top += image.height + gap
+    page.save(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""Shared by every room's tests: one small benchmark, really simulated and rendered, built once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from conf.schema import (
+    BenchmarkConfig,
+    Quota,
+    RetrievalTrackConfig,
+    SelectionConfig,
+)
+from data.build import build
+from data.selection import event, time, window
+from data.store import Store, open_store
+
+
+def micro_config(**changes: object) -> BenchmarkConfig:
+    """Ten scenes at the tiny preset's frame size, two items a cell."""
+    few = Quota(train=2, test=1)
+    settings = {
+        "name": "micro",
+        "scenes": 10,
+        "width": 192,
+        "height": 128,
+        "selection": SelectionConfig(
+            event=dict.fromkeys(event.CELLS, few),
+            time=dict.fromkeys(time.CELLS, few),
+            window=dict.fromkeys(window.CELLS, few),
+        ),
+        "retrieval": RetrievalTrackConfig(
+            builders={str(k): Quota(train=4, test=2) for k in range(1, 7)},
+            hard_negatives=2,
+            database=60,
+        ),
+    }
+    return BenchmarkConfig(**{**settings, **changes})
+
+
+@pytest.fixture(scope="session")
+def micro() -> BenchmarkConfig:
+    return micro_config()
+
+
+@pytest.fixture(scope="session")
+def micro_store(tmp_path_factory: pytest.TempPathFactory, micro: BenchmarkConfig) -> Store:
+    folder: Path = tmp_path_factory.mktemp("store") / "micro"
+    build(micro, folder, workers=2)
+    return open_store(folder)

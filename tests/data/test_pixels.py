@@ -1,0 +1,142 @@
+"""What the camera sees: geometry against Bullet's own mask, and looks that can be told apart."""
+
+from __future__ import annotations
+
+import colorsys
+
+import numpy as np
+import pytest
+
+from conf.schema import BenchmarkConfig
+from data.bullet import simulate_scene
+from data.geometry import Camera, displacements, object_match
+from data.records import COLORS, MATERIALS, SHAPES, Scene, SceneObject
+from data.render import RGB, BulletRenderer, renderer
+
+LIMITS = BenchmarkConfig(name="pixels")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return simulate_scene(0, 0, "train", LIMITS)
+
+
+def test_the_origin_is_seen_at_the_images_centre() -> None:
+    pixel, depth = Camera().project(np.zeros(3))
+    np.testing.assert_allclose(pixel, [240, 160], atol=1e-9)
+    assert depth == pytest.approx(5.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("frame", [20, 45, 60, 100])
+def test_visibility_agrees_with_bullets_mask(scene: Scene, frame: int) -> None:
+    drawn = BulletRenderer(240, 160)  # twice that inside: the oracle's own 480 x 320
+    drawn.render(scene, frame)
+    bullet, camera = drawn._bullet, drawn._fine
+    take = (camera.width, camera.height, drawn._view, drawn._projection)
+    mask = np.reshape(bullet.getCameraImage(*take, renderer=bullet.ER_TINY_RENDERER)[4], (320, 480))
+    for k in range(len(scene.objects)):
+        seen = int((mask == drawn._handles[k]).sum())
+        assert (seen > 8) <= scene.in_view[frame, k]
+        for j, handle in enumerate(drawn._handles):
+            if j != k:
+                bullet.resetBasePositionAndOrientation(handle, [0, 0, -50], [0, 0, 0, 1])
+        alone = np.reshape(
+            bullet.getCameraImage(*take, renderer=bullet.ER_TINY_RENDERER)[4], (320, 480)
+        )
+        covers = int((alone == drawn._handles[k]).sum())
+        drawn.render(scene, frame)
+        if covers > 100:
+            assert scene.visible_fraction[frame, k] == pytest.approx(seen / covers, abs=0.05)
+
+
+def test_a_frame_is_no_distance_from_itself(scene: Scene) -> None:
+    apart = displacements(scene)
+    np.testing.assert_array_equal(np.diag(apart), 0)
+    np.testing.assert_array_equal(apart, apart.T)
+    assert object_match(scene, 40)[40] == 0
+    assert (object_match(scene, 40) <= 1).all()
+
+
+def test_the_same_frame_is_the_same_pixels(scene: Scene) -> None:
+    first = BulletRenderer(192, 128).render(scene, 50).tobytes()
+    again = renderer(192, 128)
+    again.render(simulate_scene(0, 1, "train", LIMITS), 3)
+    assert again.render(scene, 50).tobytes() == first
+
+
+def crop(look: SceneObject, place: tuple[float, float], yaw: float) -> np.ndarray:
+    """The pixels of one object alone, at the tiny preset's frame size, and its mask."""
+    height = 0.18 if look.shape == "cube" else 0.2
+    position = np.array([[[*place, height]]], np.float32)
+    turn = np.array([[[0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]]], np.float32)
+    none = np.zeros((1, 1, 3), np.float32)
+    seen = np.ones((1, 1), bool)
+    one = Scene(
+        f"{look}{place}{yaw}", "train", (look,), (), position, turn, none, none,
+        none[..., :2], seen, seen.astype(np.float32),
+    )  # fmt: skip
+    drawn = renderer(192, 128)
+    drawn.render(one, 0)
+    pixels, cover = drawn._draw()
+    rows, columns = np.nonzero(cover > 0.5)
+    box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
+    return np.dstack([pixels[box], 255 * cover[box]])
+
+
+def features(picture: np.ndarray, what: str) -> np.ndarray:
+    """A few numbers that show colour, material or shape in a crop."""
+    inside = picture[..., 3] > 250
+    rgb = picture[inside][:, :3] / 255
+    light = rgb.max(axis=1)
+    if what == "color":
+        hue = [colorsys.rgb_to_hsv(*p) for p in rgb]
+        h, s, _ = np.array(hue).T
+        around = 2 * np.pi * h
+        strong = s.mean()
+        return np.array(
+            [strong * np.cos(around).mean(), strong * np.sin(around).mean(), 0.4 * light.mean()]
+        )
+    if what == "material":
+        column = picture[:, picture.shape[1] // 2, :3].max(axis=1) / max(light.max(), 1e-6) / 255
+        steps = np.abs(np.diff(column[1:-1]))
+        return np.array([light.std() / light.mean(), 3 * steps.max(), light.min() / light.max()])
+    size = 12
+    rows = np.linspace(0, picture.shape[0] - 1, size).round().astype(int)
+    columns = np.linspace(0, picture.shape[1] - 1, size).round().astype(int)
+    return (picture[np.ix_(rows, columns)][..., 3] / 255).ravel()
+
+
+PLACES = [(x, y) for x in (-1.5, -0.5, 0.5) for y in (-0.8, 0.1, 0.9)]
+
+
+@pytest.mark.parametrize(
+    ("what", "values"), [("color", COLORS), ("material", MATERIALS), ("shape", SHAPES)]
+)
+def test_looks_can_be_told_apart_at_the_tiny_size(what: str, values: tuple[str, ...]) -> None:
+    """The nearest of the crops at some places names the look of those at others."""
+    rng = np.random.default_rng(0)
+    known, asked = [], []
+    for shape in SHAPES:
+        for material in MATERIALS:
+            for color in COLORS:
+                for k, place in enumerate(PLACES):
+                    look = SceneObject(shape, material, color)
+                    # Materials are told apart within a shape and colour, as an eye would.
+                    context = (shape, color) if what == "material" else ()
+                    found = features(crop(look, place, rng.uniform(0, 6.28)), what)
+                    row = (context, getattr(look, what), found)
+                    (known if k % 2 == 0 else asked).append(row)
+    right = 0
+    for context, name, found in asked:
+        near = min(
+            (r for r in known if r[0] == context), key=lambda r: float(((r[2] - found) ** 2).sum())
+        )
+        right += near[1] == name
+    assert set(values) == {name for _, name, _ in known}
+    assert right / len(asked) >= 0.95
+
+
+def test_colors_are_far_apart_on_paper() -> None:
+    values = np.array(list(RGB.values()), float)
+    gaps = np.linalg.norm(values[:, None] - values[None], axis=-1)
+    assert gaps[~np.eye(len(values), dtype=bool)].min() > 60

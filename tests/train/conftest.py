@@ -1,0 +1,71 @@
+"""A student and a retriever of a few thousand weights, built by the project's own means."""
+
+from __future__ import annotations
+
+import pytest
+from transformers import PreTrainedModel, ProcessorMixin
+
+from conf.schema import ArchitectureConfig, LoraConfig, RetrieverConfig, StudentConfig
+from data.frames import Frames
+from data.store import Store
+from train import samples
+from train.tiny import build_model, build_processor
+
+SMALL = ArchitectureConfig(
+    hidden=64,
+    layers=2,
+    heads=2,
+    kv_heads=2,
+    feed_forward=128,
+    vision_hidden=64,
+    vision_layers=2,
+    vision_heads=2,
+    vision_feed_forward=128,
+)
+
+
+@pytest.fixture(scope="session")
+def student_cfg() -> StudentConfig:
+    return StudentConfig(
+        name="small", architecture=SMALL, quantization="none", lora=None, image_size=96,
+        max_length=1500,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def retriever_cfg() -> RetrieverConfig:
+    return RetrieverConfig(
+        name="small", architecture=SMALL, quantization="none", lora=None, image_size=96,
+        widths=[64, 32],
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def processor(micro_store: Store) -> ProcessorMixin:
+    return build_processor(samples.corpus(micro_store, []), 1024, 96)
+
+
+@pytest.fixture
+def model(processor: ProcessorMixin) -> PreTrainedModel:
+    return build_model(SMALL, len(processor.tokenizer))
+
+
+@pytest.fixture(scope="session")
+def saved_base(tmp_path_factory: pytest.TempPathFactory, processor: ProcessorMixin) -> str:
+    """A base on disk, as a preset's `model` names one."""
+    folder = tmp_path_factory.mktemp("base")
+    build_model(SMALL, len(processor.tokenizer)).save_pretrained(folder)
+    processor.save_pretrained(folder)
+    return str(folder)
+
+
+@pytest.fixture(scope="session")
+def nf4_cfg(saved_base: str) -> StudentConfig:
+    return StudentConfig(
+        name="nf4", model=saved_base, image_size=96, max_length=1500, lora=LoraConfig(rank=4)
+    )
+
+
+@pytest.fixture(scope="session")
+def frames(micro_store: Store) -> Frames:
+    return Frames(micro_store, 96)

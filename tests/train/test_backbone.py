@@ -1,0 +1,87 @@
+"""What is loaded is what the preset says, or a sentence says why not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from transformers import AutoModelForImageTextToText, AutoProcessor
+
+from conf.compose import compose
+from conf.errors import UserError
+from conf.schema import LoraConfig, SftCommand
+from train import backbone
+from train.collate import Collator
+from train.conversation import selection_sample
+
+
+def test_a_built_model_is_read_back_bit_for_bit(model, processor, tmp_path) -> None:
+    model.save_pretrained(tmp_path)
+    processor.save_pretrained(tmp_path)
+    again = AutoModelForImageTextToText.from_pretrained(tmp_path)
+    for name, weight in model.state_dict().items():
+        assert torch.equal(weight, again.state_dict()[name]), name
+    reader = AutoProcessor.from_pretrained(tmp_path)
+    text = "<|im_start|>Answer: B, near the top-left <0.4 seconds>"
+    assert reader.tokenizer.encode(text) == processor.tokenizer.encode(text)
+
+
+def test_nf4_spares_tower_and_head_and_lora_is_in_the_language_tower(nf4_cfg) -> None:
+    model, _ = backbone.load_student(nf4_cfg, "fp32", list)
+    towers = backbone.count_towers(model)
+    backbone.check_towers(towers, nf4_cfg)
+    hidden, forward, rank = 64, 128, 4
+    layer = 4 * hidden * hidden + 3 * hidden * forward
+    lora = rank * (4 * 2 * hidden + 3 * (hidden + forward))
+    assert towers["language"].four_bit == 2 * layer
+    assert towers["language"].lora == towers["language"].trainable == 2 * lora
+    assert towers["vision"].four_bit == towers["vision"].trainable == 0
+    trained = [p for p in model.parameters() if p.requires_grad]
+    assert {p.dtype for p in trained} == {torch.float32}
+
+
+def test_adapters_stay_fp32_over_a_bf16_base(nf4_cfg) -> None:
+    model, _ = backbone.load_student(nf4_cfg, "bf16", list)
+    assert {p.dtype for p in model.parameters() if p.requires_grad} == {torch.float32}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"lora": LoraConfig(rank=4, targets="all-linear")}, "vision"),
+        ({"quantization": "none"}, "language has some 4-bit"),
+    ],
+)
+def test_the_audit_stops_a_model_that_is_not_what_the_preset_says(nf4_cfg, change, message) -> None:
+    loaded = nf4_cfg if "quantization" in change else replace(nf4_cfg, **change)
+    model, _ = backbone.load_student(loaded, "fp32", list)
+    with pytest.raises(UserError, match=message):
+        backbone.check_towers(backbone.count_towers(model), replace(nf4_cfg, **change))
+
+
+def test_a_trained_student_answers_as_it_did_when_it_was_saved(
+    nf4_cfg, micro_store, frames, tmp_path
+) -> None:
+    model, processor = backbone.load_student(nf4_cfg, "fp32", list)
+    with torch.no_grad():
+        for name, weight in model.named_parameters():
+            if "lora_B" in name:
+                weight.normal_(std=0.1)
+    backbone.save(model, processor, tmp_path / "student", "fp32")
+    again, reader = backbone.load_trained(nf4_cfg, "fp32", tmp_path / "student")
+    item = micro_store.selection("train")[0]
+    batch = Collator(reader, 1500)([selection_sample(item, "answer", frames, nf4_cfg)])
+    with torch.no_grad():
+        torch.testing.assert_close(model.eval()(**batch).logits, again(**batch).logits)
+
+
+@pytest.mark.parametrize("preset", ["qwen3_vl_8b", "qwen3_vl_2b"])
+def test_a_model_that_is_not_here_is_named_with_the_way_out(preset, monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    cfg = compose("train.sft", SftCommand, [f"student={preset}"]).student
+    with pytest.raises(UserError, match=r"Qwen/Qwen3-VL-.* student\.model=FOLDER"):
+        backbone.load_student(cfg, "bf16", list)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="cannot be loaded from that folder"):
+        backbone.load_student(replace(cfg, model=str(tmp_path / "empty")), "bf16", list)

@@ -1,0 +1,116 @@
+"""Laws of what is supervised and how it is averaged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from conf.errors import UserError
+from data.records import FPS, SelectionItem, shown_frames
+from train.collate import IGNORED, Collator, encode, letter_ids, pad
+from train.conversation import Sample, selection_sample
+from train.sft_trainer import LetterChoice, token_mean
+
+
+@pytest.fixture
+def lines(micro_store, frames, student_cfg) -> list[Sample]:
+    """Samples of unequal length."""
+    items = micro_store.selection("train")[:3]
+    texts = [
+        "Answer: A",
+        "Scene parse: stationary. " * 6 + "\nAnswer: B",
+        "near the top\nAnswer: C",
+    ]
+    return [
+        selection_sample(i, "reasoning", frames, student_cfg, t)
+        for i, t in zip(items, texts, strict=True)
+    ]
+
+
+def loss_of(model, batch: dict, count: int | None = None) -> torch.Tensor:
+    batch = dict(batch)
+    labels = batch.pop("labels")
+    return token_mean(model(**batch, use_cache=False), labels, count)
+
+
+def test_supervised_is_the_response_and_nothing_else(lines, processor) -> None:
+    for line in lines:
+        encoded = encode(line, processor, 1500)
+        kept = [i for i, x in zip(encoded.input_ids, encoded.labels, strict=True) if x != IGNORED]
+        assert processor.tokenizer.decode(kept) == line.response + "<|im_end|>"
+        prompt = encode(replace(line, response=None), processor, 1500)
+        assert encoded.input_ids[: len(prompt.input_ids)] == prompt.input_ids
+
+
+def test_one_sample_alone_weighs_as_in_a_padded_batch(lines, processor, model) -> None:
+    collate = Collator(processor, 1500)
+    counts = [int((collate([s])["labels"] != IGNORED).sum()) for s in lines]
+    alone = sum(loss_of(model, collate([s])) * n for s, n in zip(lines, counts, strict=True)) / sum(
+        counts
+    )
+    torch.testing.assert_close(loss_of(model, collate(lines)), alone, atol=1e-5, rtol=0)
+
+
+def test_accumulated_gradients_are_those_of_the_big_batch(lines, processor, model) -> None:
+    collate = Collator(processor, 1500)
+    loss_of(model, collate(lines)).backward()
+    whole = [p.grad.clone() for p in model.parameters() if p.grad is not None]
+    model.zero_grad()
+    count = sum(int((collate([s])["labels"] != IGNORED).sum()) for s in lines)
+    for group in (lines[:1], lines[1:]):
+        loss_of(model, collate(group), count).backward()
+    parts = [p.grad for p in model.parameters() if p.grad is not None]
+    for one, two in zip(whole, parts, strict=True):
+        torch.testing.assert_close(one, two, atol=1e-6, rtol=1e-3)
+
+
+def test_kept_rows_give_the_loss_of_all_rows(lines, processor, model) -> None:
+    batch = pad([encode(s, processor, 1500) for s in lines], processor.tokenizer.pad_token_id)
+    labels = batch.pop("labels")
+    logits = model(**batch, use_cache=False).logits
+    full = torch.nn.functional.cross_entropy(
+        logits[:, :-1].flatten(0, 1), labels[:, 1:].flatten(), ignore_index=IGNORED
+    )
+    torch.testing.assert_close(loss_of(model, Collator(processor, 1500)(lines)), full)
+
+
+def test_the_prompt_holds_every_shown_frame_at_its_true_time(
+    micro_store, frames, student_cfg, processor
+) -> None:
+    item = micro_store.selection("train")[0]
+    encoded = encode(selection_sample(item, "answer", frames, student_cfg), processor, 1500)
+    assert encoded.media["video_grid_thw"].tolist() == [[6, 6, 6]]
+    assert encoded.media["image_grid_thw"].tolist() == [[1, 6, 6]] * 4
+    shown = shown_frames(item.prefix_start, item.prefix_stop, 12)
+    times = [(a + b) / 2 / FPS for a, b in zip(shown[::2], shown[1::2], strict=True)]
+    text = processor.tokenizer.decode(encoded.input_ids)
+    at = 0
+    for time in times:
+        at = text.index(f"<{time:.1f} seconds>", at) + 1
+
+
+def test_a_sample_over_the_limit_is_refused_with_its_length(lines, processor) -> None:
+    length = len(encode(lines[1], processor, 1500).input_ids)
+    encode(lines[1], processor, length)
+    with pytest.raises(UserError, match=f"{length} tokens, more than student.max_length"):
+        encode(lines[1], processor, length - 1)
+
+
+def test_the_letters_logits_choose_the_answer(
+    micro_store, frames, student_cfg, processor, model
+) -> None:
+    items: list[SelectionItem] = micro_store.selection("train")[:6]
+    batch = Collator(processor, 1500)(
+        [selection_sample(i, "answer", frames, student_cfg, f"Answer: {i.letter}") for i in items]
+    )
+    labels = batch.pop("labels")
+    letters = letter_ids(processor)
+    logits = torch.zeros(len(items), labels.shape[1], len(processor.tokenizer))
+    at = labels.shape[1] - 3
+    for k in range(len(items)):
+        logits[k, at, letters[(items[k].answer + (k == 0)) % 4]] = 1.0
+    chosen, right = LetterChoice(letters).shrink(logits, labels).T
+    assert right.tolist() == [i.answer for i in items]
+    assert (chosen == right).tolist() == [False] + [True] * 5

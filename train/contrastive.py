@@ -1,0 +1,88 @@
+"""Train a retriever: Matryoshka over cached multiple-negatives ranking."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from conf.entry import Run, command
+from conf.schema import ContrastiveCommand
+
+log = logging.getLogger(__name__)
+
+
+@command("train.contrastive", ContrastiveCommand)
+def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
+    from data.build import ensure_benchmark
+
+    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+
+    from datasets import Dataset
+    from sentence_transformers import (
+        SentenceTransformerTrainer,
+        SentenceTransformerTrainingArguments,
+    )
+    from sentence_transformers.sentence_transformer.losses import (
+        CachedMultipleNegativesRankingLoss,
+        MatryoshkaLoss,
+    )
+
+    from data.frames import Frames
+    from train import backbone, loop, retriever
+    from train.audit import audit_retriever
+    from train.ranking import HeldOutRanking
+    from train.samples import held_out_scenes, shuffled
+
+    backbone.keep_big_blocks()
+    frames = Frames(store, cfg.retriever.image_size)
+    queries = store.retrieval("train")
+    held_out = held_out_scenes(store, cfg.seed)
+    training = [q for q in queries if q.scene_id not in held_out]
+    # Queries stand builder by builder: a shuffled slice measures all of them.
+    validation = shuffled([q for q in queries if q.scene_id in held_out], cfg.seed)
+    validation = validation[: cfg.train.validation_queries]
+    loop.check_not_empty(len(training), "training queries")
+
+    log.info("loading retriever %s", cfg.retriever.name)
+    model = retriever.load_retriever(
+        cfg.retriever,
+        cfg.train.precision,
+        corpus=retriever.corpus(queries, cfg.retriever),
+        folder=run.folder / "untrained",
+    )
+    log.info(audit_retriever(model, cfg.retriever, training[0], frames))
+    ranking = HeldOutRanking(validation, frames, cfg.retriever, cfg.train.mini_batch)
+    loss = MatryoshkaLoss(
+        model,
+        CachedMultipleNegativesRankingLoss(
+            model, scale=cfg.train.scale, mini_batch_size=cfg.train.mini_batch
+        ),
+        matryoshka_dims=list(cfg.retriever.widths),
+    )
+    count = cfg.train.hard_negatives
+    collator = retriever.LateFrames(
+        preprocess_fn=model.preprocess, prompts=retriever.column_prompts(cfg.retriever, count)
+    )
+    collator.resolve(training, frames, cfg.retriever)
+    rows = Dataset.from_list([{"query": k, "negatives": count} for k in range(len(training))])
+    checkpoint = loop.newest_checkpoint(run.folder)
+    trainer = SentenceTransformerTrainer(
+        model=model,
+        args=SentenceTransformerTrainingArguments(
+            **loop.arguments(cfg.train, run, cfg.seed, resuming=checkpoint is not None),
+            per_device_train_batch_size=cfg.train.batch,
+            dataloader_drop_last=True,
+        ),
+        train_dataset=rows,
+        evaluator=ranking,
+        loss=loss,
+        data_collator=collator,
+    )
+    loop.train_and_log(trainer, run, checkpoint)
+    model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)
+    log.info("the retriever is in %s", run.folder / "retriever")
+    return loop.evaluated(run.folder)
+
+
+if __name__ == "__main__":
+    main()

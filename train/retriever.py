@@ -1,0 +1,131 @@
+"""The retriever as sentence-transformers sees it: queries of a video and a text, frames as images.
+
+Inputs follow Qwen3-VL-Embedding: the instruction as system message, the video before the text, a
+generation prompt at the end, and the last token's state, normalised, as the embedding. What is
+saved is a plain `SentenceTransformer`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from sentence_transformers import SentenceTransformer
+from sentence_transformers.sentence_transformer.data_collator import (
+    SentenceTransformerDataCollator,
+)
+from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
+
+from conf.schema import RetrieverConfig
+from data.frames import Frames
+from data.records import FPS, FRAMES, FrameRef, RetrievalQuery, shown_frames
+from train.backbone import DTYPES, load_failure, nf4_config, pin_sizes
+from train.tiny import build_model, build_processor
+
+PROCESSING = {
+    "video": {"do_sample_frames": False},
+    "chat_template": {"add_generation_prompt": True},
+}
+
+
+def load_retriever(
+    cfg: RetrieverConfig, precision: str, corpus: list[str], folder: Path
+) -> SentenceTransformer:
+    """A retriever ready to train. One that is built from a seed is written to `folder` first, so
+    that it is loaded as any other.
+
+    Raises:
+        UserError: the model is not on this machine and cannot be fetched.
+    """
+    source = cfg.model
+    if cfg.architecture is not None:
+        processor = build_processor(corpus, cfg.architecture.vocabulary, cfg.image_size)
+        build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
+        processor.save_pretrained(folder)
+        source = str(folder)
+    whole = cfg.quantization == "none" and cfg.lora is None
+    dtype = torch.float32 if whole else DTYPES[precision]
+    options: dict[str, Any] = {"dtype": dtype, "use_safetensors": True}
+    if cfg.quantization == "nf4":
+        options["quantization_config"] = nf4_config(dtype)
+    origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
+    try:
+        backbone = Transformer(
+            source,
+            model_kwargs={**options, **origin},
+            processor_kwargs=origin,
+            config_kwargs=origin,
+            processing_kwargs=PROCESSING,
+        )
+    except (OSError, ValueError) as error:
+        raise load_failure("retriever", cfg.model, error) from error
+    pin_sizes(backbone.processor, cfg.image_size, cfg.frames)
+    width = backbone.get_embedding_dimension()
+    model = SentenceTransformer(
+        modules=[backbone, Pooling(width, pooling_mode="lasttoken"), Normalize()],
+        prompts={"query": cfg.query_instruction, "document": cfg.frame_instruction},
+        device="cuda" if torch.cuda.is_available() else "cpu",
+    )
+    if cfg.lora:
+        import peft
+
+        model.requires_grad_(False)
+        model.add_adapter(
+            peft.LoraConfig(
+                r=cfg.lora.rank,
+                lora_alpha=cfg.lora.alpha,
+                lora_dropout=cfg.lora.dropout,
+                target_modules=cfg.lora.targets,
+            )
+        )
+    return model
+
+
+def corpus(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list[str]:
+    """Texts for a tokenizer built from nothing: questions, instructions and timestamps."""
+    texts = sorted({q.question for q in queries})
+    clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
+    roles = ["system", "user", "assistant"]
+    return [*texts, cfg.query_instruction, cfg.frame_instruction, *roles, *clock] * 10
+
+
+def query_input(query: RetrievalQuery, frames: Frames, cfg: RetrieverConfig) -> dict[str, Any]:
+    """A query as sentence-transformers takes it: the prefix with its true times, then the text."""
+    shown = shown_frames(query.prefix_start, query.prefix_stop, cfg.frames)
+    array = torch.from_numpy(frames.stack(query.scene_id, shown)).permute(0, 3, 1, 2)
+    metadata = {"fps": float(FPS), "total_num_frames": FRAMES, "frames_indices": shown}
+    return {"video": {"array": array, "video_metadata": metadata}, "text": query.question}
+
+
+def frame_input(frame: FrameRef, frames: Frames) -> Any:
+    """A database frame as sentence-transformers takes it: an image."""
+    return frames.image(frame.scene_id, frame.frame)
+
+
+class LateFrames(SentenceTransformerDataCollator):
+    """The library's collator over rows that name queries and frames; pixels are read only when a
+    batch is made."""
+
+    def resolve(self, queries: list[RetrievalQuery], frames: Frames, cfg: RetrieverConfig) -> None:
+        """Say what the rows' numbers stand for."""
+        self._queries, self._frames, self._cfg = queries, frames, cfg
+
+    def __call__(self, features: list[dict[str, int]]) -> dict[str, Any]:
+        return super().__call__([self._row(f["query"], f["negatives"]) for f in features])
+
+    def _row(self, index: int, negatives: int) -> dict[str, Any]:
+        query = self._queries[index]
+        row = {
+            "query": query_input(query, self._frames, self._cfg),
+            "target": frame_input(query.target, self._frames),
+        }
+        for k, frame in enumerate(query.hard_negatives[:negatives]):
+            row[f"negative_{k}"] = frame_input(frame, self._frames)
+        return row
+
+
+def column_prompts(cfg: RetrieverConfig, negatives: int) -> dict[str, str]:
+    """The instruction of each of a row's columns."""
+    frames = ["target", *(f"negative_{k}" for k in range(negatives))]
+    return {"query": cfg.query_instruction, **dict.fromkeys(frames, cfg.frame_instruction)}
