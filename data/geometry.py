@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -166,6 +167,7 @@ def _pixels_around(
     return columns.ravel().astype(float), rows.ravel().astype(float)
 
 
+@lru_cache(maxsize=64)
 def displacements(scene: Scene) -> np.ndarray:
     """(F, F) how far two frames of a scene are apart: the largest image displacement of an object
     between them, px at 336 x 336, the image's diagonal at most.

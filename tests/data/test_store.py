@@ -1,0 +1,132 @@
+"""A store is whole or named: same bytes every time, killed builds go on, damage is found."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from conf.errors import UserError
+from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
+from data.build import build, ensure_benchmark
+from data.store import MANIFEST, digests, open_store, write_atomically
+
+
+def small(**changes: object) -> BenchmarkConfig:
+    """Six scenes, a few items: quick to build whole."""
+    few = Quota(train=2, test=1)
+    settings = {
+        "name": "small",
+        "scenes": 6,
+        "width": 96,
+        "height": 64,
+        "selection": SelectionConfig(time={"1s": few}),
+        "retrieval": RetrievalTrackConfig(builders={"2": few}, hard_negatives=1, database=6),
+    }
+    return BenchmarkConfig(**{**settings, **changes})
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("built") / "small"
+    build(small(), folder, workers=1)
+    return folder
+
+
+@pytest.fixture
+def copy(built: Path, tmp_path: Path) -> Path:
+    subprocess.run(["cp", "-r", built, tmp_path / "small"], check=True)
+    return tmp_path / "small"
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {**digests(folder), MANIFEST: (folder / MANIFEST).read_text()}
+
+
+def test_two_builds_are_the_same_bytes_whatever_the_workers(built, tmp_path) -> None:
+    build(small(), tmp_path / "small", workers=2)
+    assert contents(tmp_path / "small") == contents(built)
+
+
+def test_a_killed_build_goes_on_to_the_same_bytes(built, tmp_path) -> None:
+    code = (
+        "from pathlib import Path\n"
+        "from tests.data.test_store import *\n"
+        f"if __name__ == '__main__': build(small(), Path({str(tmp_path)!r}) / 'small', workers=1)"
+    )
+    script = tmp_path / "run.py"
+    script.write_text(code)
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    child = subprocess.Popen([sys.executable, script], env=env, start_new_session=True)
+    scenes = tmp_path / ".small.partial" / "scenes"
+    while child.poll() is None and len(list(scenes.glob("*.npz"))) < 2:
+        time.sleep(0.02)
+    os.killpg(child.pid, signal.SIGKILL)
+    child.wait()
+    assert not (tmp_path / "small").exists()
+    first = {p.name: p.stat().st_mtime_ns for p in scenes.glob("*.npz")}
+    build(small(), tmp_path / "small", workers=1)
+    assert contents(tmp_path / "small") == contents(built)
+    kept = tmp_path / "small" / "scenes"
+    assert all((kept / name).stat().st_mtime_ns == when for name, when in first.items())
+
+
+@pytest.mark.parametrize("part", ["selection.parquet", "scenes", "frames"])
+def test_a_damaged_part_is_named(copy, part) -> None:
+    path = copy / part
+    path = next(path.iterdir()) if path.is_dir() else path
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=f"{path.name} is damaged"):
+        open_store(copy)
+    path.unlink()
+    with pytest.raises(UserError, match=f"{path.name} is missing"):
+        open_store(copy)
+
+
+def test_another_generators_store_is_named(copy) -> None:
+    manifest = json.loads((copy / MANIFEST).read_text())
+    (copy / MANIFEST).write_text(json.dumps({**manifest, "generator": "0"}))
+    with pytest.raises(UserError, match="generator version 0, this is version"):
+        open_store(copy)
+    (copy / MANIFEST).write_text(json.dumps(manifest)[:100])
+    with pytest.raises(UserError, match=r"manifest\.json is damaged"):
+        open_store(copy)
+
+
+def test_other_settings_are_named(copy) -> None:
+    asked = small(selection=SelectionConfig(time={"1s": Quota(train=3, test=1)}))
+    with pytest.raises(UserError, match=r"benchmark\.selection\.time\.1s\.train=2, you ask for 3"):
+        ensure_benchmark(asked, copy.parent, workers=1)
+
+
+def test_a_benchmark_that_would_be_empty_is_refused(built, tmp_path) -> None:
+    subprocess.run(["cp", "-r", built / "scenes", tmp_path / "scenes"], check=True)
+    nothing = replace(small().selection, min_displacement=1000.0)
+    with pytest.raises(UserError, match="would be empty"):
+        build(small(selection=nothing), tmp_path / "small", workers=1)
+    assert not (tmp_path / "small").exists()
+
+
+def test_an_unknown_cell_is_named(tmp_path) -> None:
+    unknown = SelectionConfig(event={"future_sideways": Quota(train=1)})
+    with pytest.raises(UserError, match=r"selection\.event\.future_sideways"):
+        build(small(selection=unknown), tmp_path / "small", workers=1)
+
+
+def test_a_write_that_fails_leaves_nothing(tmp_path, monkeypatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device", "store")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_atomically(tmp_path / "part.npz", b"content")
+    assert list(tmp_path.iterdir()) == []

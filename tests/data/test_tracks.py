@@ -1,0 +1,125 @@
+"""Laws of a built benchmark: what an item or a query says is what the oracle says."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from data.events import window_group
+from data.frames import Frames
+from data.geometry import displacements
+from data.records import FPS, SelectionItem
+from data.store import Store
+
+
+@pytest.fixture(scope="module")
+def items(micro_store: Store) -> list[SelectionItem]:
+    return micro_store.selection()
+
+
+def test_every_cell_has_items_and_letters_are_balanced(micro_store, items) -> None:
+    assert {i.family for i in items} == {"event", "time", "window"}
+    for cell in {(i.subtype, i.split) for i in items}:
+        letters = Counter(i.answer for i in items if (i.subtype, i.split) == cell)
+        assert max(letters.values()) - min(letters[k] for k in range(4)) <= 1
+    assert len({i.item_id for i in items}) == len(items)
+
+
+def test_scenes_keep_to_their_split(micro_store, items) -> None:
+    train, test = set(micro_store.scene_ids("train")), set(micro_store.scene_ids("test"))
+    assert not train & test
+    assert len(test) == 2
+    for asked in (*items, *micro_store.retrieval()):
+        assert asked.scene_id in (train if asked.split == "train" else test)
+
+
+def test_candidates_can_be_told_apart(micro_store, items) -> None:
+    least = micro_store.manifest["config"]["selection"]["min_displacement"]
+    for item in items:
+        apart = displacements(micro_store.scene(item.scene_id))
+        gaps = [apart[a.frame, b.frame] for a, b in combinations(item.candidates, 2)]
+        assert item.min_displacement == pytest.approx(min(gaps), rel=1e-5)
+        assert min(gaps) >= least
+
+
+def test_event_items_stand_at_their_collision(micro_store, items) -> None:
+    for item in (i for i in items if i.family == "event"):
+        events = [c.frame for c in micro_store.scene(item.scene_id).collisions]
+        assert item.event_frame in events
+        assert item.prefix_stop - item.prefix_start == 20
+        stop = item.event_frame - (10 if item.framing == "future" else 0)
+        assert item.prefix_stop == stop
+        assert item.target_frame == stop + 10
+        assert item.target_frame <= 127 - 10
+        offsets = {abs(c.frame - item.target_frame) for c in item.candidates}
+        assert offsets <= {0, 16, 32, 48}
+
+
+def test_time_items_count_26_frames_a_second(items) -> None:
+    for item in (i for i in items if i.family == "time"):
+        seconds = {"1s": 1, "2s": 2}[item.subtype]
+        assert (item.prefix_start, item.prefix_stop) == (0, 25)
+        assert item.target_frame == 26 + 26 * seconds
+        assert f"{seconds} second" in item.question
+
+
+def test_window_items_are_of_their_group_and_horizon(micro_store, items) -> None:
+    for item in (i for i in items if i.family == "window"):
+        assert item.prefix_stop - item.prefix_start + 1 == 16
+        assert item.target_frame - item.prefix_stop == item.horizon
+        scene = micro_store.scene(item.scene_id)
+        group = window_group(scene, item.prefix_start, item.prefix_stop, item.horizon)
+        assert item.subtype == f"{group}_A_h{item.horizon}_{item.difficulty}"
+
+
+def test_builders_keep_the_papers_clock(micro_store) -> None:
+    for q in micro_store.retrieval():
+        events = {c.frame for c in micro_store.scene(q.scene_id).collisions}
+        ahead, length = q.target.frame - q.prefix_stop, q.prefix_stop - q.prefix_start
+        assert q.prefix_stop < q.target.frame
+        if q.builder == 1:
+            assert q.target.frame == 127
+            assert q.prefix_stop in (2 * FPS, 3 * FPS, 4 * FPS)
+        elif q.builder == 2:
+            assert (q.prefix_stop, ahead % FPS) == (2 * FPS, 0)
+        elif q.builder == 3:
+            assert q.target.frame in events
+            assert 0 <= ahead - 1 <= 5
+        elif q.builder == 4:
+            assert q.prefix_stop in events
+            assert (length, ahead) == (FPS, FPS)
+        elif q.builder == 5:
+            assert q.target.frame in events
+            assert (length, ahead) == (FPS, FPS)
+        else:
+            assert q.prefix_stop + FPS // 2 in events
+            assert (length, ahead) == (FPS, FPS)
+
+
+def test_hard_negatives_are_other_moments_of_the_scene(micro_store) -> None:
+    for q in micro_store.retrieval():
+        apart = displacements(micro_store.scene(q.scene_id))
+        frames = [q.target.frame, *(n.frame for n in q.hard_negatives)]
+        assert len(frames) == 3
+        assert {n.scene_id for n in q.hard_negatives} == {q.scene_id}
+        assert min(apart[a, b] for a, b in combinations(frames, 2)) >= 12
+
+
+def test_the_database_holds_each_target_once_and_no_twins(micro_store) -> None:
+    database = micro_store.database()
+    assert {q.target for q in micro_store.retrieval("test")} <= set(database)
+    assert {f.scene_id for f in database} <= set(micro_store.scene_ids("test"))
+    frames = Frames(micro_store)
+    pixels = {frames.array(f.scene_id, f.frame).tobytes() for f in database}
+    assert len(pixels) == len(database) == len(set(database))
+
+
+def test_a_stored_frame_is_the_frame_drawn_anew(micro_store) -> None:
+    item = micro_store.selection("train")[0]
+    frames = Frames(micro_store)
+    drawn = frames._draw(micro_store.scene(item.scene_id), item.target_frame)
+    stored = frames.array(item.scene_id, item.target_frame)
+    np.testing.assert_array_equal(np.asarray(drawn), stored)
