@@ -8,7 +8,6 @@ import os
 import platform
 import re
 import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -134,7 +133,6 @@ def _record(
         "seed": settings["seed"],
         "git": _git(),
         "python": platform.python_version(),
-        "executable": sys.executable,
         "platform": platform.platform(),
         "packages": {name: v for name in PACKAGES if (v := _version(name))},
         "started": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -34,7 +34,7 @@ Corpus = Callable[[], Iterable[str]]
 
 
 def load_base(
-    cfg: StudentConfig | RetrieverConfig, precision: str, corpus: Corpus
+    cfg: StudentConfig, precision: str, corpus: Corpus
 ) -> tuple[PreTrainedModel, ProcessorMixin]:
     """The base that a preset names, or builds from a seed, with its processor.
 
@@ -47,7 +47,7 @@ def load_base(
     if cfg.architecture is not None:
         processor = build_processor(corpus(), cfg.architecture.vocabulary, cfg.image_size)
         return build_model(cfg.architecture, len(processor.tokenizer)), processor
-    group = "student" if isinstance(cfg, StudentConfig) else "retriever"
+    check_reachable("student", cfg.model)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     # Weights that are trained stay fp32 and are computed in lower precision by autocast.
     whole = cfg.quantization == "none" and cfg.lora is None
@@ -63,7 +63,7 @@ def load_base(
             **origin,
         )
     except (OSError, ValueError) as error:
-        raise load_failure(group, cfg.model, error) from error
+        raise load_failure("student", cfg.model, error) from error
     pin_sizes(processor, cfg.image_size, cfg.frames)
     processor.tokenizer.padding_side = "left"
     return model, processor
@@ -77,6 +77,24 @@ def nf4_config(compute: torch.dtype) -> BitsAndBytesConfig:
         bnb_4bit_compute_dtype=compute,
         llm_int8_skip_modules=UNQUANTIZED,
     )
+
+
+def check_reachable(group: str, model: str) -> None:
+    """Ask once whether a model can be had, before libraries try again and again for minutes.
+
+    Raises:
+        UserError: it is no folder here, not in the hub's cache, and cannot be fetched.
+    """
+    from huggingface_hub import model_info, try_to_load_from_cache
+
+    if Path(model).is_dir():
+        return
+    try:
+        if not isinstance(try_to_load_from_cache(model, "config.json"), str):
+            model_info(model, timeout=10)
+    except Exception as error:
+        # The hub's client raises errors of whichever HTTP library it has; all mean the same here.
+        raise load_failure(group, model, error) from error
 
 
 def load_failure(group: str, model: str, error: Exception) -> UserError:

@@ -20,7 +20,7 @@ from sentence_transformers.sentence_transformer.modules import Normalize, Poolin
 from conf.schema import RetrieverConfig
 from data.frames import Frames
 from data.records import FPS, FRAMES, FrameRef, RetrievalQuery, shown_frames
-from train.backbone import DTYPES, load_failure, nf4_config, pin_sizes
+from train.backbone import DTYPES, check_reachable, load_failure, nf4_config, pin_sizes
 from train.tiny import build_model, build_processor
 
 PROCESSING = {
@@ -44,6 +44,7 @@ def load_retriever(
         build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
         processor.save_pretrained(folder)
         source = str(folder)
+    check_reachable("retriever", source)
     whole = cfg.quantization == "none" and cfg.lora is None
     dtype = torch.float32 if whole else DTYPES[precision]
     options: dict[str, Any] = {"dtype": dtype, "use_safetensors": True}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
@@ -13,6 +14,7 @@ from conf.schema import SftCommand, StudentConfig
 from data.frames import Frames
 from data.records import LETTERS, Rationale, SelectionItem
 from data.store import Store
+from teacher.predicates import region_of
 from teacher.template import describe
 from train.conversation import (
     ASK,
@@ -25,8 +27,8 @@ from train.conversation import (
 
 HELD_OUT = 0.1
 """Share of the training scenes whose items measure a run."""
-WORDINGS = 3
-"""Ways in which each described window is worded for the tiny base."""
+LOOKS = 2
+"""Questions about what a candidate shows that the tiny base learns from, for each item."""
 
 MakeSample = Callable[[], Sample]
 Row = TypeVar("Row")
@@ -76,10 +78,10 @@ def supervised_items(
 
 
 def descriptions(
-    store: Store, scenes: set[str], variants: int, cfg: StudentConfig, frames: Frames, seed: int
+    store: Store, scenes: set[str], cfg: StudentConfig, frames: Frames, seed: int
 ) -> list[MakeSample]:
-    """The built-in narrator's descriptions of training scenes, each window worded `variants` ways:
-    what the tiny base learns to write. Windows are those that items and queries show."""
+    """The built-in narrator's descriptions of training scenes: what the tiny base learns to write.
+    Windows are those that items and queries show."""
     windows = {
         (a.scene_id, a.prefix_start, a.prefix_stop, frame)
         for a, frame in (
@@ -90,11 +92,37 @@ def descriptions(
     }
     made: list[MakeSample] = []
     for scene_id, start, stop, target in sorted(windows):
-        for variant in range(variants):
-            text = describe(store.scene(scene_id), start, stop, target, seed + variant)
-            if text is not None:
-                make = partial(description_sample, scene_id, start, stop, target, frames, cfg, text)
-                made.append(make)
+        text = describe(store.scene(scene_id), start, stop, target, seed)
+        if text is not None:
+            make = partial(description_sample, scene_id, start, stop, target, frames, cfg, text)
+            made.append(make)
+    return made
+
+
+def looks(
+    store: Store, scenes: set[str], cfg: StudentConfig, frames: Frames, seed: int
+) -> list[MakeSample]:
+    """Questions about what stands where in a candidate, which need no foresight: they give the
+    tiny base the words and letters of the candidate analysis."""
+    made: list[MakeSample] = []
+    for item in store.selection("train"):
+        if item.scene_id not in scenes:
+            continue
+        scene = store.scene(item.scene_id)
+        shown = [
+            [region_of(scene, c.frame, k) for k in range(len(scene.objects))]
+            for c in item.candidates
+        ]
+        telling = [
+            (letter, f"the {look.phrase} {shown[at][k]}")
+            for at, letter in enumerate(LETTERS)
+            for k, look in enumerate(scene.objects)
+            if sum(row[k] == shown[at][k] for row in shown) == 1
+        ]
+        for letter, what in shuffled(telling, seed)[:LOOKS]:
+            asked = replace(item, question=f"Which candidate shows {what}?")
+            text = f"Candidate {letter} shows {what}.\n{answer_line(letter)}"
+            made.append(partial(selection_sample, asked, "answer", frames, cfg, text))
     return made
 
 
@@ -106,9 +134,14 @@ def splits(
     others = set(store.scene_ids("train")) - held_out
     limit = cfg.train.validation_items
     if cfg.train.regime == "describe":
-        told = partial(descriptions, store, cfg=cfg.student, frames=frames, seed=cfg.seed)
-        validation = shuffled(told(scenes=held_out, variants=1), cfg.seed)[:limit]
-        return Samples(told(scenes=others, variants=WORDINGS)), {"describe": Samples(validation)}
+        made = {
+            kind: [make(store, some, cfg.student, frames, cfg.seed) for some in (others, held_out)]
+            for kind, make in (("describe", descriptions), ("look", looks))
+        }
+        training = [sample for told, _ in made.values() for sample in told]
+        return Samples(training), {
+            kind: Samples(shuffled(kept, cfg.seed)[:limit]) for kind, (_, kept) in made.items()
+        }
     by_item = {r.item_id: r for r in rationales}
     items = store.selection("train")
     # The items of every family stand together: a shuffled slice measures all of them.

@@ -78,7 +78,8 @@ def test_a_trained_student_answers_as_it_did_when_it_was_saved(
 
 @pytest.mark.parametrize("preset", ["qwen3_vl_8b", "qwen3_vl_2b"])
 def test_a_model_that_is_not_here_is_named_with_the_way_out(preset, monkeypatch, tmp_path) -> None:
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     cfg = compose("train.sft", SftCommand, [f"student={preset}"]).student
     with pytest.raises(UserError, match=r"Qwen/Qwen3-VL-.* student\.model=FOLDER"):
         backbone.load_student(cfg, "bf16", list)

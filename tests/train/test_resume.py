@@ -1,0 +1,84 @@
+"""A run that was killed and goes on ends where an undisturbed one ends, in both trainers."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from conf.entry import Run
+from conf.schema import (
+    ContrastiveCommand,
+    ContrastiveTrainConfig,
+    SftCommand,
+    SftTrainConfig,
+    TeacherConfig,
+)
+from train import contrastive, sft
+from train.loop import newest_checkpoint, read_journal
+
+
+def common(micro, store) -> dict:
+    return {"benchmark": micro, "store": str(store.folder.parent), "workers": 1}
+
+
+@pytest.fixture
+def sft_settings(micro, micro_store, nf4_cfg) -> SftCommand:
+    train = SftTrainConfig(
+        lr=1e-3, max_steps=4, micro_batch=2, accumulation=2, precision="fp32",
+        gradient_checkpointing=False, evaluations=2, validation_items=4,
+    )  # fmt: skip
+    teacher = TeacherConfig(name="template")
+    return SftCommand(**common(micro, micro_store), teacher=teacher, student=nf4_cfg, train=train)
+
+
+@pytest.fixture
+def contrastive_settings(micro, micro_store, retriever_cfg) -> ContrastiveCommand:
+    train = ContrastiveTrainConfig(
+        lr=1e-3, max_steps=4, batch=4, mini_batch=2, accumulation=1, precision="fp32",
+        gradient_checkpointing=False, evaluations=2, validation_queries=4,
+    )  # fmt: skip
+    return ContrastiveCommand(**common(micro, micro_store), retriever=retriever_cfg, train=train)
+
+
+def train_twice(main, settings, folder: Path) -> tuple[Path, Path]:
+    """An undisturbed run, and one that goes on from the first's middle checkpoint."""
+    whole, killed = folder / "whole", folder / "killed"
+    whole.mkdir()
+    main.__wrapped__(settings, Run("whole", whole))
+    killed.mkdir()
+    shutil.copytree(whole / "checkpoint-2", killed / "checkpoint-2")
+    # What a kill leaves: a checkpoint without its state, and a journal past the whole one.
+    (killed / "checkpoint-3").mkdir()
+    (killed / "checkpoint-3" / "trainer_state.json").write_text("{")
+    shutil.copy(whole / "metrics.jsonl", killed / "metrics.jsonl")
+    assert newest_checkpoint(killed) == killed / "checkpoint-2"
+    main.__wrapped__(settings, Run("killed", killed))
+    return whole, killed
+
+
+def same_weights(one: Path, two: Path) -> None:
+    first, second = load_file(one), load_file(two)
+    assert first.keys() == second.keys()
+    for name, weight in first.items():
+        torch.testing.assert_close(weight, second[name], atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_student_goes_on_as_if_undisturbed(sft_settings, tmp_path) -> None:
+    whole, killed = train_twice(sft.main, sft_settings, tmp_path)
+    same_weights(*(f / "student" / "adapter_model.safetensors" for f in (whole, killed)))
+    one, two = read_journal(whole), read_journal(killed)
+    assert [r["step"] for r in one] == [r["step"] for r in two]
+    losses = [[r["loss"] for r in records if "loss" in r] for records in (one, two)]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    assert (whole / "curves.png").stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_a_retriever_goes_on_as_if_undisturbed(contrastive_settings, tmp_path) -> None:
+    whole, killed = train_twice(contrastive.main, contrastive_settings, tmp_path)
+    same_weights(*(f / "retriever" / "model.safetensors" for f in (whole, killed)))
