@@ -19,7 +19,7 @@ $(READY): pyproject.toml constraints.txt
 
 run: setup ## Train and measure the tiny student and the tiny retriever, and report on both
 	$(BIN)/python -m train.sft +exp=cot
-	$(BIN)/python -m evaluation.select model=checkpoints/sft/exp=cot
+	$(BIN)/python -m evaluation.select model=checkpoints/sft/exp-cot
 	$(BIN)/python -m train.contrastive
 	$(BIN)/python -m evaluation.retrieve model=checkpoints/contrastive/default
 	$(BIN)/python -m evaluation.report
@@ -41,9 +41,9 @@ format: setup ## Format and mend style
 base: setup ## Train the tiny base anew and put it into checkpoints/bases/tiny
 	$(BIN)/python -m train.sft +exp=base
 	mkdir -p checkpoints/bases/tiny
-	cp -r checkpoints/sft/exp=base/student/. checkpoints/bases/tiny/
-	cp checkpoints/sft/exp=base/config.yaml checkpoints/sft/exp=base/run.json \
-	   checkpoints/sft/exp=base/metrics.jsonl checkpoints/sft/exp=base/curves.png checkpoints/bases/tiny/
+	cp -r checkpoints/sft/exp-base/student/. checkpoints/bases/tiny/
+	cp checkpoints/sft/exp-base/config.yaml checkpoints/sft/exp-base/run.json \
+	   checkpoints/sft/exp-base/metrics.jsonl checkpoints/sft/exp-base/curves.png checkpoints/bases/tiny/
 
 constraints: setup ## Write constraints.txt from the versions in .venv
 	$(BIN)/uv pip freeze --quiet --python $(BIN)/python --exclude-editable > constraints.txt

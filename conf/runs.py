@@ -40,7 +40,7 @@ PACKAGES = (
 @dataclass(frozen=True)
 class Run:
     name: str
-    """Of the folder below checkpoints/<command>/, such as exp=cot."""
+    """Of the folder below checkpoints/<command>/, such as exp-cot."""
     folder: Path
 
 
@@ -50,7 +50,8 @@ def run_name(run: str | None, overrides: Sequence[str]) -> str:
         return run
     told = [o.lstrip("+") for o in overrides]
     told = [o for o in told if o.partition("=")[0] not in ELSEWHERE]
-    name = re.sub(r"[^A-Za-z0-9_.,=+-]", "-", ",".join(told)) or "default"
+    # Only what can be typed after model= as it stands: "=" and "," mean something there.
+    name = re.sub(r"[^A-Za-z0-9_.+-]", "-", "+".join(told)) or "default"
     if len(name) > 120:
         digest = hashlib.sha256(name.encode()).hexdigest()[:8]
         name = f"{name[:111]}-{digest}"

@@ -148,7 +148,17 @@ def load_student(
     """A student ready to train: its base, with adapters where the preset has them."""
     base, processor = load_base(cfg, precision, corpus)
     base.config.use_cache = False
+    keep_differentiable(base)
     return (add_adapters(base, cfg.lora) if cfg.lora else base), processor
+
+
+def keep_differentiable(model: nn.Module) -> None:
+    """Keep bitsandbytes from repacking 4-bit weights on a CPU with AVX-512 BF16. It does so at the
+    first evaluation, and what is packed passes no gradient on: every later step would silently
+    train on a part of it."""
+    for module in model.modules():
+        if hasattr(module, "support_avx512bf16_for_cpu"):
+            module.support_avx512bf16_for_cpu = False
 
 
 def load_trained(

@@ -26,6 +26,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
         CachedMultipleNegativesRankingLoss,
         MatryoshkaLoss,
     )
+    from transformers import set_seed
 
     from data.frames import Frames
     from train import backbone, loop, retriever
@@ -34,6 +35,8 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from train.samples import held_out_scenes, shuffled
 
     backbone.keep_big_blocks()
+    # Adapters are drawn before the trainer sets its seed.
+    set_seed(cfg.seed)
     frames = Frames(store, cfg.retriever.image_size)
     queries = store.retrieval("train")
     held_out = held_out_scenes(store, cfg.seed)

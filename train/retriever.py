@@ -20,7 +20,14 @@ from sentence_transformers.sentence_transformer.modules import Normalize, Poolin
 from conf.schema import RetrieverConfig
 from data.frames import Frames
 from data.records import FPS, FRAMES, FrameRef, RetrievalQuery, shown_frames
-from train.backbone import DTYPES, check_reachable, load_failure, nf4_config, pin_sizes
+from train.backbone import (
+    DTYPES,
+    check_reachable,
+    keep_differentiable,
+    load_failure,
+    nf4_config,
+    pin_sizes,
+)
 from train.tiny import build_model, build_processor
 
 PROCESSING = {
@@ -68,6 +75,7 @@ def load_retriever(
         prompts={"query": cfg.query_instruction, "document": cfg.frame_instruction},
         device="cuda" if torch.cuda.is_available() else "cpu",
     )
+    keep_differentiable(backbone)
     if cfg.lora:
         import peft
 

@@ -21,7 +21,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     if cfg.train.regime != "answer_only":
         rationales = ensure_rationales(store, cfg.teacher, cfg.workers)
 
-    from transformers import Trainer, TrainingArguments
+    from transformers import Trainer, TrainingArguments, set_seed
 
     from data.frames import Frames
     from train import backbone, loop, samples
@@ -30,6 +30,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from train.sft_trainer import LetterChoice, token_mean
 
     backbone.keep_big_blocks()
+    # Adapters are drawn before the trainer sets its seed.
+    set_seed(cfg.seed)
     log.info("loading student %s", cfg.student.name)
     model, processor = backbone.load_student(
         cfg.student, cfg.train.precision, lambda: samples.corpus(store, rationales)

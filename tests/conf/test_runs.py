@@ -15,10 +15,10 @@ SETTINGS = {"seed": 0, "run": None, "store": "store", "checkpoints": "c", "worke
     ("overrides", "name"),
     [
         ([], "default"),
-        (["+exp=cot"], "exp=cot"),
-        (["train.lr=1e-3", "+exp=cot"], "train.lr=1e-3,exp=cot"),
+        (["+exp=cot"], "exp-cot"),
+        (["train.lr=1e-3", "+exp=cot"], "train.lr-1e-3+exp-cot"),
         (["store=/big", "workers=8", "checkpoints=c"], "default"),
-        (["student.model=Qwen/Qwen3 VL"], "student.model=Qwen-Qwen3-VL"),
+        (["student.model=Qwen/Qwen3 VL"], "student.model-Qwen-Qwen3-VL"),
     ],
 )
 def test_a_run_is_named_by_its_overrides(overrides, name):

@@ -1,0 +1,134 @@
+"""The evaluation commands on a small student and retriever, really asked."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from conf.entry import Run
+from conf.errors import UserError
+from conf.schema import (
+    ArchitectureConfig,
+    ContrastiveCommand,
+    ReportCommand,
+    RetrieveCommand,
+    RetrieverConfig,
+    SelectCommand,
+    SftCommand,
+    StudentConfig,
+    TeacherConfig,
+)
+from evaluation import report, retrieve, select
+from evaluation.answers import AnswerLog
+from evaluation.trained import settings_of
+from train import backbone, retriever, samples
+
+SMALL = ArchitectureConfig(
+    hidden=64, layers=1, heads=2, kv_heads=2, feed_forward=64,
+    vision_hidden=64, vision_layers=1, vision_heads=2, vision_feed_forward=64,
+)  # fmt: skip
+SHARED = {"architecture": SMALL, "quantization": "none", "lora": None, "image_size": 96}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory, micro, micro_store) -> Path:
+    """checkpoints/ with a finished run of each trainer, as the trainers leave them."""
+    root = tmp_path_factory.mktemp("checkpoints")
+    student = StudentConfig(name="small", max_length=1500, max_new_tokens=12, **SHARED)
+    sft = SftCommand(benchmark=micro, teacher=TeacherConfig(name="template"), student=student)
+    folder = root / "sft" / "run"
+    folder.mkdir(parents=True)
+    model, processor = backbone.load_student(
+        student, "bf16", lambda: samples.corpus(micro_store, [])
+    )
+    backbone.save(model, processor, folder / "student", "bf16")
+    OmegaConf.save(OmegaConf.structured(sft), folder / "config.yaml")
+    (folder / "metrics.json").write_text('{"answer_loss": 1.0, "answer_loss_at_start": 2.0}')
+
+    cfg = RetrieverConfig(name="small", widths=[64, 32], **SHARED)
+    folder = root / "contrastive" / "run"
+    folder.mkdir(parents=True)
+    texts = retriever.corpus(micro_store.retrieval("train"), cfg)
+    built = retriever.load_retriever(cfg, "fp32", texts, folder / "untrained")
+    built.save_pretrained(str(folder / "retriever"), create_model_card=False)
+    settings = ContrastiveCommand(benchmark=micro, retriever=cfg)
+    OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
+    (folder / "metrics.json").write_text("{}")
+    return root
+
+
+def run_in(root: Path, kind: str, name: str = "run") -> Run:
+    folder = root / kind / name
+    folder.mkdir(parents=True, exist_ok=True)
+    return Run(name, folder)
+
+
+def finish(run: Run, metrics: dict) -> None:
+    (run.folder / "metrics.json").write_text(json.dumps(metrics))
+
+
+def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_store) -> None:
+    store = str(micro_store.folder.parent)
+    asked = SelectCommand(
+        benchmark=micro, student=StudentConfig(name="unused", model="unused"), store=store,
+        model=str(runs / "sft" / "run"), batch=4, limit=8,
+    )  # fmt: skip
+    run = run_in(runs, "select")
+    metrics = select.main.__wrapped__(asked, run)
+    finish(run, metrics)
+    told = (run.folder / "report.json").read_text()
+    (reasoning, answer) = json.loads(told)["rows"]
+    assert (reasoning["n"], answer["n"]) == (8, 8)
+    assert set(answer["families"]) == {"event", "time", "window"}
+    assert "paper" in (run.folder / "report.txt").read_text()
+
+    # Killed in the middle of a line, it asks again only what was lost, and says the same.
+    log = run.folder / "answers.jsonl"
+    whole = log.read_text()
+    log.write_text(whole[: len(whole) * 2 // 3])
+    kept = len(AnswerLog(log).answers)
+    assert 0 < kept < 16
+    select.main.__wrapped__(asked, run)
+    assert (run.folder / "report.json").read_text() == told
+    assert sorted(log.read_text().splitlines()) == sorted(whole.splitlines())
+
+    ranked = RetrieveCommand(
+        benchmark=micro, retriever=RetrieverConfig(name="unused", model="unused"), store=store,
+        model=str(runs / "contrastive" / "run"), batch=16,
+    )  # fmt: skip
+    run = run_in(runs, "retrieve")
+    metrics = retrieve.main.__wrapped__(ranked, run)
+    finish(run, metrics)
+    rows = json.loads((run.folder / "report.json").read_text())["rows"]
+    assert [r["width"] for r in rows] == [64, 32, 64, 32]
+    # This "trained" one was saved untrained: both must rank alike.
+    for trained, untrained in zip(rows[:2], rows[2:], strict=True):
+        assert trained["mrr"] == pytest.approx(untrained["mrr"], rel=0.05)
+        assert trained["frames"] == len(micro_store.database())
+
+    page = run_in(runs, "report")
+    report.main.__wrapped__(ReportCommand(checkpoints=str(runs)), page)
+    text = (page.folder / "report.txt").read_text()
+    assert "sft/run answer loss" in text
+    assert (page.folder / "report.png").stat().st_size > 10_000
+
+
+def test_a_model_that_is_no_run_is_named(tmp_path) -> None:
+    with pytest.raises(UserError, match="is no run folder of a trained student"):
+        settings_of(tmp_path / "nowhere", SftCommand, "student")
+
+
+def test_nothing_to_report_says_what_to_run_first(tmp_path) -> None:
+    with pytest.raises(UserError, match=r"evaluation\.select"):
+        report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path)), Run("x", tmp_path))
+
+
+def test_a_limit_spreads_over_the_families(micro_store) -> None:
+    items = micro_store.selection()
+    few = select.spread(items, 6, seed=0)
+    assert sorted(i.family for i in few) == ["event"] * 2 + ["time"] * 2 + ["window"] * 2
+    assert select.spread(items, 6, seed=0) == few
+    assert select.spread(items, None, seed=0) == items
