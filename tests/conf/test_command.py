@@ -27,8 +27,8 @@ def toy(room: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 def test_a_run_leaves_its_record_and_can_be_run_again(room):
     done = toy(room, "x=2", "workers=1")
     assert (done.returncode, done.stdout) == (0, "")
-    assert done.stderr == "x is 2.0 in checkpoints/toy/x=2\n"
-    folder = room / "checkpoints/toy/x=2"
+    assert done.stderr == "x is 2.0 in checkpoints/toy/x-2\n"
+    folder = room / "checkpoints/toy/x-2"
     assert {p.name for p in folder.iterdir()} == {
         "config.yaml",
         "metrics.json",
@@ -118,7 +118,7 @@ def test_a_sweep_outlives_a_failed_job_and_goes_on(room):
 def test_a_sweep_without_a_name_is_named_by_its_overrides(room):
     done = toy(room, "-m", "x=1,2")
     assert done.returncode == 0
-    assert (room / "checkpoints/toy/x=1,2/1/metrics.json").exists()
+    assert (room / "checkpoints/toy/x-1-2/1/metrics.json").exists()
 
 
 def test_a_killed_sweep_takes_its_child_along(room):
@@ -128,7 +128,7 @@ def test_a_killed_sweep_takes_its_child_along(room):
         stderr=subprocess.PIPE,
         text=True,
     )
-    output = room / "checkpoints/toy/x=1,2,end=never/0/output.log"
+    output = room / "checkpoints/toy/x-1-2+end-never/0/output.log"
     until = time.monotonic() + 10
     while not (output.exists() and output.read_text()) and time.monotonic() < until:
         time.sleep(0.05)

@@ -17,6 +17,7 @@ SCHEMAS = {
     "train.contrastive": schema.ContrastiveCommand,
     "evaluation.select": schema.SelectCommand,
     "evaluation.retrieve": schema.RetrieveCommand,
+    "evaluation.report": schema.ReportCommand,
 }
 
 
@@ -44,7 +45,7 @@ def test_a_file_names_a_command_that_composes_it(path):
 def test_a_student_brings_its_recipe():
     tiny = settings("python -m train.sft")
     paper = settings("python -m train.sft student=qwen3_vl_8b")
-    assert (tiny.train.lr, tiny.train.micro_batch, tiny.train.accumulation) == (1e-3, 8, 2)
+    assert (tiny.train.lr, tiny.train.micro_batch, tiny.train.accumulation) == (2e-3, 8, 2)
     assert tiny.train.regime == "cot"
     assert (paper.train.lr, paper.train.micro_batch, paper.train.accumulation) == (2e-5, 1, 16)
     assert (paper.train.epochs, paper.train.precision) == (3, "bf16")
@@ -67,7 +68,7 @@ def test_a_typed_value_and_an_overlay_win_over_a_recipe():
 def test_a_retriever_brings_its_recipe():
     tiny = settings("python -m train.contrastive")
     paper = settings("python -m train.contrastive retriever=qwen3_vl_emb_8b")
-    assert (tiny.train.batch, tiny.train.lr, tiny.retriever.widths[0]) == (64, 2e-3, 128)
+    assert (tiny.train.batch, tiny.train.lr, tiny.retriever.widths[0]) == (64, 1.5e-3, 128)
     assert tiny.retriever.architecture.vocabulary == 1024
     assert (paper.train.batch, paper.train.mini_batch, paper.train.lr) == (512, 8, 2e-5)
 

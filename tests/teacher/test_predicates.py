@@ -45,13 +45,13 @@ def test_a_pair_on_a_course_meets():
     (contact,) = scene.collisions
     assert courses(scene, 10) == [(0, 1)]
     names = tuple(o.phrase for o in scene.objects)
-    for stop, when in ((contact.frame - 45, None), (20, "soon")):
-        facts = facts_of(scene, 0, max(stop, 6), contact.frame)
+    # They close at two units a second and meet after about 32 frames; the cut is 6, then 20.
+    for stop, when in ((6, "soon"), (20, "imminent")):
+        facts = facts_of(scene, 0, stop, contact.frame)
         assert facts.courses[0].objects == names
         assert facts.contacts == facts.courses
-        if when:
-            assert facts.courses[0].when == when
-            assert facts.close[0].objects == names
+        assert facts.courses[0].when == when
+        assert facts.close[0].objects == names
 
 
 def test_parallel_and_parting_pairs_are_on_no_course():
@@ -82,6 +82,8 @@ def cases(count):
         scene, other = synthetic.random_scene(rng), synthetic.random_scene(rng, "other")
         frames = tuple(int(f) for f in 40 + rng.permutation(80)[:4])
         answer = int(rng.integers(4))
+        if not scene.in_view[frames[answer]].any():
+            continue  # No builder names a target that shows nothing.
         foreign = {(answer + 1) % 4: "other"} if k % 3 == 0 else {}
         item = synthetic.item(
             frames,
