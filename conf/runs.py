@@ -58,6 +58,12 @@ def run_name(run: str | None, overrides: Sequence[str]) -> str:
     return name
 
 
+def finished(run: Run) -> dict[str, float] | None:
+    """The metrics of a run that has ended; None while there is something left to do."""
+    path = run.folder / "metrics.json"
+    return json.loads(path.read_text()) if path.exists() else None
+
+
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 
 

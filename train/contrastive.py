@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 
 from conf.entry import Run, command
+from conf.runs import finished
 from conf.schema import ContrastiveCommand
 
 log = logging.getLogger(__name__)
@@ -13,6 +14,10 @@ log = logging.getLogger(__name__)
 
 @command("train.contrastive", ContrastiveCommand)
 def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
+    if (metrics := finished(run)) is not None:
+        log.info("%s is finished; delete it, or give run=NAME, to train anew", run.folder)
+        return metrics
+
     from data.build import ensure_benchmark
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)

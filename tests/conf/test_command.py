@@ -39,9 +39,9 @@ def test_a_run_leaves_its_record_and_can_be_run_again(room):
     assert json.loads((folder / "run.json").read_text())["overrides"] == ["x=2", "workers=1"]
     assert "x is 2.0" in (folder / "run.log").read_text()
     assert toy(room, "x=2").returncode == 0
-    refused = toy(room, "x=3", "run='x=2'")
+    refused = toy(room, "x=3", "run=x-2")
     assert refused.returncode == 2
-    assert "error: checkpoints/toy/x=2 holds a run with other settings: x is 2.0 there" in (
+    assert "error: checkpoints/toy/x-2 holds a run with other settings: x is 2.0 there" in (
         refused.stderr
     )
 
