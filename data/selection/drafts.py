@@ -78,8 +78,9 @@ def fill(
             drafted = draw(scene_of(scene_ids[split][index]), rng, least)
             if drafted is not None:
                 drafts.append(drafted)
-        # Every letter is the answer equally often, up to a remainder, in a random order.
-        positions = rng.permutation(np.arange(len(drafts)) % 4)
+        # Every letter is the answer equally often in a random order; the remainder starts at a
+        # random letter, or the last letter would be right in fewer cells than the first.
+        positions = rng.permutation((np.arange(len(drafts)) + rng.integers(4)) % 4)
         items += [finish(d, int(p), rng) for d, p in zip(drafts, positions, strict=True)]
     return items
 
