@@ -7,7 +7,6 @@ from PIL import Image
 from evaluation import paper
 from evaluation.figures import (
     item_figure,
-    losses_figure,
     retrieval_figure,
     selection_figure,
 )
@@ -20,6 +19,7 @@ from evaluation.tables import (
     retrieval_table,
     selection_table,
 )
+from train.plots import curves_figure
 
 
 @pytest.fixture(scope="module")
@@ -90,12 +90,12 @@ def test_figures_are_written(selection_rows, retrieval_rows, tmp_path):
     for chosen in ("B", "C", None):
         path = tmp_path / f"item_{chosen}.png"
         item_figure(images, images[:4], "ABCD", "B", chosen, question, path)
-    losses_figure(
+    curves_figure(
         [{"step": 2, "loss": 1.0}, {"step": 1, "loss": 2.0}, {"step": 2, "eval_loss": 1.5,
          "eval_accuracy": 0.4, "eval_runtime": 3.0}, {"step": 2, "train_runtime": 9.0}],
         tmp_path / "losses.png",
     )  # fmt: skip
-    losses_figure([], tmp_path / "no_losses.png")
+    curves_figure([], tmp_path / "no_losses.png")
     for path in tmp_path.iterdir():
         with Image.open(path) as image:
             assert image.width > 800
