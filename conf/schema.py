@@ -363,8 +363,10 @@ class ContrastiveCommand(CommandConfig):
 class SelectCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     student: StudentConfig = MISSING
+    train: SftTrainConfig = field(default_factory=SftTrainConfig)
+    """The preset's recipe; a measurement takes its precision alone."""
     model: str | None = None
-    """A run folder of train.sft or a model folder; null takes the student's base."""
+    """A run folder of train.sft, with its own student and recipe; null takes the student's base."""
     modes: list[str] = field(default_factory=lambda: ["reasoning", "answer"])
     """reasoning (rationale, then answer) and answer (at once), each measured by itself."""
     batch: int = 16
@@ -385,8 +387,11 @@ class SelectCommand(CommandConfig):
 class RetrieveCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     retriever: RetrieverConfig = MISSING
+    train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
+    """The preset's recipe; a measurement takes its precision alone."""
     model: str | None = None
-    """A run folder of train.contrastive or a model folder; null takes the retriever's base."""
+    """A run folder of train.contrastive, with its own retriever and recipe; null takes the
+    retriever's base."""
     batch: int = 64
     """Queries or frames that pass the model at once."""
 

@@ -17,10 +17,9 @@ log = logging.getLogger(__name__)
 def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     from evaluation.trained import settings_of
 
-    preset, folder = cfg.retriever, None
-    if cfg.model is not None:
-        folder = Path(cfg.model)
-        preset = settings_of(folder, ContrastiveCommand, "retriever").retriever
+    folder = Path(cfg.model) if cfg.model is not None else None
+    trained = settings_of(folder, ContrastiveCommand, "retriever") if folder else cfg
+    preset, precision = trained.retriever, trained.train.precision
 
     from data.build import ensure_benchmark
 
@@ -40,7 +39,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
         rows += rank_all(saved_retriever(folder), preset, store, frames, cfg.batch, folder.name)
     log.info("ranking with the untrained %s", preset.name)
     texts = retriever.corpus(store.retrieval("train"), preset)
-    untrained = retriever.load_retriever(preset, "bf16", texts, run.folder / "untrained")
+    untrained = retriever.load_retriever(preset, precision, texts, run.folder / "untrained")
     rows += rank_all(untrained, preset, store, frames, cfg.batch, UNTRAINED)
 
     table = retrieval_table(rows)

@@ -18,11 +18,9 @@ log = logging.getLogger(__name__)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from evaluation.trained import settings_of
 
-    student, precision, folder = cfg.student, "bf16", None
-    if cfg.model is not None:
-        folder = Path(cfg.model)
-        trained = settings_of(folder, SftCommand, "student")
-        student, precision = trained.student, trained.train.precision
+    folder = Path(cfg.model) if cfg.model is not None else None
+    trained = settings_of(folder, SftCommand, "student") if folder else cfg
+    student, precision = trained.student, trained.train.precision
 
     from data.build import ensure_benchmark
 

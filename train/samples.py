@@ -14,7 +14,7 @@ from conf.schema import SftCommand, StudentConfig
 from data.frames import Frames
 from data.records import LETTERS, Rationale, SelectionItem
 from data.store import Store
-from teacher.predicates import region_of
+from teacher.predicates import OUT, region_of
 from teacher.template import describe
 from train.conversation import (
     ASK,
@@ -117,7 +117,7 @@ def looks(
             (letter, f"the {look.phrase} {shown[at][k]}")
             for at, letter in enumerate(LETTERS)
             for k, look in enumerate(scene.objects)
-            if sum(row[k] == shown[at][k] for row in shown) == 1
+            if shown[at][k] != OUT and sum(row[k] == shown[at][k] for row in shown) == 1
         ]
         for letter, what in shuffled(telling, seed)[:LOOKS]:
             asked = replace(item, question=f"Which candidate shows {what}?")
