@@ -7,8 +7,11 @@ needs no simulator.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise, product
@@ -70,18 +73,28 @@ class Motion:
 
 
 def connect() -> BulletClient:
-    """A Bullet client without a window, its greetings on standard output swallowed."""
-    sys.stdout.flush()
-    kept = os.dup(1)
-    with open(os.devnull, "w") as nowhere:
-        os.dup2(nowhere.fileno(), 1)
-    try:
+    """A Bullet client without a window, its greetings swallowed."""
+    with _silence(1), _silence(2):
         import pybullet
         from pybullet_utils.bullet_client import BulletClient
 
         return BulletClient(pybullet.DIRECT)
+
+
+@contextmanager
+def _silence(descriptor: int) -> Iterator[None]:
+    """Send what C writes to a file descriptor nowhere."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = os.dup(descriptor)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), descriptor)
+    try:
+        yield
     finally:
-        os.dup2(kept, 1)
+        # What C has buffered would else come out later, in the midst of a progress bar.
+        ctypes.CDLL(None).fflush(None)
+        os.dup2(kept, descriptor)
         os.close(kept)
 
 

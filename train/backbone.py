@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -32,6 +33,10 @@ TOWERS = ("vision", "language", "embeddings and head")
 
 Corpus = Callable[[], Iterable[str]]
 
+# A model's shards load in moments, and peft asks transformers by a name that is about to go.
+transformers_logging.disable_progress_bar()
+warnings.filterwarnings("ignore", "`is_gradient_checkpointing`", FutureWarning)
+
 
 def load_base(
     cfg: StudentConfig, precision: str, corpus: Corpus
@@ -43,7 +48,6 @@ def load_base(
     Raises:
         UserError: the model is neither a folder here nor in the hub's cache, and cannot be fetched.
     """
-    transformers_logging.disable_progress_bar()
     if cfg.architecture is not None:
         processor = build_processor(corpus(), cfg.architecture.vocabulary, cfg.image_size)
         return build_model(cfg.architecture, len(processor.tokenizer)), processor

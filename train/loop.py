@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import torch
-from transformers import PrinterCallback, ProgressCallback, Trainer, TrainerCallback
+from transformers import (
+    PrinterCallback,
+    ProgressCallback,
+    Trainer,
+    TrainerCallback,
+    TrainingArguments,
+)
 from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.entry import Run
@@ -43,8 +50,7 @@ def arguments(train: TrainConfig, run: Run, seed: int, resuming: bool) -> dict[s
         "gradient_accumulation_steps": train.accumulation,
         "bf16": train.precision == "bf16",
         "use_cpu": not torch.cuda.is_available(),
-        "gradient_checkpointing": train.gradient_checkpointing,
-        "gradient_checkpointing_kwargs": {"use_reentrant": False},
+        **checkpointing(train),
         "eval_strategy": "steps",
         "eval_steps": every,
         # A resumed run has its evaluation at the start in the journal already.
@@ -59,6 +65,16 @@ def arguments(train: TrainConfig, run: Run, seed: int, resuming: bool) -> dict[s
         "report_to": list(train.report_to) or "none",
         "disable_tqdm": False,
     }
+
+
+def checkpointing(train: TrainConfig) -> dict[str, Any]:
+    """Recomputing activations, under the name that this version of transformers has for it."""
+    if not train.gradient_checkpointing:
+        return {}
+    named = {field.name for field in fields(TrainingArguments)}
+    new = "activation_checkpointing" in named
+    name = "activation_checkpointing" if new else "gradient_checkpointing"
+    return {name: True, f"{name}_kwargs": {"use_reentrant": False}}
 
 
 def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None) -> None:

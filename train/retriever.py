@@ -75,6 +75,8 @@ def load_retriever(
         prompts={"query": cfg.query_instruction, "document": cfg.frame_instruction},
         device="cuda" if torch.cuda.is_available() else "cpu",
     )
+    # Rows name queries by number: there is no text of theirs that a model card could show.
+    model.model_card_data.generate_widget_examples = False
     keep_differentiable(backbone)
     if cfg.lora:
         import peft

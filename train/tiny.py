@@ -56,6 +56,8 @@ def build_model(sizes: ArchitectureConfig, vocabulary: int) -> Qwen3VLForConditi
     """
     half = sizes.head // 2
     height = width = half // 3
+    end = SPECIAL_TOKENS.index("<|im_end|>")
+    padding = SPECIAL_TOKENS.index("<|endoftext|>")
     config = Qwen3VLConfig(
         text_config={
             "vocab_size": vocabulary,
@@ -66,6 +68,8 @@ def build_model(sizes: ArchitectureConfig, vocabulary: int) -> Qwen3VLForConditi
             "num_key_value_heads": sizes.kv_heads,
             "head_dim": sizes.head,
             "max_position_embeddings": 4096,
+            "eos_token_id": end,
+            "pad_token_id": padding,
             "rope_parameters": {
                 "rope_type": "default",
                 "rope_theta": 5e6,
@@ -95,8 +99,6 @@ def build_model(sizes: ArchitectureConfig, vocabulary: int) -> Qwen3VLForConditi
     with torch.random.fork_rng():
         torch.manual_seed(sizes.seed)
         model = Qwen3VLForConditionalGeneration(config)
-    end = SPECIAL_TOKENS.index("<|im_end|>")
-    padding = SPECIAL_TOKENS.index("<|endoftext|>")
     model.generation_config.update(eos_token_id=end, pad_token_id=padding)
     return model
 
