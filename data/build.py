@@ -21,15 +21,16 @@ from tqdm import tqdm
 from conf.entry import Run, command
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig, BuildCommand, Quota
-from data.bullet import GENERATOR_VERSION, scene_id, simulate_scene
+from data.bullet import scene_id, simulate_scene
 from data.frames import load_frames, save_frames
 from data.records import SPLITS, FrameRef, RetrievalQuery, Scene, SelectionItem, shown_frames
-from data.render import RENDERER_VERSION, renderer
+from data.render import renderer
 from data.retrieval import future
 from data.retrieval.database import choose_frames, drop_twin_targets, share_of_scene
 from data.selection import drafts, event, time, window
 from data.store import (
     MANIFEST,
+    VERSIONS,
     Store,
     digests,
     load_scene,
@@ -253,7 +254,7 @@ def _run_jobs(
 
 def _begin(cfg: BenchmarkConfig, growing: Path) -> None:
     """Go on in the folder of a killed build of the same settings, or begin a new one."""
-    plan = {"generator": GENERATOR_VERSION, "renderer": RENDERER_VERSION, "config": asdict(cfg)}
+    plan = {**VERSIONS, "config": asdict(cfg)}
     path = growing / MANIFEST
     if growing.exists() and (not path.exists() or json.loads(path.read_text()) != plan):
         log.info("a build of other settings was left in %s: beginning anew", growing)
@@ -273,8 +274,7 @@ def _finish(
     manifest = {
         "name": cfg.name,
         "seed": cfg.seed,
-        "generator": GENERATOR_VERSION,
-        "renderer": RENDERER_VERSION,
+        **VERSIONS,
         "config": asdict(cfg),
         "counts": counts,
         "shortfalls": shortfalls,

@@ -36,8 +36,15 @@ from data.records import (
     SelectionItem,
 )
 from data.render import RENDERER_VERSION
+from data.selection.drafts import BUILDERS_VERSION
 
 MANIFEST = "manifest.json"
+VERSIONS = {
+    "generator": GENERATOR_VERSION,
+    "renderer": RENDERER_VERSION,
+    "builders": BUILDERS_VERSION,
+}
+"""What makes the same config give another benchmark: scenes, pixels, items and queries."""
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -169,11 +176,10 @@ def open_store(folder: Path) -> Store:
         files = manifest["files"]
     except (json.JSONDecodeError, KeyError) as error:
         raise UserError(f"{path} is damaged and cannot be read; {rebuild}") from error
-    for key, current in (("generator", GENERATOR_VERSION), ("renderer", RENDERER_VERSION)):
-        if manifest[key] != current:
+    for key, current in VERSIONS.items():
+        if (there := manifest.get(key)) != current:
             raise UserError(
-                f"{folder} was built by {key} version {manifest[key]}, this is version {current}; "
-                f"{rebuild}"
+                f"{folder} was built by {key} version {there}, this is version {current}; {rebuild}"
             )
     found = digests(folder)
     missing = [name for name in files if name not in found]

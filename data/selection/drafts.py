@@ -17,6 +17,9 @@ from conf.schema import Quota
 from data.geometry import DIAGONAL, displacements
 from data.records import SPLITS, Candidate, Scene, SelectionItem
 
+BUILDERS_VERSION = "1"
+"""Of the items' and queries' builders: changes whenever the same scenes would give others."""
+
 
 @dataclass(frozen=True)
 class Draft:

@@ -92,11 +92,16 @@ def test_a_damaged_part_is_named(copy, part) -> None:
         open_store(copy)
 
 
-def test_another_generators_store_is_named(copy) -> None:
+@pytest.mark.parametrize("maker", ["generator", "renderer", "builders"])
+def test_a_store_of_another_version_is_named(copy, maker) -> None:
     manifest = json.loads((copy / MANIFEST).read_text())
-    (copy / MANIFEST).write_text(json.dumps({**manifest, "generator": "0"}))
-    with pytest.raises(UserError, match="generator version 0, this is version"):
+    (copy / MANIFEST).write_text(json.dumps({**manifest, maker: "0"}))
+    with pytest.raises(UserError, match=f"{maker} version 0, this is version"):
         open_store(copy)
+
+
+def test_a_damaged_manifest_is_named(copy) -> None:
+    manifest = json.loads((copy / MANIFEST).read_text())
     (copy / MANIFEST).write_text(json.dumps(manifest)[:100])
     with pytest.raises(UserError, match=r"manifest\.json is damaged"):
         open_store(copy)
