@@ -62,10 +62,9 @@ class Report:
     def __str__(self) -> str:
         reasons = ", ".join(f"{n} {reason}" for reason, n in self.rejected.most_common())
         return (
-            f"rationales: {len(self.rationales)} accepted, {self.rejected.total()} reasons to "
-            f"reject an answer ({reasons or 'none'}), {self.set_aside} items set aside, "
-            f"{self.too_short} items with too short a prefix, {self.mean_words:.0f} words on "
-            "average"
+            f"rationales: {len(self.rationales)} accepted of {self.mean_words:.0f} words on "
+            f"average, {self.set_aside} items set aside, {self.too_short} with too short a prefix; "
+            f"answers were rejected for: {reasons or 'nothing'}"
         )
 
 

@@ -4,12 +4,23 @@ from __future__ import annotations
 
 import ast
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
 FLOW = ("conf", "data", "teacher", "train", "evaluation")
+COMMANDS = (
+    "data.build",
+    "teacher.narrate",
+    "train.sft",
+    "train.contrastive",
+    "evaluation.select",
+    "evaluation.retrieve",
+    "evaluation.report",
+)
+HEAVY = {"torch", "transformers", "sentence_transformers", "pybullet", "matplotlib", "datasets"}
 
 
 @pytest.mark.parametrize("package", FLOW)
@@ -24,6 +35,18 @@ def test_packages_import_only_from_their_left(package: str) -> None:
                 names = [node.module or ""]
             roots = {name.split(".")[0] for name in names} & set(FLOW)
             assert roots <= allowed, f"{path.relative_to(ROOT)} imports {roots - allowed}"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_imports_nothing_heavy(command: str) -> None:
+    code = (
+        f"import runpy, sys; sys.argv = [{command!r}, '--help']\n"
+        f"runpy.run_module({command!r}, run_name='__main__')\n"
+        f"assert not {HEAVY!r} & set(sys.modules), sorted({HEAVY!r} & set(sys.modules))"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert shown.returncode == 0, shown.stderr
+    assert shown.stdout.startswith(f"python -m {command} [KEY=VALUE ...]")
 
 
 def test_no_file_names_a_package_registry() -> None:

@@ -29,7 +29,11 @@ def token_mean(
 
 class LetterChoice:
     """The letter that a student would answer, from the letters' logits where the answer's letter
-    stands; two numbers an item are kept, never the logits."""
+    stands; two numbers an item are kept, never the logits.
+
+    Everything before the letter is given. In reasoning mode that is the teacher's own rationale,
+    so the measure there is whether the student's answer follows from what was reasoned.
+    """
 
     def __init__(self, letters: list[int]) -> None:
         self._letters = torch.tensor(letters)
