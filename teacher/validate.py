@@ -54,8 +54,8 @@ def word_count(text: str) -> int:
 
 def _parse(text: str) -> tuple[dict[str, str], str | None, list[str]]:
     headings = list(HEADING.finditer(text))
-    stops = [m.start() for m in headings[1:]] + [len(text)]
-    parts = [(m[1], text[m.end() : stop].strip()) for m, stop in zip(headings, stops, strict=True)]
+    bounds = [*(m.start() for m in headings), len(text)]
+    parts = [(m[1], text[m.end() : bounds[k + 1]].strip()) for k, m in enumerate(headings)]
     sections = {name: body for name, body in parts if name != "Answer"}
     answers = [body for name, body in parts if name == "Answer"]
     problems = [f"missing section: {name}" for name in SECTIONS if name not in sections]

@@ -104,6 +104,8 @@ def swap(text, item):
         (lambda t, i: "Sure! " + t.replace("Scene", "\nScene", 1), "text before the sections"),
         (lambda t, i: t + "\n" + t.splitlines()[-1], "repeated section"),
         (swap, "sections out of order"),
+        (lambda t, i: "", "missing section: Scene parse"),
+        (lambda t, i: "No heading stands anywhere in this.", "missing section: Outcome"),
         (
             lambda t, i: t.replace("Candidate D", "It").replace("candidate D", "it"),
             "candidate not analysed: D",
