@@ -24,7 +24,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from conf.runs import differences, run_name, write_json
-from conf.sweep import JOB_FILE, read_jobs, report, varying
+from conf.sweep import JOB_FILE, outcome, read_jobs, report, varying
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +95,7 @@ class ProcessLauncher(Launcher):
             log.error("%s: failed after %s s, %s/output.log ends:%s", title, seconds, folder, lines)
             return None
         found = json.loads(metrics.read_text()) if metrics.exists() else {}
-        told = "".join(f", {name} {value:.4g}" for name, value in list(found.items())[:3])
+        told = "".join(f", {name} {value:.4g}" for name, value in list(outcome(found).items())[:3])
         log.info("%s: done in %s s%s", title, seconds, told)
         return found
 

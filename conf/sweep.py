@@ -15,6 +15,8 @@ from conf.errors import UserError
 from conf.runs import write_text
 
 JOB_FILE = "job.json"
+AT_START = "_at_start"
+"""End of the name of a metric measured before a run's first step."""
 
 
 @dataclass
@@ -34,11 +36,16 @@ def read_jobs(folder: Path) -> list[Job]:
     for path in folder.glob(f"*/{JOB_FILE}"):
         metrics = path.with_name("metrics.json")
         told = json.loads(path.read_text())
-        found = json.loads(metrics.read_text()) if metrics.exists() else {}
+        found = outcome(json.loads(metrics.read_text())) if metrics.exists() else {}
         jobs.append(
             Job(int(path.parent.name), **told, metrics=found if told["status"] == "done" else {})
         )
     return sorted(jobs, key=lambda job: job.number)
+
+
+def outcome(metrics: dict[str, float]) -> dict[str, float]:
+    """What a run came to: its metrics but those of its start, which jobs mostly share."""
+    return {name: value for name, value in metrics.items() if not name.endswith(AT_START)}
 
 
 def report(folder: Path) -> str:
@@ -111,11 +118,18 @@ def _plot(
     from matplotlib.figure import Figure
 
     labels = ["\n".join(told.values()) or str(i) for i, told in enumerate(settings)]
-    size = (max(4.0, 1.2 + 0.8 * len(rows)), 0.6 + 2.2 * len(metrics))
+    columns = min(2, len(metrics))
+    lines = math.ceil(len(metrics) / columns)
+    size = (columns * max(4.0, 1.2 + 0.8 * len(rows)), 0.8 + 2.2 * lines)
     figure = Figure(figsize=size, layout="constrained")
-    for axes, name in zip(figure.subplots(len(metrics), squeeze=False)[:, 0], metrics, strict=True):
+    panels = list(figure.subplots(lines, columns, squeeze=False).flat)
+    for axes, name in zip(panels, metrics, strict=False):
         axes.plot(range(len(rows)), [row.get(name, math.nan) for row in rows], "o")
-        axes.set_ylabel(name)
+        axes.set_title(name.replace("_", " "), fontsize="medium", loc="left")
         axes.set_xticks(range(len(rows)), labels)
+        axes.set_xlim(-0.5, len(rows) - 0.5)
         axes.grid(axis="y", alpha=0.3)
+    for axes in panels[len(metrics) :]:
+        axes.set_axis_off()
+    figure.supxlabel(" / ".join(dict.fromkeys(key for told in settings for key in told)))
     figure.savefig(path, dpi=120)

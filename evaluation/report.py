@@ -11,6 +11,7 @@ from conf.entry import Run, command
 from conf.errors import UserError
 from conf.runs import write_text
 from conf.schema import ReportCommand
+from conf.sweep import AT_START
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +72,7 @@ def training_table(runs: list[Path]) -> str:
     for folder in runs:
         metrics = json.loads((folder / "metrics.json").read_text())
         for name, value in metrics.items():
-            start = metrics.get(f"{name}_at_start")
+            start = metrics.get(f"{name}{AT_START}")
             if start is not None:
                 label = f"{folder.parent.name}/{folder.name} {name.replace('_', ' ')}"
                 lines.append(f"{label:<44}{start:>10.3f}{value:>10.3f}")

@@ -61,10 +61,11 @@ class Report:
 
     def __str__(self) -> str:
         reasons = ", ".join(f"{n} {reason}" for reason, n in self.rejected.most_common())
+        words = f" ({self.mean_words:.0f} words on average)" if self.rationales else ""
         return (
-            f"rationales: {len(self.rationales)} accepted of {self.mean_words:.0f} words on "
-            f"average, {self.set_aside} items set aside, {self.too_short} with too short a prefix; "
-            f"answers were rejected for: {reasons or 'nothing'}"
+            f"rationales: {len(self.rationales)} accepted{words}, {self.set_aside} items set "
+            f"aside, {self.too_short} with too short a prefix; answers were rejected for: "
+            f"{reasons or 'nothing'}"
         )
 
 

@@ -21,6 +21,7 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import TrainConfig
+from conf.sweep import AT_START
 from train.plots import curves_figure
 
 log = logging.getLogger(__name__)
@@ -97,7 +98,7 @@ def evaluated(folder: Path) -> dict[str, float]:
         for key, value in record.items():
             if key.startswith("eval_"):
                 name = key.removeprefix("eval_")
-                results.setdefault(f"{name}_at_start", value)
+                results.setdefault(f"{name}{AT_START}", value)
                 results[name] = value
     return results
 

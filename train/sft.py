@@ -42,6 +42,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         cfg.student, cfg.train.precision, lambda: samples.corpus(store, rationales)
     )
     frames = Frames(store, cfg.student.image_size)
+    if cfg.train.regime == "cot":
+        loop.check_not_empty(len(rationales), f"accepted rationales of teacher {cfg.teacher.name}")
     training, validation = samples.splits(store, rationales, cfg, frames)
     loop.check_not_empty(len(training), f"samples for train.regime={cfg.train.regime}")
     collator = Collator(processor, cfg.student.max_length)
