@@ -173,12 +173,26 @@ def _compose_one(command: str, schema: type, overrides: list[str]) -> Any:
     except OmegaConfBaseException as error:
         raise SettingsError(_omegaconf_problem(error, schema)) from error
     except (AssertionError, AttributeError) as error:
-        # OmegaConf 2.3 fails like this below a dataclass that a preset has set to null.
-        below = [o for o in overrides if "." in o.partition("=")[0]]
         raise SettingsError(
-            f"{' '.join(below)}: cannot be set below a key that is null here, choose a preset "
-            "that has it"
+            f"{_below_null(command, overrides)}: cannot be set below a key that is null here, "
+            "choose a preset that has it"
         ) from error
+
+
+def _below_null(command: str, overrides: list[str]) -> str:
+    """The overrides at which OmegaConf 2.3 fails, without a word, because they lie below a
+    dataclass that a preset has set to null."""
+
+    def fails(override: str) -> bool:
+        try:
+            hydra_compose(short(command), [*choices, override])
+        except (AssertionError, AttributeError):
+            return True
+        return False
+
+    dotted = [o for o in overrides if "." in o.partition("=")[0]]
+    choices = [o for o in overrides if o not in dotted]
+    return " ".join([o for o in dotted if fails(o)] or dotted)
 
 
 def _hydra_problem(error: HydraException, schema: type) -> str:

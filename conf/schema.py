@@ -136,6 +136,7 @@ class ArchitectureConfig:
 @dataclass
 class LoraConfig:
     rank: int = 16
+    """0 adds no adapters and trains the whole model."""
     alpha: int = 32
     dropout: float = 0.0
     targets: str = (
@@ -156,8 +157,7 @@ class StudentConfig:
     architecture: ArchitectureConfig | None = None
     quantization: str = "nf4"
     """nf4 or none."""
-    lora: LoraConfig | None = field(default_factory=LoraConfig)
-    """null trains the whole model."""
+    lora: LoraConfig = field(default_factory=LoraConfig)
     image_size: int = 336
     """Frames reach the model at image_size x image_size px, before the processor's grid."""
     frames: int = 12
@@ -178,7 +178,7 @@ class RetrieverConfig:
     trust_remote_code: bool = False
     architecture: ArchitectureConfig | None = None
     quantization: str = "nf4"
-    lora: LoraConfig | None = field(default_factory=LoraConfig)
+    lora: LoraConfig = field(default_factory=LoraConfig)
     image_size: int = 336
     frames: int = 12
     max_length: int = 3072
@@ -203,16 +203,18 @@ def _backbone_problems(group: str, cfg: StudentConfig | RetrieverConfig) -> list
         )
     if cfg.quantization not in ("nf4", "none"):
         problems.append(f"{group}.quantization={cfg.quantization}: the options are nf4 and none")
-    if cfg.quantization == "nf4" and cfg.lora is None:
+    if cfg.quantization == "nf4" and cfg.lora.rank == 0:
         problems.append(
-            f"{group}.quantization=nf4 with {group}.lora=null: 4-bit weights cannot be trained "
-            f"whole, set {group}.quantization=none or give {group}.lora"
+            f"{group}.quantization=nf4 with {group}.lora.rank=0: 4-bit weights cannot be trained "
+            f"whole, set {group}.quantization=none or raise {group}.lora.rank"
         )
     if cfg.quantization == "nf4" and cfg.architecture is not None:
         problems.append(
             f"{group}.quantization=nf4 with {group}.architecture: a model built from a seed is "
             f"trained whole, set {group}.quantization=none"
         )
+    if cfg.lora.rank < 0:
+        problems.append(f"{group}.lora.rank={cfg.lora.rank} must be 0 or more")
     if cfg.image_size < 32:
         problems.append(f"{group}.image_size={cfg.image_size} must be 32 or more")
     if cfg.frames < 2:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from sentence_transformers import SentenceTransformer
@@ -80,8 +79,3 @@ def normalise(embeddings: np.ndarray) -> np.ndarray:
     """Rows of unit length; a row of zeros stays one."""
     lengths = np.linalg.norm(embeddings, axis=1, keepdims=True)
     return embeddings / np.maximum(lengths, 1e-12)
-
-
-def saved_retriever(run: Path) -> SentenceTransformer:
-    """The retriever that a run of train.contrastive wrote: a plain SentenceTransformer."""
-    return SentenceTransformer(str(run / "retriever"), local_files_only=True)

@@ -26,7 +26,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.frames import Frames
-    from evaluation.embedding import rank_all, saved_retriever
+    from evaluation.embedding import rank_all
     from evaluation.figures import retrieval_figure
     from evaluation.tables import RECALLS, UNTRAINED, RetrievalRow, retrieval_table
     from train import backbone, retriever
@@ -36,7 +36,8 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     rows: list[RetrievalRow] = []
     if folder is not None:
         log.info("ranking with the retriever of %s", folder)
-        rows += rank_all(saved_retriever(folder), preset, store, frames, cfg.batch, folder.name)
+        model = retriever.load_trained(preset, precision, folder / "retriever")
+        rows += rank_all(model, preset, store, frames, cfg.batch, folder.name)
     log.info("ranking with the untrained %s", preset.name)
     texts = retriever.corpus(store.retrieval("train"), preset)
     untrained = retriever.load_retriever(preset, precision, texts, run.folder / "untrained")

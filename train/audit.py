@@ -25,11 +25,11 @@ def audit(
     sample: Sample,
     collator: Collator,
 ) -> str:
-    """Parameter counts by tower, the grids that frames become, and a decoded sample whose
-    supervised part stands between >>> and <<<.
+    """Parameter counts by tower, the grids that frames become, and the longest sample, decoded,
+    its supervised part between >>> and <<<.
 
     Raises:
-        UserError: the counts are not what the preset says.
+        UserError: the counts are not what the preset says, or the sample is too long.
     """
     towers = count_towers(model)
     check_towers(towers, cfg)
@@ -40,10 +40,10 @@ def audit(
     decode = processor.tokenizer.decode
     return "\n".join(
         [
-            f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora else 'whole'})",
+            f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'whole'})",
             tower_table(towers),
             f"frames of {cfg.image_size} x {cfg.image_size} px become {grids(batch, processor)}",
-            f"a sample of {len(ids)} tokens, {supervised} of them supervised:",
+            f"the longest sample has {len(ids)} tokens, {supervised} of them supervised:",
             f"{squeeze(decode(prompt))}>>>{squeeze(decode(response))}<<<",
         ]
     )
@@ -52,11 +52,11 @@ def audit(
 def audit_retriever(
     model: SentenceTransformer, cfg: RetrieverConfig, query: RetrievalQuery, frames: Frames
 ) -> str:
-    """The same for a retriever: counts, grids, and a decoded query and frame.
+    """The same for a retriever: counts, grids, the longest query and a frame, decoded.
 
     Raises:
-        UserError: the counts are not what the preset says, or the model is narrower than its
-            widest width.
+        UserError: the counts are not what the preset says, the model is narrower than its widest
+            width, or the query is too long.
     """
     towers = count_towers(model)
     check_towers(towers, cfg)
@@ -67,15 +67,21 @@ def audit_retriever(
         )
     processor = model[0].processor
     asked = model.preprocess([query_input(query, frames, cfg)], prompt=cfg.query_instruction)
+    length = asked["input_ids"].shape[1]
+    if length > cfg.max_length:
+        raise UserError(
+            f"query {query.query_id} has {length} tokens, more than retriever.max_length="
+            f"{cfg.max_length}: raise it, or lower retriever.image_size or retriever.frames"
+        )
     shown = model.preprocess([frame_input(query.target, frames)], prompt=cfg.frame_instruction)
     decode = processor.tokenizer.decode
     return "\n".join(
         [
-            f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora else 'whole'})",
+            f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'whole'})",
             tower_table(towers),
             f"frames of {cfg.image_size} x {cfg.image_size} px become "
             f"{grids(asked | {k: shown[k] for k in ('image_grid_thw',)}, processor)}",
-            f"a query of {asked['input_ids'].shape[1]} tokens, embedded at the last one:",
+            f"the longest query has {length} tokens and is embedded at the last one:",
             squeeze(decode(asked["input_ids"][0])),
             f"a frame of {shown['input_ids'].shape[1]} tokens:",
             squeeze(decode(shown["input_ids"][0])),

@@ -54,7 +54,7 @@ def load_base(
     check_reachable("student", cfg.model)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     # Weights that are trained stay fp32 and are computed in lower precision by autocast.
-    whole = cfg.quantization == "none" and cfg.lora is None
+    whole = cfg.quantization == "none" and cfg.lora.rank == 0
     dtype = torch.float32 if whole else DTYPES[precision]
     quantization = nf4_config(dtype) if cfg.quantization == "nf4" else None
     try:
@@ -153,7 +153,7 @@ def load_student(
     base, processor = load_base(cfg, precision, corpus)
     base.config.use_cache = False
     keep_differentiable(base)
-    return (add_adapters(base, cfg.lora) if cfg.lora else base), processor
+    return (add_adapters(base, cfg.lora) if cfg.lora.rank else base), processor
 
 
 def keep_differentiable(model: nn.Module) -> None:
@@ -179,7 +179,9 @@ def load_trained(
     if (folder / "adapter_config.json").exists():
         base, processor = load_base(cfg, precision, list)
         return peft.PeftModel.from_pretrained(base, folder).eval(), processor
-    whole = replace(cfg, model=str(folder), architecture=None, quantization="none", lora=None)
+    whole = replace(
+        cfg, model=str(folder), architecture=None, quantization="none", lora=LoraConfig(rank=0)
+    )
     model, processor = load_base(whole, precision, list)
     return model.eval(), processor
 
@@ -233,7 +235,7 @@ def check_towers(towers: dict[str, Tower], cfg: StudentConfig | RetrieverConfig)
         UserError: a tower is quantised, adapted or trained that should not be, or is not that
             should.
     """
-    nf4, lora = cfg.quantization == "nf4", cfg.lora is not None
+    nf4, lora = cfg.quantization == "nf4", cfg.lora.rank > 0
     problems = []
     for name, tower in towers.items():
         language = name == "language"

@@ -58,7 +58,8 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
         corpus=retriever.corpus(queries, cfg.retriever),
         folder=run.folder / "untrained",
     )
-    log.info(audit_retriever(model, cfg.retriever, training[0], frames))
+    longest = retriever.longest_query(training, model.tokenizer)
+    log.info(audit_retriever(model, cfg.retriever, longest, frames))
     ranking = HeldOutRanking(validation, frames, cfg.retriever, cfg.train.mini_batch)
     loss = MatryoshkaLoss(
         model,

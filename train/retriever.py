@@ -31,6 +31,8 @@ from train.backbone import (
 from train.tiny import build_model, build_processor
 
 PROCESSING = {
+    # The library's default cuts a long input, through its frames if need be; the audit refuses it.
+    "text": {"truncation": False},
     "video": {"do_sample_frames": False},
     "chat_template": {"add_generation_prompt": True},
 }
@@ -52,16 +54,11 @@ def load_retriever(
         processor.save_pretrained(folder)
         source = str(folder)
     check_reachable("retriever", source)
-    whole = cfg.quantization == "none" and cfg.lora is None
-    dtype = torch.float32 if whole else DTYPES[precision]
-    options: dict[str, Any] = {"dtype": dtype, "use_safetensors": True}
-    if cfg.quantization == "nf4":
-        options["quantization_config"] = nf4_config(dtype)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     try:
         backbone = Transformer(
             source,
-            model_kwargs={**options, **origin},
+            model_kwargs={**weight_options(cfg, precision), **origin},
             processor_kwargs=origin,
             config_kwargs=origin,
             processing_kwargs=PROCESSING,
@@ -78,7 +75,7 @@ def load_retriever(
     # Rows name queries by number: there is no text of theirs that a model card could show.
     model.model_card_data.generate_widget_examples = False
     keep_differentiable(backbone)
-    if cfg.lora:
+    if cfg.lora.rank:
         import peft
 
         model.requires_grad_(False)
@@ -93,12 +90,37 @@ def load_retriever(
     return model
 
 
+def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> SentenceTransformer:
+    """The retriever that `train.contrastive` saved in `folder`, its adapters over the same 4-bit
+    weights that they were trained on."""
+    return SentenceTransformer(
+        str(folder), model_kwargs=weight_options(cfg, precision), local_files_only=True
+    )
+
+
+def weight_options(cfg: RetrieverConfig, precision: str) -> dict[str, Any]:
+    """How weights are loaded: fp32 where all of them are trained, else in the precision that they
+    compute in, 4-bit where the preset says so; safetensors only."""
+    whole = cfg.quantization == "none" and cfg.lora.rank == 0
+    dtype = torch.float32 if whole else DTYPES[precision]
+    options: dict[str, Any] = {"dtype": dtype, "use_safetensors": True}
+    if cfg.quantization == "nf4":
+        options["quantization_config"] = nf4_config(dtype)
+    return options
+
+
 def corpus(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list[str]:
     """Texts for a tokenizer built from nothing: questions, instructions and timestamps."""
     texts = sorted({q.question for q in queries})
     clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
     roles = ["system", "user", "assistant"]
     return [*texts, cfg.query_instruction, cfg.frame_instruction, *roles, *clock] * 10
+
+
+def longest_query(queries: list[RetrievalQuery], tokenizer: Any) -> RetrievalQuery:
+    """The query with the most tokens. Frames are alike in all of them, so the text tells."""
+    encoded = tokenizer([q.question for q in queries], add_special_tokens=False).input_ids
+    return queries[max(range(len(queries)), key=lambda k: len(encoded[k]))]
 
 
 def query_input(query: RetrievalQuery, frames: Frames, cfg: RetrieverConfig) -> dict[str, Any]:

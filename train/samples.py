@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
 
 import numpy as np
 from torch.utils.data import Dataset
+from transformers import PreTrainedTokenizerBase
 
 from conf.schema import SftCommand, StudentConfig
 from data.frames import Frames
@@ -30,21 +31,34 @@ HELD_OUT = 0.1
 LOOKS = 2
 """Questions about what a candidate shows that the tiny base learns from, for each item."""
 
-MakeSample = Callable[[], Sample]
 Row = TypeVar("Row")
 
 
-class Samples(Dataset):
-    """Samples made when they are asked for, so that pixels are not held for all of them."""
+@dataclass(frozen=True)
+class Planned:
+    """A sample to be made when it is asked for, so that pixels are not held for all of them, and
+    the text that it does not share with others of its kind."""
 
-    def __init__(self, makers: Sequence[MakeSample]) -> None:
-        self._makers = makers
+    text: str
+    make: Callable[[], Sample]
+
+
+class Samples(Dataset):
+    """Planned samples as a trainer reads them."""
+
+    def __init__(self, planned: Sequence[Planned]) -> None:
+        self._planned = planned
 
     def __len__(self) -> int:
-        return len(self._makers)
+        return len(self._planned)
 
     def __getitem__(self, index: int) -> Sample:
-        return self._makers[index]()
+        return self._planned[index].make()
+
+    def longest(self, tokenizer: PreTrainedTokenizerBase) -> Sample:
+        """The sample with the most tokens. Frames are alike in all of them, so the text tells."""
+        encoded = tokenizer([p.text for p in self._planned], add_special_tokens=False).input_ids
+        return self[max(range(len(self)), key=lambda k: len(encoded[k]))]
 
 
 def held_out_scenes(store: Store, seed: int) -> set[str]:
@@ -63,23 +77,26 @@ def shuffled(rows: list[Row], seed: int) -> list[Row]:
 
 def supervised_items(
     items: list[SelectionItem], rationales: dict[str, Rationale], cfg: StudentConfig, frames: Frames
-) -> dict[str, list[MakeSample]]:
+) -> dict[str, list[Planned]]:
     """Each item in reasoning mode, where it has a rationale, and in answer mode."""
-    made: dict[str, list[MakeSample]] = {"reasoning": [], "answer": []}
+    made: dict[str, list[Planned]] = {"reasoning": [], "answer": []}
     for item in items:
         if rationale := rationales.get(item.item_id):
-            text = rationale.text
-            made["reasoning"].append(
-                partial(selection_sample, item, "reasoning", frames, cfg, text)
-            )
-        line = answer_line(item.letter)
-        made["answer"].append(partial(selection_sample, item, "answer", frames, cfg, line))
+            made["reasoning"].append(_asked(item, "reasoning", frames, cfg, rationale.text))
+        made["answer"].append(_asked(item, "answer", frames, cfg, answer_line(item.letter)))
     return made
+
+
+def _asked(
+    item: SelectionItem, mode: str, frames: Frames, cfg: StudentConfig, response: str
+) -> Planned:
+    text = f"{item.question} {ASK[mode]} {response}"
+    return Planned(text, partial(selection_sample, item, mode, frames, cfg, response))
 
 
 def descriptions(
     store: Store, scenes: set[str], cfg: StudentConfig, frames: Frames, seed: int
-) -> list[MakeSample]:
+) -> list[Planned]:
     """The built-in narrator's descriptions of training scenes: what the tiny base learns to write.
     Windows are those that items and queries show."""
     windows = {
@@ -90,21 +107,21 @@ def descriptions(
         )
         if a.scene_id in scenes
     }
-    made: list[MakeSample] = []
+    made: list[Planned] = []
     for scene_id, start, stop, target in sorted(windows):
         text = describe(store.scene(scene_id), start, stop, target, seed)
         if text is not None:
             make = partial(description_sample, scene_id, start, stop, target, frames, cfg, text)
-            made.append(make)
+            made.append(Planned(text, make))
     return made
 
 
 def looks(
     store: Store, scenes: set[str], cfg: StudentConfig, frames: Frames, seed: int
-) -> list[MakeSample]:
+) -> list[Planned]:
     """Questions about what stands where in a candidate, which need no foresight: they give the
     tiny base the words and letters of the candidate analysis."""
-    made: list[MakeSample] = []
+    made: list[Planned] = []
     for item in store.selection("train"):
         if item.scene_id not in scenes:
             continue
@@ -122,7 +139,7 @@ def looks(
         for letter, what in shuffled(telling, seed)[:LOOKS]:
             asked = replace(item, question=f"Which candidate shows {what}?")
             text = f"Candidate {letter} shows {what}.\n{answer_line(letter)}"
-            made.append(partial(selection_sample, asked, "answer", frames, cfg, text))
+            made.append(_asked(asked, "answer", frames, cfg, text))
     return made
 
 
@@ -153,7 +170,7 @@ def splits(
     # A CoT student learns both modes, so that it can be asked in either.
     return (
         Samples(training["reasoning"] + training["answer"]),
-        {mode: Samples(makers) for mode, makers in validation.items() if makers},
+        {mode: Samples(planned) for mode, planned in validation.items() if planned},
     )
 
 

@@ -47,7 +47,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     training, validation = samples.splits(store, rationales, cfg, frames)
     loop.check_not_empty(len(training), f"samples for train.regime={cfg.train.regime}")
     collator = Collator(processor, cfg.student.max_length)
-    log.info(audit(model, processor, cfg.student, training[0], collator))
+    longest = training.longest(processor.tokenizer)
+    log.info(audit(model, processor, cfg.student, longest, collator))
 
     # Descriptions end in no answer whose letter could be measured.
     letters = None if cfg.train.regime == "describe" else LetterChoice(letter_ids(processor))

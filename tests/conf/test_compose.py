@@ -91,9 +91,15 @@ def test_a_check_across_groups_is_told():
 
 
 def test_what_may_be_null_can_be_set_and_unset():
-    assert compose("train.sft", SftCommand, ["student.lora.rank=8"]).student.lora.rank == 8
-    unset = ["student.lora=null", "student.quantization=none"]
-    assert compose("train.sft", SftCommand, unset).student.lora is None
+    sizes = ["student=tiny_scratch", "student.architecture.hidden=96"]
+    assert compose("train.sft", SftCommand, sizes).student.architecture.hidden == 96
+    unset = ["student=tiny_scratch", "student.architecture=null", "student.model=folder"]
+    assert compose("train.sft", SftCommand, unset).student.architecture is None
+
+
+def test_a_key_below_a_null_is_named_alone():
+    said = problem("train.lr=1e-3", "student.architecture.hidden=96", "student.frames=4")
+    assert said.startswith("student.architecture.hidden=96: cannot be set below a key that is null")
 
 
 def test_a_dict_takes_new_names():

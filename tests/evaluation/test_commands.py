@@ -13,6 +13,7 @@ from conf.errors import UserError
 from conf.schema import (
     ArchitectureConfig,
     ContrastiveCommand,
+    LoraConfig,
     ReportCommand,
     RetrieveCommand,
     RetrieverConfig,
@@ -30,7 +31,9 @@ SMALL = ArchitectureConfig(
     hidden=64, layers=1, heads=2, kv_heads=2, feed_forward=64,
     vision_hidden=64, vision_layers=1, vision_heads=2, vision_feed_forward=64,
 )  # fmt: skip
-SHARED = {"architecture": SMALL, "quantization": "none", "lora": None, "image_size": 96}
+SHARED = {
+    "architecture": SMALL, "quantization": "none", "lora": LoraConfig(rank=0), "image_size": 96,
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

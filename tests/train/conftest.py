@@ -27,7 +27,8 @@ SMALL = ArchitectureConfig(
 @pytest.fixture(scope="session")
 def student_cfg() -> StudentConfig:
     return StudentConfig(
-        name="small", architecture=SMALL, quantization="none", lora=None, image_size=96,
+        name="small", architecture=SMALL, quantization="none", lora=LoraConfig(rank=0),
+        image_size=96,
         max_length=1500,
     )  # fmt: skip
 
@@ -35,7 +36,8 @@ def student_cfg() -> StudentConfig:
 @pytest.fixture(scope="session")
 def retriever_cfg() -> RetrieverConfig:
     return RetrieverConfig(
-        name="small", architecture=SMALL, quantization="none", lora=None, image_size=96,
+        name="small", architecture=SMALL, quantization="none", lora=LoraConfig(rank=0),
+        image_size=96,
         widths=[64, 32],
     )  # fmt: skip
 

@@ -9,6 +9,7 @@ import torch
 
 from conf.errors import UserError
 from data.records import FPS, SelectionItem, shown_frames
+from train import samples
 from train.collate import IGNORED, Collator, encode, letter_ids, pad
 from train.conversation import Sample, selection_sample
 from train.sft_trainer import LetterChoice, token_mean
@@ -96,6 +97,25 @@ def test_a_sample_over_the_limit_is_refused_with_its_length(lines, processor) ->
     encode(lines[1], processor, length)
     with pytest.raises(UserError, match=f"{length} tokens, more than student.max_length"):
         encode(lines[1], processor, length - 1)
+
+
+def test_the_longest_sample_is_found_without_making_them_all(
+    micro_store, frames, student_cfg, processor
+) -> None:
+    seen = []
+
+    def planned(item: SelectionItem, words: int) -> samples.Planned:
+        text = "near the top " * words + "\nAnswer: A"
+        sample = selection_sample(item, "answer", frames, student_cfg, text)
+        return samples.Planned(text, lambda: seen.append(item.item_id) or sample)
+
+    items = micro_store.selection("train")[:4]
+    made = samples.Samples([planned(i, w) for i, w in zip(items, (3, 9, 27, 1), strict=True)])
+    lengths = [len(encode(made[k], processor, 1500).input_ids) for k in range(4)]
+    seen.clear()
+    longest = made.longest(processor.tokenizer)
+    assert seen == [items[2].item_id]
+    assert len(encode(longest, processor, 1500).input_ids) == max(lengths)
 
 
 def test_the_letters_logits_choose_the_answer(

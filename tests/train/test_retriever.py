@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import torch
 from sentence_transformers import SentenceTransformer
 
+from conf.errors import UserError
+from conf.schema import LoraConfig
 from data.records import FPS, shown_frames
 from train import retriever
 from train.audit import audit_retriever
+from train.backbone import count_towers, keep_differentiable
 from train.retriever import LateFrames, column_prompts, frame_input, query_input
 
 
@@ -33,6 +39,17 @@ def test_a_query_is_instruction_then_video_then_text_and_a_generation_prompt(
     shown = shown_frames(query.prefix_start, query.prefix_stop, 12)
     assert f"<{(shown[0] + shown[1]) / 2 / FPS:.1f} seconds>" in text
     assert "of 6 x 3 x 3 tokens" in audit_retriever(model, retriever_cfg, query, frames)
+
+
+def test_a_long_query_is_refused_and_never_cut(
+    micro_store, frames, retriever_cfg, tmp_path
+) -> None:
+    model = load(micro_store, retriever_cfg, tmp_path)
+    short = micro_store.retrieval("train")[0]
+    long = replace(short, question="Which frame? " * 2000)
+    assert retriever.longest_query([short, long, short], model.tokenizer) is long
+    with pytest.raises(UserError, match=rf"query {long.query_id} has \d{{4,}} tokens, more than"):
+        audit_retriever(model, retriever_cfg, long, frames)
 
 
 def test_the_embedding_is_the_last_tokens_state_normalised(
@@ -64,6 +81,26 @@ def test_a_saved_retriever_encodes_the_same_without_this_project(
             again.encode(inputs, prompt_name="query"),
             atol=1e-6,
         )
+
+
+def test_adapters_are_read_back_over_the_4_bit_weights_they_were_trained_on(
+    micro_store, frames, retriever_cfg, saved_base, tmp_path
+) -> None:
+    cfg = replace(
+        retriever_cfg, architecture=None, model=saved_base, quantization="nf4", lora=LoraConfig()
+    )
+    model = load(micro_store, cfg, tmp_path)
+    with torch.no_grad():
+        for name, weight in model.named_parameters():
+            if "lora_B" in name:
+                weight.normal_(std=0.1, generator=torch.Generator().manual_seed(0))
+    model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
+    again = retriever.load_trained(cfg, "fp32", tmp_path / "saved")
+    assert count_towers(again)["language"].four_bit > 0
+    keep_differentiable(again)
+    query = [query_input(micro_store.retrieval("train")[0], frames, cfg)]
+    one, two = (m.encode(query, prompt_name="query") for m in (model, again))
+    np.testing.assert_allclose(one, two, atol=1e-5)
 
 
 def test_a_batch_reads_the_pixels_of_its_rows_alone(
