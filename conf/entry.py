@@ -5,12 +5,13 @@ from __future__ import annotations
 import errno
 import functools
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser
@@ -25,6 +26,8 @@ from conf.runs import Run, open_run, run_name, write_json
 Metrics = dict[str, float]
 Main = Callable[[Any, Run], Metrics | None]
 
+NOTHING_LEFT = 1 << 20
+"""Free bytes under which a disk counts as full."""
 CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.ENOTDIR)
 
 
@@ -81,10 +84,11 @@ def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None
 
 
 @contextmanager
-def _sentences(folder: str = "the disk") -> Iterator[None]:
+def _sentences(folder: str = ".") -> Iterator[None]:
     """End with a sentence where a user can help it; any other error is a bug, with its traceback.
 
-    A full disk names no file: `folder` is where it was met.
+    A full disk may name no file, and some libraries report it as an error of their own: `folder`
+    is where it is looked for.
     """
     try:
         yield
@@ -98,5 +102,20 @@ def _sentences(folder: str = "the disk") -> Iterator[None]:
     except OSError as error:
         if error.errno not in CANNOT_WRITE:
             raise
-        print(f"error: {error.filename or folder}: {error.strerror}", file=sys.stderr)
-        sys.exit(1)
+        _cannot_write(str(error.filename or folder), str(error.strerror))
+    except Exception:
+        if not _full(folder):
+            raise
+        _cannot_write(folder, os.strerror(errno.ENOSPC))
+
+
+def _cannot_write(where: str, why: str) -> NoReturn:
+    print(
+        f"error: {where}: {why}; once that is mended, the same command goes on where it was",
+        file=sys.stderr,
+    )
+    sys.exit(1)
+
+
+def _full(folder: str) -> bool:
+    return os.path.exists(folder) and shutil.disk_usage(folder).free < NOTHING_LEFT

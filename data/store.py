@@ -57,9 +57,10 @@ def write_atomically(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
-    except OSError:
+    except OSError as error:
         partial.unlink(missing_ok=True)
-        raise
+        # A full disk names no file of itself.
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def save_scene(scene: Scene, path: Path) -> None:

@@ -11,6 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from conf.entry import _sentences
+
+GO_ON = "once that is mended, the same command goes on where it was\n"
+
 
 @pytest.fixture
 def room(tmp_path: Path) -> Path:
@@ -50,10 +54,10 @@ def test_a_run_leaves_its_record_and_can_be_run_again(room):
     ("arguments", "code", "said"),
     [
         (["end=mistake"], 1, "error: this end is a mistake: set end=well\n"),
-        (["end=disk"], 1, "error: some/file: No space left on device\n"),
+        (["end=disk"], 1, f"error: some/file: No space left on device; {GO_ON}"),
         (["end=interrupt"], 130, "interrupted; run the same command again to go on\n"),
         (["+teacher.sed=1"], 2, "+teacher.sed: toy has no such key, did you mean teacher.seed?\n"),
-        (["checkpoints=toy.py"], 1, "error: toy.py/toy/default: Not a directory\n"),
+        (["checkpoints=toy.py"], 1, f"error: toy.py/toy/default: Not a directory; {GO_ON}"),
     ],
 )
 def test_a_mistake_is_a_sentence(room, arguments, code, said):
@@ -61,6 +65,17 @@ def test_a_mistake_is_a_sentence(room, arguments, code, said):
     assert done.returncode == code
     assert done.stderr.endswith(said)
     assert "Traceback" not in done.stderr
+
+
+def test_a_librarys_own_error_on_a_full_disk_is_a_sentence(monkeypatch, tmp_path, capsys):
+    with pytest.raises(RuntimeError), _sentences(str(tmp_path)):
+        raise RuntimeError("unexpected pos 304000 vs 303892")
+    full = shutil.disk_usage(tmp_path)._replace(free=0)
+    monkeypatch.setattr("conf.entry.shutil.disk_usage", lambda _: full)
+    with pytest.raises(SystemExit) as ended, _sentences(str(tmp_path)):
+        raise RuntimeError("unexpected pos 304000 vs 303892")
+    assert ended.value.code == 1
+    assert capsys.readouterr().err == f"error: {tmp_path}: No space left on device; {GO_ON}"
 
 
 def test_a_bug_keeps_its_traceback(room):
