@@ -27,8 +27,9 @@ from train.plots import curves_figure
 log = logging.getLogger(__name__)
 
 JOURNAL = "metrics.jsonl"
-TIMINGS = ("_runtime", "_per_second", "total_flos")
-"""Ends of the logged names that no two runs share."""
+UNSHARED = ("_runtime", "_per_second", "total_flos", "train_loss")
+"""Ends of the logged names that no two runs share: timings, and the trainer's mean over the run,
+which counts only the steps since it was resumed."""
 
 SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
 
@@ -117,7 +118,9 @@ class Journal(TrainerCallback):
         self._path.write_text("".join(lines))
 
     def on_log(self, args, state: TrainerState, control: TrainerControl, logs=None, **_) -> None:
-        values = {k: v for k, v in (logs or {}).items() if not k.endswith(TIMINGS)}
+        values = {k: v for k, v in (logs or {}).items() if not k.endswith(UNSHARED)}
+        if not values.keys() - {"epoch"}:
+            return
         with open(self._path, "a") as file:
             file.write(json.dumps({"step": state.global_step, **values}) + "\n")
 
@@ -136,7 +139,7 @@ class Bar(ProgressCallback):
 
     def on_log(self, args, state, control, logs=None, **_) -> None:
         for name, value in (logs or {}).items():
-            if name.endswith(self.SHOWN):
+            if name.endswith(self.SHOWN) and not name.endswith(UNSHARED):
                 self._figures[name.removeprefix("eval_")] = f"{value:.3g}"
         if self.training_bar is not None:
             self.training_bar.set_postfix(self._figures)
