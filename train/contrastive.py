@@ -78,7 +78,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     trainer = SentenceTransformerTrainer(
         model=model,
         args=SentenceTransformerTrainingArguments(
-            **loop.arguments(cfg.train, run, cfg.seed, resuming=checkpoint is not None),
+            **loop.arguments(cfg.train, run, cfg.seed, checkpoint),
             per_device_train_batch_size=cfg.train.batch,
             dataloader_drop_last=True,
         ),

@@ -34,10 +34,13 @@ which counts only the steps since it was resumed."""
 SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
 
 
-def arguments(train: TrainConfig, run: Run, seed: int, resuming: bool) -> dict[str, Any]:
+def arguments(train: TrainConfig, run: Run, seed: int, checkpoint: Path | None) -> dict[str, Any]:
     """Arguments for `TrainingArguments` and its kin, from the settings that trainers share."""
-    # A share of the steps; 1 would mean every step.
-    every = min(1 / train.evaluations, 0.9999)
+    if checkpoint is None:
+        # A share of the steps; 1 would mean every step.
+        every = min(1 / train.evaluations, 0.9999)
+    else:
+        every = json.loads((checkpoint / "trainer_state.json").read_text())["eval_steps"]
     return {
         "output_dir": str(run.folder),
         "seed": seed,
@@ -56,7 +59,7 @@ def arguments(train: TrainConfig, run: Run, seed: int, resuming: bool) -> dict[s
         "eval_strategy": "steps",
         "eval_steps": every,
         # A resumed run has its evaluation at the start in the journal already.
-        "eval_on_start": not resuming,
+        "eval_on_start": checkpoint is None,
         "save_strategy": "steps",
         "save_steps": every,
         "save_total_limit": train.keep,

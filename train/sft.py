@@ -56,7 +56,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     trainer = Trainer(
         model=model,
         args=TrainingArguments(
-            **loop.arguments(cfg.train, run, cfg.seed, resuming=checkpoint is not None),
+            **loop.arguments(cfg.train, run, cfg.seed, checkpoint),
             per_device_train_batch_size=cfg.train.micro_batch,
             per_device_eval_batch_size=cfg.train.micro_batch,
             label_names=["labels"],
