@@ -103,6 +103,7 @@ def test_help_tells_the_settings_and_imports_nothing_heavy(room):
     assert not (room / "checkpoints").exists()
 
 
+@pytest.mark.slow
 def test_a_sweep_outlives_a_failed_job_and_goes_on(room):
     sweep = ("-m", "x=1,2", "end=well,bug", "run=s")
     done = toy(room, *sweep)
