@@ -177,6 +177,9 @@ def load_trained(
     import peft
 
     if (folder / "adapter_config.json").exists():
+        # peft would read a pickle where there are no safetensors.
+        if not (weights := folder / "adapter_model.safetensors").exists():
+            raise UserError(f"{folder} holds no student: {weights} is missing")
         base, processor = load_base(cfg, precision, list)
         return peft.PeftModel.from_pretrained(base, folder).eval(), processor
     whole = replace(

@@ -94,7 +94,10 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Sentence
     """The retriever that `train.contrastive` saved in `folder`, its adapters over the same 4-bit
     weights that they were trained on."""
     return SentenceTransformer(
-        str(folder), model_kwargs=weight_options(cfg, precision), local_files_only=True
+        str(folder),
+        model_kwargs=weight_options(cfg, precision),
+        trust_remote_code=cfg.trust_remote_code,
+        local_files_only=True,
     )
 
 
