@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
-import multiprocessing
-import shutil
+import math
+import os
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict
+from collections.abc import Callable, Iterator
+from concurrent.futures import as_completed
+from contextlib import contextmanager
+from dataclasses import asdict, astuple
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -19,17 +21,19 @@ from PIL import Image
 from tqdm import tqdm
 
 from conf.entry import Run, command
-from conf.errors import UserError
+from conf.errors import SettingsError, UserError
+from conf.keys import nearest
 from conf.schema import BenchmarkConfig, BuildCommand, Quota
 from data.bullet import scene_id, simulate_scene
 from data.frames import load_frames, save_frames
 from data.records import SPLITS, FrameRef, RetrievalQuery, Scene, SelectionItem, shown_frames
 from data.render import renderer
 from data.retrieval import future
-from data.retrieval.database import choose_frames, drop_twin_targets, share_of_scene
+from data.retrieval.database import choose_frames, distinct, drop_twin_targets, share_of_scene
 from data.selection import drafts, event, time, window
 from data.store import (
     MANIFEST,
+    PLAN,
     VERSIONS,
     Store,
     digests,
@@ -39,9 +43,12 @@ from data.store import (
     save_scene,
     write_atomically,
 )
+from data.workers import pool
 
 log = logging.getLogger(__name__)
 
+SPLIT_BLOCK = 5
+"""Consecutive scenes that are split together."""
 FAMILY_BUILDERS = {"event": event, "time": time, "window": window}
 
 
@@ -59,6 +66,7 @@ def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
         UserError: a store of that name is there but was built from other settings, by another
             generator, or is damaged.
     """
+    check_names(cfg)
     folder = root / cfg.name
     if not folder.exists():
         build(cfg, folder, workers)
@@ -69,32 +77,56 @@ def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
 
 def build(cfg: BenchmarkConfig, folder: Path, workers: int) -> None:
     """Build a benchmark at `folder`, going on with what a killed build left."""
-    log.info("building benchmark %s in %s", cfg.name, folder)
-    growing = folder.with_name(f".{folder.name}.partial")
-    _begin(cfg, growing)
+    check_names(cfg)
     scene_ids = split_scenes(cfg)
-    simulate(cfg, growing, scene_ids, workers)
-    scene_of = lru_cache(maxsize=512)(lambda name: load_scene(growing / "scenes" / f"{name}.npz"))
-    items = select_items(cfg, scene_ids, scene_of)
-    queries = make_queries(cfg, scene_ids, scene_of)
-    queries, database, twins = render(cfg, growing, scene_ids, items, queries, workers)
-    _check_not_empty(cfg, items, queries)
-    save_rows([i.to_row() for i in items], growing / "selection.parquet")
-    save_rows([q.to_row() for q in queries], growing / "retrieval.parquet")
-    save_rows([{**vars(f), "database": "test"} for f in database], growing / "database.parquet")
-    counts = _counts(scene_ids, items, queries, database) | {"twin_frames_left_out": twins}
-    shortfalls = _shortfalls(cfg, items, queries, database)
-    _finish(cfg, growing, scene_ids, counts, shortfalls)
-    growing.rename(folder)
+    log.info("building benchmark %s in %s", cfg.name, folder)
+    with _growing(cfg, folder) as growing:
+        simulate(cfg, growing, scene_ids, workers)
+        scene_of = lru_cache(maxsize=512)(
+            lambda name: load_scene(growing / "scenes" / f"{name}.npz")
+        )
+        items, dropped = select_items(cfg, scene_ids, scene_of)
+        made, dropped_queries = make_queries(cfg, scene_ids, scene_of)
+        queries, database, twins = render(cfg, growing, scene_ids, items, made, workers)
+        _check_not_empty(cfg, items, queries)
+        save_rows([i.to_row() for i in items], growing / "selection.parquet")
+        save_rows([q.to_row() for q in queries], growing / "retrieval.parquet")
+        save_rows([{**vars(f), "database": "test"} for f in database], growing / "database.parquet")
+        counts = _counts(scene_ids, items, queries, database) | dropped | dropped_queries
+        counts |= {
+            "queries dropped, target has a twin": len(made) - len(queries),
+            "frames left out, twins": twins,
+        }
+        shortfalls = _shortfalls(cfg, items, queries, database)
+        _finish(cfg, growing, scene_ids, counts, shortfalls)
+        growing.rename(folder)
+        (folder / PLAN).unlink()
 
 
 def split_scenes(cfg: BenchmarkConfig) -> dict[str, list[str]]:
-    """Scene ids of each split, in order of index: a seeded share of the scenes is for testing."""
-    order = np.random.default_rng([cfg.seed, cfg.scenes]).permutation(cfg.scenes)
-    test = set(order[: round(cfg.test_share * cfg.scenes)].tolist())
+    """Scene ids of each split, in order of index: of every few scenes a seeded share is for
+    testing.
+
+    A scene's split follows from the seed and its index alone, so that a larger benchmark never
+    trains on what a smaller one tests: both simulate the same scenes.
+
+    Raises:
+        UserError: a split would be empty.
+    """
     ids: dict[str, list[str]] = {split: [] for split in SPLITS}
-    for index in range(cfg.scenes):
-        ids["test" if index in test else "train"].append(scene_id(cfg.seed, index))
+    for block in range(math.ceil(cfg.scenes / SPLIT_BLOCK)):
+        first = block * SPLIT_BLOCK
+        share = [round(cfg.test_share * n) for n in (first, first + SPLIT_BLOCK)]
+        order = np.random.default_rng([cfg.seed, block]).permutation(SPLIT_BLOCK)
+        test = set(order[: share[1] - share[0]].tolist())
+        for k in range(min(SPLIT_BLOCK, cfg.scenes - first)):
+            ids["test" if k in test else "train"].append(scene_id(cfg.seed, first + k))
+    for split in SPLITS:
+        if not ids[split]:
+            raise UserError(
+                f"benchmark.scenes={cfg.scenes} with benchmark.test_share={cfg.test_share} leaves "
+                f"no scene to {split} on: raise benchmark.scenes"
+            )
     return ids
 
 
@@ -118,30 +150,33 @@ def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> N
 
 def select_items(
     cfg: BenchmarkConfig, scene_ids: dict[str, list[str]], scene_of: Callable[[str], Scene]
-) -> list[SelectionItem]:
-    """Every selection item, family by family and cell by cell."""
+) -> tuple[list[SelectionItem], dict[str, int]]:
+    """Every selection item, family by family and cell by cell, and how many were dropped for want
+    of distractors, by family."""
     track = cfg.selection
-    items = []
-    for family, quotas in (("event", track.event), ("time", track.time), ("window", track.window)):
-        builder = FAMILY_BUILDERS[family]
-        _check_names(f"benchmark.selection.{family}", quotas, builder.CELLS)
+    items: list[SelectionItem] = []
+    dropped: Counter[str] = Counter()
+    for family, quotas in _family_quotas(cfg).items():
         for subtype, quota in quotas.items():
-            draw = partial(builder.draft, subtype)
-            items += drafts.fill(
+            draw = partial(FAMILY_BUILDERS[family].draft, subtype)
+            found, without = drafts.fill(
                 subtype, draw, scene_ids, scene_of, quota, cfg.seed, track.min_displacement
             )
-    return items
+            items += found
+            dropped[f"items dropped, too alike/{family}"] += without
+    return items, dict(dropped)
 
 
 def make_queries(
     cfg: BenchmarkConfig, scene_ids: dict[str, list[str]], scene_of: Callable[[str], Scene]
-) -> list[RetrievalQuery]:
-    """Every future-state query, builder by builder."""
+) -> tuple[list[RetrievalQuery], dict[str, int]]:
+    """Every future-state query, builder by builder, and how many were dropped for want of hard
+    negatives."""
     track = cfg.retrieval
-    _check_names("benchmark.retrieval.builders", track.builders, map(str, future.BUILDERS))
-    queries = []
+    queries: list[RetrievalQuery] = []
+    dropped = 0
     for builder, quota in track.builders.items():
-        queries += future.fill(
+        found, without = future.fill(
             int(builder),
             scene_ids,
             scene_of,
@@ -150,7 +185,9 @@ def make_queries(
             cfg.selection.min_displacement,
             cfg.seed,
         )
-    return queries
+        queries += found
+        dropped += without
+    return queries, {"queries dropped, too alike": dropped}
 
 
 def render(
@@ -181,15 +218,16 @@ def render(
             jobs[name] = partial(
                 _render_one, cfg, folder, name, named[name], targets[name], wanted, path
             )
-    stands_for: dict[FrameRef, FrameRef] = {}
-    twins = 0
-    done = dict(_run_jobs(jobs, "rendering scenes", len(jobs), workers))
-    for name in sorted(done):
-        frames, left_out = done[name]
-        twins += left_out
-        stands_for |= {FrameRef(name, f): FrameRef(name, g) for f, g in frames.items()}
-    database = [frame for frame, shown in stands_for.items() if frame == shown]
-    return drop_twin_targets(queries, stands_for), database, twins
+    looked_at = dict(_run_jobs(jobs, "rendering scenes", len(jobs), workers))
+    named_targets = [FrameRef(name, frame) for name in targets for frame in targets[name]]
+    pixels = {
+        FrameRef(name, frame): digest
+        for name in sorted(looked_at)
+        for frame, digest in looked_at[name].items()
+    }
+    stands_for = distinct(pixels, first=named_targets)
+    database = sorted({f for f, shown in stands_for.items() if f == shown}, key=astuple)
+    return drop_twin_targets(queries, stands_for), database, len(pixels) - len(database)
 
 
 def _render_one(
@@ -200,7 +238,7 @@ def _render_one(
     targets: list[int],
     wanted: int,
     path: Path,
-) -> tuple[dict[int, int], int]:
+) -> dict[int, str]:
     images = load_frames(path) if path.exists() else {}
     there = len(images)
     scene = load_scene(folder / "scenes" / f"{name}.npz")
@@ -239,29 +277,63 @@ def _run_jobs(
 ) -> Iterator[tuple[str, Any]]:
     """Run jobs in worker processes and give their results as they come, under a progress bar."""
     bar = tqdm(total=total, initial=total - len(jobs), desc=title, unit="scene", mininterval=1.0)
-    # Spawned, not forked: a worker must not inherit the threads of libraries loaded here.
-    context = multiprocessing.get_context("spawn")
-    with bar, ProcessPoolExecutor(workers, mp_context=context) as pool:
-        names = {pool.submit(job): name for name, job in jobs.items()}
+    with bar, pool(workers) as processes:
+        names = {processes.submit(job): name for name, job in jobs.items()}
         try:
             for future_result in as_completed(names):
                 yield names[future_result], future_result.result()
                 bar.update()
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            processes.shutdown(wait=False, cancel_futures=True)
             raise
 
 
-def _begin(cfg: BenchmarkConfig, growing: Path) -> None:
-    """Go on in the folder of a killed build of the same settings, or begin a new one."""
+@contextmanager
+def _growing(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path]:
+    """The folder beside `folder` that a build fills, held by this process alone.
+
+    Raises:
+        UserError: another process is building there, or a build of other settings was left there.
+    """
+    growing = folder.with_name(f".{folder.name}.partial")
+    growing.mkdir(parents=True, exist_ok=True)
     plan = {**VERSIONS, "config": asdict(cfg)}
-    path = growing / MANIFEST
-    if growing.exists() and (not path.exists() or json.loads(path.read_text()) != plan):
-        log.info("a build of other settings was left in %s: beginning anew", growing)
-        shutil.rmtree(growing)
-    write_atomically(path, json.dumps(plan).encode())
-    for leftover in growing.rglob(".*.partial"):
-        leftover.unlink()
+    with _held(growing, folder):
+        if (growing / PLAN).exists():
+            _check_same_plan(json.loads((growing / PLAN).read_text()), plan, growing)
+        for leftover in growing.rglob(".*.partial"):
+            leftover.unlink()
+        write_atomically(growing / PLAN, json.dumps(plan).encode())
+        yield growing
+
+
+@contextmanager
+def _held(growing: Path, folder: Path) -> Iterator[None]:
+    handle = os.open(growing, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        raise UserError(
+            f"{folder} is being built by another process; run this again when it is done"
+        ) from error
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
+def _check_same_plan(there: dict[str, Any], plan: dict[str, Any], growing: Path) -> None:
+    """Work of hours is not thrown away for a changed setting."""
+    was, now = _flat(there), _flat(plan)
+    for key in was | now:
+        if was.get(key) != now.get(key):
+            name = key.replace("config.", "benchmark.", 1)
+            raise UserError(
+                f"{growing} holds an unfinished build with {name}={was.get(key)}, you ask for "
+                f"{now.get(key)}: go on with that one, choose another name with "
+                f"benchmark.name=NAME, or delete {growing}"
+            )
 
 
 def _finish(
@@ -306,11 +378,12 @@ def _shortfalls(
     """What every cell, builder and database has, where that is less than its quota."""
     found = Counter((f"{i.family}/{i.subtype}", i.split) for i in items)
     found.update((f"builder {q.builder}", q.split) for q in queries)
-    track = cfg.selection
     wanted = {
-        **{f"event/{cell}": quota for cell, quota in track.event.items()},
-        **{f"time/{cell}": quota for cell, quota in track.time.items()},
-        **{f"window/{cell}": quota for cell, quota in track.window.items()},
+        **{
+            f"{family}/{cell}": quota
+            for family, quotas in _family_quotas(cfg).items()
+            for cell, quota in quotas.items()
+        },
         **{f"builder {b}": quota for b, quota in cfg.retrieval.builders.items()},
     }
     short = {
@@ -324,11 +397,28 @@ def _shortfalls(
     return short
 
 
-def _check_names(key: str, quotas: dict[str, Quota], known: Iterable[str]) -> None:
-    known = list(known)
-    for name in quotas:
-        if name not in known:
-            raise UserError(f"{key}.{name}: there is no such builder; there are {', '.join(known)}")
+def _family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:
+    track = cfg.selection
+    return {"event": track.event, "time": track.time, "window": track.window}
+
+
+def check_names(cfg: BenchmarkConfig) -> None:
+    """Raises SettingsError where a quota names a cell or builder that does not exist."""
+    named = [
+        (f"benchmark.selection.{family}", quotas, list(FAMILY_BUILDERS[family].CELLS))
+        for family, quotas in _family_quotas(cfg).items()
+    ]
+    builders = [str(b) for b in future.BUILDERS]
+    named.append(("benchmark.retrieval.builders", cfg.retrieval.builders, builders))
+    problems = [
+        f"{key}.{name}: there is no such builder, did you mean {nearest(name, known) or known[0]}? "
+        f"There are {', '.join(known)}"
+        for key, quotas, known in named
+        for name in quotas
+        if name not in known
+    ]
+    if problems:
+        raise SettingsError("\n".join(problems))
 
 
 def _check_not_empty(

@@ -39,6 +39,8 @@ from data.render import RENDERER_VERSION
 from data.selection.drafts import BUILDERS_VERSION
 
 MANIFEST = "manifest.json"
+PLAN = "plan.json"
+"""What a build in progress is to become; gone from a whole store."""
 VERSIONS = {
     "generator": GENERATOR_VERSION,
     "renderer": RENDERER_VERSION,
@@ -115,7 +117,9 @@ def digest(path: Path) -> str:
 def digests(folder: Path) -> dict[str, str]:
     """SHA-256 of every file below `folder` but its manifest and rationales, by relative path."""
     paths = sorted(
-        p for p in folder.rglob("*") if p.is_file() and p.name not in (MANIFEST, "rationales.jsonl")
+        p
+        for p in folder.rglob("*")
+        if p.is_file() and p.name not in (MANIFEST, PLAN, "rationales.jsonl")
     )
     names = [p.relative_to(folder).as_posix() for p in paths]
     with ThreadPoolExecutor(4) as pool:

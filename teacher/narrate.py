@@ -8,12 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import multiprocessing
-import os
-import threading
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -24,6 +20,7 @@ from tqdm import tqdm
 from conf.entry import Run, command
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
+from data.workers import pool
 from teacher.journal import Journal
 from teacher.predicates import Predicates, predicates_of
 from teacher.prompts import PROMPT_VERSION, messages
@@ -207,9 +204,8 @@ def _narrated(
         for job in jobs:
             yield _narrate_one(job, store, cfg)
         return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _enter_worker, (store, cfg)) as pool:
-        yield from pool.map(_narrate_in_worker, jobs, chunksize=64)
+    with pool(workers, _enter_worker, (store, cfg)) as processes:
+        yield from processes.map(_narrate_in_worker, jobs, chunksize=64)
 
 
 def _narrate_one(job: Job, store: Store, cfg: TeacherConfig) -> list[Rationale]:
@@ -233,13 +229,6 @@ _worker: tuple[Store, TeacherConfig]
 def _enter_worker(store: Store, cfg: TeacherConfig) -> None:
     global _worker
     _worker = (store, cfg)
-    # A killed parent closes no queue, and its workers would wait for work for ever.
-    threading.Thread(target=_follow_parent, daemon=True).start()
-
-
-def _follow_parent() -> None:
-    multiprocessing.parent_process().join()
-    os._exit(1)
 
 
 def _narrate_in_worker(job: Job) -> list[Rationale]:

@@ -24,26 +24,30 @@ def choose_frames(
     wanted: int,
     seed: int,
     scene_id: str,
-) -> tuple[dict[int, int], int]:
-    """A scene's frames of the database.
-
-    Targets come first, then frames in a seeded order until there are `wanted`; a frame that is
-    pixel-identical to one chosen before is a twin and left out.
+) -> dict[int, str]:
+    """A scene's frames for the database: its targets, then frames in a seeded order until `wanted`
+    of them differ in their pixels.
 
     Returns:
-        For every frame looked at, the chosen frame that shows the same pixels (itself if chosen),
-        and the number of twins.
+        A hash of the pixels of every frame looked at, in that order.
     """
-    chosen: dict[bytes, int] = {}
-    stands_for: dict[int, int] = {}
+    pixels: dict[int, str] = {}
     others = cell_rng(seed, "database", scene_id).permutation(frames).tolist()
     targets = sorted(set(targets))
     for frame in dict.fromkeys([*targets, *others]):
-        if len(chosen) >= max(wanted, len(targets)) and frame not in targets:
+        if frame not in targets and len(set(pixels.values())) >= max(wanted, len(targets)):
             break
-        pixels = hashlib.sha256(image_of(frame).tobytes()).digest()
-        stands_for[frame] = chosen.setdefault(pixels, frame)
-    return stands_for, len(stands_for) - len(chosen)
+        pixels[frame] = hashlib.sha256(image_of(frame).tobytes()).hexdigest()
+    return pixels
+
+
+def distinct(pixels: dict[FrameRef, str], first: Iterable[FrameRef]) -> dict[FrameRef, FrameRef]:
+    """For every frame the one that stands for its pixels in the database: of frames alike to the
+    pixel, in one scene or in several, one of `first` or else the first of them."""
+    shown: dict[str, FrameRef] = {}
+    for frame in [*first, *pixels]:
+        shown.setdefault(pixels[frame], frame)
+    return {frame: shown[digest] for frame, digest in pixels.items()}
 
 
 def drop_twin_targets(

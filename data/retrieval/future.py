@@ -22,6 +22,8 @@ DENSE_STEP = 4
 """Step of the denser grid that stands in where the first choices do not do."""
 EVENTS_A_SCENE = 3
 """Events of a scene that builder 3 uses at most."""
+ONE_A_SCENE = (4, 5, 6)
+"""Builders that ask for one event of a scene (paper, retrieval construction)."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,9 @@ def _clock(scene: Scene) -> Iterator[Moment]:
 
 def _at_event(scene: Scene) -> Iterator[Moment]:
     text = "Which frame shows the scene at the moment of the next collision?"
-    for event in [c.frame for c in scene.collisions][:EVENTS_A_SCENE]:
+    for event in list(dict.fromkeys(c.frame for c in scene.collisions))[:EVENTS_A_SCENE]:
         for early in range(6):
+            # So many frames lie between: the event's own would show the target.
             stop = event - 1 - early
             if stop >= FPS and _is_next(scene, stop, event):
                 yield Moment("event", text, (stop - FPS, stop), event)
@@ -109,13 +112,14 @@ def fill(
     hard_negatives: int,
     least: float,
     seed: int,
-) -> list[RetrievalQuery]:
-    """Queries of one builder up to its quota in each split.
+) -> tuple[list[RetrievalQuery], int]:
+    """Queries of one builder up to its quota in each split, and how many moments were dropped for
+    want of hard negatives that can be told apart.
 
     Scenes come in a seeded order and give one moment each before any gives a second, so that
-    queries spread over scenes. A moment without enough hard negatives is passed over.
+    queries spread over scenes.
     """
-    queries = []
+    queries, dropped = [], 0
     for split in SPLITS:
         rng = cell_rng(seed, "retrieval", str(builder), split)
         left = {}
@@ -130,9 +134,14 @@ def fill(
                 if waiting and len(found) < wanted:
                     scene = scene_of(scene_id)
                     query = _query(builder, scene, waiting.pop(), hard_negatives, least, rng)
-                    found += [query] if query else []
+                    if query is None:
+                        dropped += 1
+                        continue
+                    found.append(query)
+                    if builder in ONE_A_SCENE:
+                        waiting.clear()
         queries += found
-    return queries
+    return queries, dropped
 
 
 def _query(

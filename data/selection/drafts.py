@@ -17,7 +17,7 @@ from conf.schema import Quota
 from data.geometry import DIAGONAL, displacements
 from data.records import SPLITS, Candidate, Scene, SelectionItem
 
-BUILDERS_VERSION = "1"
+BUILDERS_VERSION = "2"
 """Of the items' and queries' builders: changes whenever the same scenes would give others."""
 
 
@@ -36,24 +36,35 @@ class Draft:
     axes: dict[str, Any] = field(default_factory=dict)
 
 
-Draw = Callable[[Scene, np.random.Generator, float], Draft | None]
-"""Makes at most one draft of a cell from a scene, given the least displacement between frames."""
+@dataclass
+class Picker:
+    """Picks distractors that can be told apart, and counts the targets for which it could not.
+
+    `least` is the least displacement between two candidates (px at 336 x 336, in some object).
+    """
+
+    least: float
+    dropped: int = 0
+
+    def pick(
+        self, scene: Scene, target: int, pool: Iterable[int]
+    ) -> tuple[list[int], float] | None:
+        """The first three frames of `pool` that can be told apart from the target and each other,
+        and the least displacement among the four; None where there are no such three."""
+        apart = displacements(scene)
+        chosen = [target]
+        for frame in pool:
+            if apart[frame, chosen].min() >= self.least:
+                chosen.append(int(frame))
+                if len(chosen) == 4:
+                    among = apart[np.ix_(chosen, chosen)][np.triu_indices(4, 1)]
+                    return chosen[1:], float(min(among.min(), DIAGONAL))
+        self.dropped += 1
+        return None
 
 
-def pick_apart(
-    scene: Scene, target: int, pool: Iterable[int], least: float
-) -> tuple[list[int], float] | None:
-    """The first three frames of `pool` that can be told apart from the target and each other, and
-    the least displacement among the four; None where there are no such three."""
-    apart = displacements(scene)
-    chosen = [target]
-    for frame in pool:
-        if apart[frame, chosen].min() >= least:
-            chosen.append(int(frame))
-            if len(chosen) == 4:
-                among = apart[np.ix_(chosen, chosen)][np.triu_indices(4, 1)]
-                return chosen[1:], float(min(among.min(), DIAGONAL))
-    return None
+Draw = Callable[[Scene, np.random.Generator, Picker], Draft | None]
+"""Makes at most one draft of a cell from a scene."""
 
 
 def same_scene(scene: Scene, frames: Sequence[int], source: str) -> tuple[Candidate, ...]:
@@ -68,24 +79,25 @@ def fill(
     quota: Quota,
     seed: int,
     least: float,
-) -> list[SelectionItem]:
+) -> tuple[list[SelectionItem], int]:
     """Items of one cell up to its quota in each split, at most one a scene, scenes in a seeded
-    order. What falls short is the caller's to report."""
-    items = []
+    order, and how many targets were dropped for want of distractors that can be told apart. What
+    falls short is the caller's to report."""
+    items, picker = [], Picker(least)
     for split in SPLITS:
         rng = cell_rng(seed, subtype, split)
         drafts: list[Draft] = []
         for index in rng.permutation(len(scene_ids[split])):
             if len(drafts) == getattr(quota, split):
                 break
-            drafted = draw(scene_of(scene_ids[split][index]), rng, least)
+            drafted = draw(scene_of(scene_ids[split][index]), rng, picker)
             if drafted is not None:
                 drafts.append(drafted)
         # Every letter is the answer equally often in a random order; the remainder starts at a
         # random letter, or the last letter would be right in fewer cells than the first.
         positions = rng.permutation((np.arange(len(drafts)) + rng.integers(4)) % 4)
         items += [finish(d, int(p), rng) for d, p in zip(drafts, positions, strict=True)]
-    return items
+    return items, picker.dropped
 
 
 def finish(draft: Draft, position: int, rng: np.random.Generator) -> SelectionItem:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data.records import Scene
-from data.selection.drafts import Draft, pick_apart, same_scene
+from data.selection.drafts import Draft, Picker, same_scene
 
 QUESTION = "Which image is closest to the correct future state of the whole scene?"
 PREFIX_STEP = 20
@@ -35,7 +35,7 @@ CELLS = {
 }
 
 
-def draft(subtype: str, scene: Scene, rng: np.random.Generator, least: float) -> Draft | None:
+def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) -> Draft | None:
     """An item of the cell around one of the scene's collisions, tried in a random order."""
     cell = CELLS[subtype]
     for k in rng.permutation(len(scene.collisions)):
@@ -48,7 +48,7 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, least: float) ->
         if start < 0 or target > scene.frames - 1 - TAIL:
             continue
         pool = [f for o in OFFSETS for f in (target - o, target + o) if 0 <= f < scene.frames]
-        picked = pick_apart(scene, target, rng.permutation(pool), least)
+        picked = picker.pick(scene, target, rng.permutation(pool))
         if picked is None:
             continue
         frames, apart = picked

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from data.records import SELECTION_SECOND, Scene
-from data.selection.drafts import Draft, pick_apart, same_scene
+from data.selection.drafts import Draft, Picker, same_scene
 
-CELLS = {"1s": 1, "2s": 2}
+CELLS = {"in_1s": 1, "in_2s": 2}
 """Seconds from the observation's end to the target, by subtype."""
 
 
@@ -19,13 +19,13 @@ def question(seconds: int) -> str:
     )
 
 
-def draft(subtype: str, scene: Scene, rng: np.random.Generator, least: float) -> Draft | None:
+def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) -> Draft | None:
     """An item whose prefix is the scene's first second; distractors are later moments of the same
     scene."""
     seconds = CELLS[subtype]
     start, stop = 0, SELECTION_SECOND - 1
     target = start + SELECTION_SECOND + SELECTION_SECOND * seconds
-    picked = pick_apart(scene, target, rng.permutation(np.arange(stop + 1, scene.frames)), least)
+    picked = picker.pick(scene, target, rng.permutation(np.arange(stop + 1, scene.frames)))
     if picked is None:
         return None
     frames, apart = picked

@@ -15,7 +15,7 @@ import numpy as np
 from data.events import window_group
 from data.geometry import object_match
 from data.records import Scene
-from data.selection.drafts import Draft, pick_apart, same_scene
+from data.selection.drafts import Draft, Picker, same_scene
 
 QUESTION = "Which image best matches the next scene state?"
 PREFIX_FRAMES = 16
@@ -39,7 +39,7 @@ CELLS = {
 }
 
 
-def draft(subtype: str, scene: Scene, rng: np.random.Generator, least: float) -> Draft | None:
+def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) -> Draft | None:
     """An item at one of the scene's windows that fall in the cell's group, tried in a random
     order."""
     cell = CELLS[subtype]
@@ -52,7 +52,7 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, least: float) ->
         unlike = np.argsort(object_match(scene, target), kind="stable")
         pool = unlike if cell.difficulty == "hard" else unlike[::-1]
         source = "same_near" if cell.difficulty == "hard" else "same_far"
-        picked = pick_apart(scene, target, pool[pool != target], least)
+        picked = picker.pick(scene, target, pool[pool != target])
         if picked is None:
             continue
         frames, apart = picked

@@ -27,7 +27,7 @@ def small(**changes: object) -> BenchmarkConfig:
         "scenes": 6,
         "width": 96,
         "height": 64,
-        "selection": SelectionConfig(time={"1s": few}),
+        "selection": SelectionConfig(time={"in_1s": few}),
         "retrieval": RetrievalTrackConfig(builders={"2": few}, hard_negatives=1, database=6),
     }
     return BenchmarkConfig(**{**settings, **changes})
@@ -108,8 +108,10 @@ def test_a_damaged_manifest_is_named(copy) -> None:
 
 
 def test_other_settings_are_named(copy) -> None:
-    asked = small(selection=SelectionConfig(time={"1s": Quota(train=3, test=1)}))
-    with pytest.raises(UserError, match=r"benchmark\.selection\.time\.1s\.train=2, you ask for 3"):
+    asked = small(selection=SelectionConfig(time={"in_1s": Quota(train=3, test=1)}))
+    with pytest.raises(
+        UserError, match=r"benchmark\.selection\.time\.in_1s\.train=2, you ask for 3"
+    ):
         ensure_benchmark(asked, copy.parent, workers=1)
 
 

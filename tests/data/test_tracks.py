@@ -60,7 +60,7 @@ def test_event_items_stand_at_their_collision(micro_store, items) -> None:
 
 def test_time_items_count_26_frames_a_second(items) -> None:
     for item in (i for i in items if i.family == "time"):
-        seconds = {"1s": 1, "2s": 2}[item.subtype]
+        seconds = {"in_1s": 1, "in_2s": 2}[item.subtype]
         assert (item.prefix_start, item.prefix_stop) == (0, 25)
         assert item.target_frame == 26 + 26 * seconds
         assert f"{seconds} second" in item.question
