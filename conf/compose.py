@@ -26,7 +26,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 import conf.launcher  # noqa: F401  registers the launcher that run_folder.yaml names
 from conf.errors import SettingsError
-from conf.keys import dict_above, has_key, keys, nearest
+from conf.keys import dict_above, has_key, keys, keys_like, nearest
 
 OVERLAYS = ("exp", "sweep")
 """Groups that any command takes, as `+exp=cot`."""
@@ -125,7 +125,9 @@ def _override_problems(
     # `student={...}` sets values below student, `student=tiny` chooses a preset.
     chosen = [] if isinstance(override._value, dict) else _chosen(override)
     options = loader.get_group_options(key)
-    if options and not (override.is_delete() or override._value is None or not chosen):
+    if options and override._value is None and not override.is_delete():
+        return [f"{override.input_line}: choose one of {', '.join(options)}"]
+    if options and chosen and not override.is_delete():
         root = (override.package or key).partition(".")[0]
         if root not in OVERLAYS and not has_key(schema, root):
             return [f"{_typed_key(override)}: {command} takes no {root}"]
@@ -140,7 +142,7 @@ def _override_problems(
         ]
     if has_key(schema, key) or key in OVERLAYS:
         return []
-    guess = nearest(key, [*keys(schema), *OVERLAYS])
+    guess = nearest(key, [*keys_like(schema, key), *OVERLAYS])
     hint = f", did you mean {'+' if guess in OVERLAYS else ''}{guess}?" if guess else ""
     return [f"{_typed_key(override)}: {command} has no such key{hint}"]
 
@@ -201,11 +203,23 @@ def _hydra_problem(error: HydraException, schema: type) -> str:
     cause = error.__cause__
     if not isinstance(cause, OmegaConfBaseException):
         return text
-    key = text.partition("=")[0]
-    if "is not a subclass" in str(cause) and (above := dict_above(schema, key.lstrip("+"))):
-        return f"{text}: give new names as +{above}={{NAME: {{...}}}}"
+    typed = text.partition("=")[0]
+    if spot := _new_name(cause, typed.lstrip("+"), schema):
+        above, _, name = spot.rpartition(".")
+        return f"{spot}: no such name yet, add it as +{above}={{{name}: {{...}}}}"
     problem = _omegaconf_problem(cause, schema)
-    return f"{text}: {problem.removeprefix(f'{key}: ')}"
+    return f"{text}: {problem.removeprefix(f'{typed}: ')}"
+
+
+def _new_name(cause: OmegaConfBaseException, typed: str, schema: type) -> str | None:
+    """The name that an override would have added to a dict of settings, with the keys above it."""
+    if isinstance(cause, ConfigAttributeError | ConfigKeyError):
+        parent = cause.full_key.rpartition(".")[0]
+        return cause.full_key if dict_above(schema, cause.full_key) == parent else None
+    if "is not a subclass" in str(cause) and (above := dict_above(schema, typed)):
+        name = typed.removeprefix(f"{above}.").partition(".")[0]
+        return f"{above}.{name}"
+    return None
 
 
 def _omegaconf_problem(error: OmegaConfBaseException, schema: type) -> str:

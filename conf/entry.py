@@ -28,7 +28,17 @@ Main = Callable[[Any, Run], Metrics | None]
 
 NOTHING_LEFT = 1 << 20
 """Free bytes under which a disk counts as full."""
-CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.ENOTDIR)
+CANNOT_WRITE = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EEXIST,
+    errno.ENAMETOOLONG,
+)
 
 
 def command(name: str, schema: type) -> Callable[[Main], Callable[[], None]]:

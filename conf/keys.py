@@ -24,6 +24,17 @@ def keys(schema: type, prefix: str = "") -> Iterator[str]:
             yield from keys(inner, key + ".")
 
 
+def keys_like(schema: type, key: str) -> Iterator[str]:
+    """Every dotted key of a schema and, where `key` lies in a dict field, of its entry there."""
+    if above := dict_above(schema, key):
+        kind: Any = schema
+        for part in above.split("."):
+            kind = _unwrap(get_type_hints(kind)[part])
+        name = key.removeprefix(f"{above}.").partition(".")[0]
+        yield from keys(get_args(kind)[1], f"{above}.{name}.")
+    yield from keys(schema)
+
+
 def has_key(schema: type, key: str) -> bool:
     """Whether `key` can be set; a dict field takes any name, and below it its own schema holds."""
     kind: Any = schema

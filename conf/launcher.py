@@ -60,6 +60,8 @@ class ProcessLauncher(Launcher):
         sweep = run_name(self.config.run, hydra.overrides.task)
         jobs = [list(overrides) for overrides in job_overrides]
         log.info("sweep %s: %d jobs", hydra.sweep.dir, len(jobs))
+        if initial_job_idx == 0:
+            _forget_from(Path(hydra.sweep.dir), len(jobs))
         labels = [" ".join(f"{k}={v}" for k, v in told.items()) for told in varying(jobs)]
         returns = []
         for number, (overrides, label) in enumerate(
@@ -129,9 +131,19 @@ class ProcessLauncher(Launcher):
 
 def _record(folder: Path, overrides: list[str], status: str, seconds: float | None) -> None:
     path = folder / JOB_FILE
+    now = {"overrides": overrides, "status": status, "seconds": seconds}
     if seconds is None and path.exists():
-        return
-    write_json(path, {"overrides": overrides, "status": status, "seconds": seconds})
+        before = json.loads(path.read_text())
+        # How long it took is known where this sweep ran it before.
+        now["seconds"] = before["seconds"] if before["status"] == status else None
+    write_json(path, now)
+
+
+def _forget_from(folder: Path, count: int) -> None:
+    """Leave the jobs of an earlier, longer sweep in this folder out of the table."""
+    for job in read_jobs(folder):
+        if job.number >= count:
+            (folder / str(job.number) / JOB_FILE).unlink()
 
 
 class TableCallback(Callback):

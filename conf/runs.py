@@ -137,7 +137,7 @@ def _record(
     return {
         "command": command,
         "overrides": overrides,
-        "seed": settings["seed"],
+        "seeds": {k: v for k, v in _flat(settings).items() if k.rpartition(".")[2] == "seed"},
         "git": _git(),
         "python": platform.python_version(),
         "platform": platform.platform(),

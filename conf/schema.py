@@ -8,6 +8,7 @@ a user types them.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from omegaconf import MISSING
 
@@ -20,6 +21,10 @@ class Quota:
     test: int = 0
 
 
+LOOKS = 48
+"""Objects that can be told apart by their names: 3 shapes, 8 colours, 2 materials."""
+
+
 @dataclass
 class SelectionConfig:
     """Cells of the selection track and their quotas. A cell's name is its item's `subtype`."""
@@ -29,6 +34,12 @@ class SelectionConfig:
     event: dict[str, Quota] = field(default_factory=dict)
     time: dict[str, Quota] = field(default_factory=dict)
     window: dict[str, Quota] = field(default_factory=dict)
+
+    def check(self) -> list[str]:
+        problems = _too_small(self, "benchmark.selection.", {"min_displacement": 0})
+        for family in ("event", "time", "window"):
+            problems += _quota_problems(f"benchmark.selection.{family}", getattr(self, family))
+        return problems
 
 
 @dataclass
@@ -40,6 +51,12 @@ class RetrievalTrackConfig:
     """Same-scene wrong-time frames a query."""
     database: int = 10_000
     """Frames of the test database; it always holds every test target."""
+
+    def check(self) -> list[str]:
+        return [
+            *_too_small(self, "benchmark.retrieval.", {"hard_negatives": 1, "database": 0}),
+            *_quota_problems("benchmark.retrieval.builders", self.builders),
+        ]
 
 
 @dataclass
@@ -60,18 +77,22 @@ class BenchmarkConfig:
     retrieval: RetrievalTrackConfig = field(default_factory=RetrievalTrackConfig)
 
     def check(self) -> list[str]:
-        problems = []
+        problems = _too_small(
+            self, "benchmark.", {"seed": 0, "scenes": 4, "max_collisions": 1, "prefix_frames": 2}
+        )
         if not 0 < self.test_share < 1:
             problems.append(f"benchmark.test_share={self.test_share} must lie between 0 and 1")
-        if self.scenes < 4:
-            problems.append(f"benchmark.scenes={self.scenes}: at least 4 scenes are needed")
-        if not 2 <= self.min_objects <= self.max_objects:
+        if not 2 <= self.min_objects <= self.max_objects <= LOOKS:
             problems.append(
                 f"benchmark.min_objects={self.min_objects} and "
-                f"benchmark.max_objects={self.max_objects}: need 2 <= min <= max"
+                f"benchmark.max_objects={self.max_objects}: need 2 <= min <= max <= {LOOKS}, as "
+                "no two objects of a scene look alike"
             )
-        if self.prefix_frames < 2:
-            problems.append(f"benchmark.prefix_frames={self.prefix_frames} must be 2 or more")
+        if self.width < 48 or self.width * 2 != self.height * 3:
+            problems.append(
+                f"benchmark.width={self.width} and benchmark.height={self.height}: frames are "
+                "3 wide to 2 high and 48 x 32 px at least, such as 480 x 320"
+            )
         return problems
 
 
@@ -101,7 +122,19 @@ class TeacherConfig:
     """Seconds to wait for a server that is down before giving up."""
 
     def check(self) -> list[str]:
-        problems = []
+        problems = _too_small(
+            self,
+            "teacher.",
+            {
+                "seed": 0,
+                "attempts": 1,
+                "temperature": 0,
+                "max_tokens": 1,
+                "concurrency": 1,
+                "timeout": 1,
+                "patience": 0,
+            },
+        )
         if (self.url is None) != (self.model is None):
             problems.append("teacher.url and teacher.model go together: set both or neither")
         if not 0 < self.min_words <= self.max_words:
@@ -109,8 +142,8 @@ class TeacherConfig:
                 f"teacher.min_words={self.min_words} and teacher.max_words={self.max_words}: "
                 "need 0 < min <= max"
             )
-        if self.attempts < 1:
-            problems.append(f"teacher.attempts={self.attempts} must be 1 or more")
+        if not 0 < self.top_p <= 1:
+            problems.append(f"teacher.top_p={self.top_p} must be above 0 and at most 1")
         return problems
 
 
@@ -167,7 +200,9 @@ class StudentConfig:
     max_new_tokens: int = 512
 
     def check(self) -> list[str]:
-        return _backbone_problems("student", self)
+        return _backbone_problems("student", self) + _too_small(
+            self, "student.", {"max_new_tokens": 1}
+        )
 
 
 @dataclass
@@ -195,7 +230,8 @@ class RetrieverConfig:
 
 
 def _backbone_problems(group: str, cfg: StudentConfig | RetrieverConfig) -> list[str]:
-    problems = []
+    problems = _too_small(cfg, f"{group}.", {"image_size": 32, "frames": 2, "max_length": 1})
+    problems += _too_small(cfg.lora, f"{group}.lora.", {"rank": 0, "dropout": 0})
     if (cfg.model is None) == (cfg.architecture is None):
         problems.append(
             f"{group}.model and {group}.architecture: give exactly one, a model to load or sizes "
@@ -213,12 +249,6 @@ def _backbone_problems(group: str, cfg: StudentConfig | RetrieverConfig) -> list
             f"{group}.quantization=nf4 with {group}.architecture: a model built from a seed is "
             f"trained whole, set {group}.quantization=none"
         )
-    if cfg.lora.rank < 0:
-        problems.append(f"{group}.lora.rank={cfg.lora.rank} must be 0 or more")
-    if cfg.image_size < 32:
-        problems.append(f"{group}.image_size={cfg.image_size} must be 32 or more")
-    if cfg.frames < 2:
-        problems.append(f"{group}.frames={cfg.frames} must be 2 or more")
     return problems
 
 
@@ -251,7 +281,20 @@ class TrainConfig:
     """Trackers of transformers' Trainer, such as tensorboard, wandb or trackio."""
 
     def check(self) -> list[str]:
-        problems = []
+        problems = _too_small(
+            self,
+            "train.",
+            {
+                "warmup": 0,
+                "weight_decay": 0,
+                "max_grad_norm": 0,
+                "micro_batch": 1,
+                "accumulation": 1,
+                "evaluations": 1,
+                "keep": 1,
+                "workers": 0,
+            },
+        )
         if self.lr <= 0:
             problems.append(f"train.lr={self.lr} must be above 0")
         if self.schedule not in ("cosine", "linear", "constant"):
@@ -260,10 +303,10 @@ class TrainConfig:
             )
         if self.precision not in ("bf16", "fp32"):
             problems.append(f"train.precision={self.precision}: the options are bf16 and fp32")
-        if min(self.micro_batch, self.accumulation, self.evaluations, self.keep) < 1:
+        if self.max_steps < 1 and (self.max_steps != -1 or self.epochs <= 0):
             problems.append(
-                "train.micro_batch, train.accumulation, train.evaluations and train.keep "
-                "must be 1 or more"
+                f"train.max_steps={self.max_steps} and train.epochs={self.epochs}: give one or "
+                "more steps, or -1 and epochs above 0"
             )
         return problems
 
@@ -276,7 +319,7 @@ class SftTrainConfig(TrainConfig):
     """Training-split items of held-out training scenes that measure the run."""
 
     def check(self) -> list[str]:
-        problems = super().check()
+        problems = super().check() + _too_small(self, "train.", {"validation_items": 1})
         if self.regime not in ("cot", "answer_only", "describe"):
             problems.append(
                 f"train.regime={self.regime}: the options are cot, answer_only and describe"
@@ -298,7 +341,9 @@ class ContrastiveTrainConfig(TrainConfig):
     """Queries of held-out training scenes that measure the run."""
 
     def check(self) -> list[str]:
-        problems = super().check()
+        problems = super().check() + _too_small(
+            self, "train.", {"hard_negatives": 0, "validation_queries": 1}
+        )
         if self.accumulation != 1:
             problems.append(
                 f"train.accumulation={self.accumulation}: the cached loss already splits "
@@ -316,7 +361,6 @@ class ContrastiveTrainConfig(TrainConfig):
 class CommandConfig:
     """What every command takes."""
 
-    seed: int = 0
     run: str | None = None
     """Folder of the run below checkpoints/<command>/; made from the overrides when null."""
     store: str = "store"
@@ -325,6 +369,11 @@ class CommandConfig:
     """Folder of the runs."""
     workers: int = 2
     """Processes that simulate, render and narrate."""
+
+    def check(self) -> list[str]:
+        return _too_small(
+            self, "", {"workers": 1, **({"seed": 0} if hasattr(self, "seed") else {})}
+        )
 
 
 @dataclass
@@ -344,6 +393,8 @@ class SftCommand(CommandConfig):
     teacher: TeacherConfig = MISSING
     student: StudentConfig = MISSING
     train: SftTrainConfig = field(default_factory=SftTrainConfig)
+    seed: int = 0
+    """Of the held-out training scenes, the order of samples and new adapters."""
 
 
 @dataclass
@@ -351,14 +402,17 @@ class ContrastiveCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     retriever: RetrieverConfig = MISSING
     train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
+    seed: int = 0
+    """Of the held-out training scenes, the order of queries and new adapters."""
 
     def check(self) -> list[str]:
+        problems = super().check()
         if self.train.hard_negatives > self.benchmark.retrieval.hard_negatives:
-            return [
+            problems.append(
                 f"train.hard_negatives={self.train.hard_negatives} is more than "
                 f"benchmark.retrieval.hard_negatives={self.benchmark.retrieval.hard_negatives}"
-            ]
-        return []
+            )
+        return problems
 
 
 @dataclass
@@ -374,14 +428,14 @@ class SelectCommand(CommandConfig):
     batch: int = 16
     """Items that pass the model at once."""
     limit: int | None = None
-    """Test items at most; null takes all."""
+    """Test items at most, spread over the cells; null takes all."""
+    seed: int = 0
+    """Of the items that `limit` leaves."""
 
     def check(self) -> list[str]:
-        problems = []
+        problems = super().check() + _too_small(self, "", {"batch": 1, "limit": 1})
         if not self.modes or not set(self.modes) <= {"reasoning", "answer"}:
             problems.append(f"modes={self.modes}: the options are reasoning and answer")
-        if self.batch < 1:
-            problems.append(f"batch={self.batch} must be 1 or more")
         return problems
 
 
@@ -398,9 +452,27 @@ class RetrieveCommand(CommandConfig):
     """Queries or frames that pass the model at once."""
 
     def check(self) -> list[str]:
-        return [] if self.batch >= 1 else [f"batch={self.batch} must be 1 or more"]
+        return super().check() + _too_small(self, "", {"batch": 1})
 
 
 @dataclass
 class ReportCommand(CommandConfig):
     pass
+
+
+def _too_small(cfg: Any, above: str, least: dict[str, float]) -> list[str]:
+    """A sentence for each setting that is less than its least value; null is no value."""
+    values = {name: getattr(cfg, name) for name in least}
+    return [
+        f"{above}{name}={value} must be {least[name]} or more"
+        for name, value in values.items()
+        if value is not None and value < least[name]
+    ]
+
+
+def _quota_problems(above: str, quotas: dict[str, Quota]) -> list[str]:
+    return [
+        problem
+        for name, quota in quotas.items()
+        for problem in _too_small(quota, f"{above}.{name}.", {"train": 0, "test": 0})
+    ]

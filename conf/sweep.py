@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from conf.runs import write_text
 JOB_FILE = "job.json"
 AT_START = "_at_start"
 """End of the name of a metric measured before a run's first step."""
+LESS_IS_BETTER = r"loss|_rank$|set_aside|too_short|reject"
 
 
 @dataclass
@@ -85,11 +87,12 @@ def varying(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
 
 
 def best(name: str, values: Sequence[float]) -> float | None:
-    """The best of a metric's values: the least of a loss or a rank, else the greatest."""
+    """The best of a metric's values: the least of a loss, a rank or what was refused, else the
+    greatest."""
     finite = [value for value in values if math.isfinite(value)]
     if not finite:
         return None
-    return min(finite) if "loss" in name or name.endswith("_rank") else max(finite)
+    return (min if re.search(LESS_IS_BETTER, name) else max)(finite)
 
 
 def _text(rows: list[dict[str, Any]], columns: list[str], metrics: list[str]) -> str:

@@ -37,6 +37,7 @@ def test_a_run_is_recorded_and_each_start_kept(tmp_path):
     open_run(run, SETTINGS, "train.sft", ["x=1"])
     first = json.loads((run.folder / "run.json").read_text())
     assert first["earlier_starts"] == []
+    assert first["seeds"] == {"seed": 0}
     assert first["packages"]["hydra-core"].startswith("1.3")
     open_run(run, SETTINGS | {"workers": 8, "store": "/big"}, "train.sft", ["x=1"])
     again = json.loads((run.folder / "run.json").read_text())
@@ -63,6 +64,7 @@ def test_the_best_of_a_metric_goes_by_its_name():
     values = [2.0, 1.0, float("nan")]
     assert best("eval_loss", values) == 1.0
     assert best("median_rank", values) == 1.0
+    assert best("set_aside", values) == 1.0
     assert best("accuracy", values) == 2.0
     assert best("accuracy", [float("nan")]) is None
 
