@@ -39,16 +39,21 @@ class Answer:
 
 
 class AnswerLog:
-    """The answers in a file, one JSON line each."""
+    """The answers in a file, one JSON line each, below a line that says what was `measured`.
 
-    def __init__(self, path: Path) -> None:
+    Answers of other weights or to other items are no answers to these: the file begins anew.
+    """
+
+    def __init__(self, path: Path, measured: str) -> None:
         self._path = path
         self.answers: dict[tuple[str, str], Answer] = {}
-        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-        if lines and not lines[-1].endswith("\n"):
-            # Torn by a kill: the item is asked again.
-            path.write_text("".join(lines[:-1]))
-            lines = lines[:-1]
+        text = path.read_text() if path.exists() else ""
+        # What follows the last line's end was torn by a kill: that item is asked again.
+        head, *lines = text[: text.rfind("\n") + 1].splitlines() or [""]
+        top = json.dumps({"measured": measured})
+        if head != top:
+            lines = []
+        path.write_text("".join(f"{line}\n" for line in [top, *lines]))
         for line in lines:
             answer = Answer(**json.loads(line))
             self.answers[answer.item_id, answer.mode] = answer

@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.select", SelectCommand)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
-    from evaluation.trained import settings_of
+    from evaluation.trained import settings_of, weights_digest
 
     folder = Path(cfg.model) if cfg.model is not None else None
     trained = settings_of(folder, SftCommand, "student") if folder else cfg
@@ -41,7 +41,8 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
         model, processor = backbone.load_base(student, precision, list)
     name = folder.name if folder else f"{student.name} base"
     frames = Frames(store, student.image_size)
-    journal = answers.AnswerLog(run.folder / "answers.jsonl")
+    weights = weights_digest(student.model, folder / "student" if folder else None)
+    journal = answers.AnswerLog(run.folder / "answers.jsonl", f"{weights} on {store.identity}")
     rows, subtypes, metrics = [], {}, {}
     for mode in cfg.modes:
         log.info("asking %s in %s mode", name, mode)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import TypeVar
 
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from conf.errors import UserError
+from data.store import digest
 
 Command = TypeVar("Command")
 
@@ -16,7 +19,8 @@ def settings_of(folder: Path, schema: type[Command], product: str) -> Command:
     """The settings of a finished training run, as its command's dataclass.
 
     Raises:
-        UserError: `folder` is no run folder, or holds no finished `product` (student, retriever).
+        UserError: `folder` is no run folder, holds no finished `product` (student, retriever), or
+            settings that this version does not know.
     """
     config = folder / "config.yaml"
     if not config.exists():
@@ -29,5 +33,20 @@ def settings_of(folder: Path, schema: type[Command], product: str) -> Command:
             f"model={folder} is not finished: {folder / product} is missing; run its command again "
             "to go on with it"
         )
-    settings = OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.load(config))
+    try:
+        settings = OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.load(config))
+    except OmegaConfBaseException as error:
+        raise UserError(
+            f"{config} is of another version of DynaPix: {error.full_key} is not known; train again"
+        ) from error
     return OmegaConf.to_object(settings)
+
+
+def weights_digest(model: str | None, trained: Path | None) -> str:
+    """A short hash of every safetensors file of a model: of its base, where that is a folder, and
+    of what training wrote."""
+    whole = hashlib.sha256(str(model).encode())
+    for folder in (model, trained):
+        for path in sorted(Path(folder).rglob("*.safetensors")) if folder else []:
+            whole.update(digest(path).encode())
+    return whole.hexdigest()[:16]

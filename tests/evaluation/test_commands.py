@@ -92,11 +92,14 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
     log = run.folder / "answers.jsonl"
     whole = log.read_text()
     log.write_text(whole[: len(whole) * 2 // 3])
-    kept = len(AnswerLog(log).answers)
-    assert 0 < kept < 16
+    measured = json.loads(whole.partition("\n")[0])["measured"]
+    assert 0 < len(AnswerLog(log, measured).answers) < 16
     select.main.__wrapped__(asked, run)
     assert (run.folder / "report.json").read_text() == told
     assert sorted(log.read_text().splitlines()) == sorted(whole.splitlines())
+
+    # Answers of other weights are not taken for these.
+    assert not AnswerLog(log, "another").answers
 
     ranked = RetrieveCommand(
         benchmark=micro, retriever=RetrieverConfig(name="unused", model="unused"), store=store,
