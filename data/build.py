@@ -41,6 +41,7 @@ from data.store import (
     open_store,
     save_rows,
     save_scene,
+    sealed,
     write_atomically,
 )
 from data.workers import pool
@@ -353,7 +354,7 @@ def _finish(
         "scenes": scene_ids,
         "files": digests(growing),
     }
-    write_atomically(growing / MANIFEST, json.dumps(manifest, indent=1).encode())
+    write_atomically(growing / MANIFEST, json.dumps(sealed(manifest), indent=1).encode())
 
 
 def _counts(

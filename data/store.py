@@ -39,6 +39,7 @@ from data.render import RENDERER_VERSION
 from data.selection.drafts import BUILDERS_VERSION
 
 MANIFEST = "manifest.json"
+SEAL = "sha256"
 PLAN = "plan.json"
 """What a build in progress is to become; gone from a whole store."""
 VERSIONS = {
@@ -126,6 +127,12 @@ def digests(folder: Path) -> dict[str, str]:
         return dict(zip(names, pool.map(digest, paths), strict=True))
 
 
+def sealed(manifest: dict[str, Any]) -> dict[str, Any]:
+    """A manifest with the SHA-256 of its own content."""
+    content = {key: value for key, value in manifest.items() if key != SEAL}
+    return content | {SEAL: hashlib.sha256(json.dumps(content).encode()).hexdigest()}
+
+
 @dataclass(frozen=True)
 class Store:
     """A built and verified benchmark."""
@@ -178,14 +185,18 @@ def open_store(folder: Path) -> Store:
         raise UserError(f"{folder} holds no benchmark: {MANIFEST} is missing; {rebuild}")
     try:
         manifest = json.loads(path.read_text())
-        files = manifest["files"]
-    except (json.JSONDecodeError, KeyError) as error:
+        versions = {key: manifest.get(key) for key in VERSIONS}
+    except (ValueError, AttributeError) as error:
         raise UserError(f"{path} is damaged and cannot be read; {rebuild}") from error
     for key, current in VERSIONS.items():
-        if (there := manifest.get(key)) != current:
+        if versions[key] != current:
             raise UserError(
-                f"{folder} was built by {key} version {there}, this is version {current}; {rebuild}"
+                f"{folder} was built by {key} version {versions[key]}, this is version {current}; "
+                f"{rebuild}"
             )
+    if manifest != sealed(manifest):
+        raise UserError(f"{path} is damaged (it was changed after the build); {rebuild}")
+    files = manifest["files"]
     found = digests(folder)
     missing = [name for name in files if name not in found]
     damaged = [name for name in files if name in found and found[name] != files[name]]

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 
-from conf.errors import UserError
+from conf.errors import SettingsError, UserError
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
-from data.build import build, ensure_benchmark
+from data.build import _growing, build, ensure_benchmark, split_scenes
 from data.store import MANIFEST, digests, open_store, write_atomically
 
 
@@ -55,27 +55,59 @@ def test_two_builds_are_the_same_bytes_whatever_the_workers(built, tmp_path) -> 
     assert contents(tmp_path / "small") == contents(built)
 
 
-def test_a_killed_build_goes_on_to_the_same_bytes(built, tmp_path) -> None:
+@pytest.mark.parametrize("part", ["scenes", "frames"])
+def test_a_killed_build_goes_on_to_the_same_bytes(built, tmp_path, part) -> None:
     code = (
         "from pathlib import Path\n"
         "from tests.data.test_store import *\n"
-        f"if __name__ == '__main__': build(small(), Path({str(tmp_path)!r}) / 'small', workers=1)"
+        f"if __name__ == '__main__': build(small(), Path({str(tmp_path)!r}) / 'small', workers=2)"
     )
     script = tmp_path / "run.py"
     script.write_text(code)
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    child = subprocess.Popen([sys.executable, script], env=env, start_new_session=True)
-    scenes = tmp_path / ".small.partial" / "scenes"
-    while child.poll() is None and len(list(scenes.glob("*.npz"))) < 2:
+    child = subprocess.Popen([sys.executable, script], env=env)
+    parts = tmp_path / ".small.partial" / part
+    while child.poll() is None and len(list(parts.glob("*"))) < 2:
         time.sleep(0.02)
-    os.killpg(child.pid, signal.SIGKILL)
+    workers = psutil.Process(child.pid).children()
+    child.kill()
     child.wait()
     assert not (tmp_path / "small").exists()
-    first = {p.name: p.stat().st_mtime_ns for p in scenes.glob("*.npz")}
+    assert workers
+    assert not psutil.wait_procs(workers, timeout=30)[1]
+    first = {p.name: p.stat().st_mtime_ns for p in parts.glob("[!.]*")}
     build(small(), tmp_path / "small", workers=1)
     assert contents(tmp_path / "small") == contents(built)
-    kept = tmp_path / "small" / "scenes"
+    kept = tmp_path / "small" / part
     assert all((kept / name).stat().st_mtime_ns == when for name, when in first.items())
+
+
+def test_a_build_of_other_settings_is_not_thrown_away(tmp_path) -> None:
+    with pytest.raises(UserError, match="would be empty"):
+        build(small(selection=SelectionConfig(time={"in_1s": Quota()}),
+                    retrieval=RetrievalTrackConfig()), tmp_path / "small", workers=1)  # fmt: skip
+    with pytest.raises(UserError, match=r"unfinished build with .*=\d+, you ask for"):
+        build(small(), tmp_path / "small", workers=1)
+    assert len(list((tmp_path / ".small.partial" / "scenes").iterdir())) == 6
+
+
+def test_a_build_is_one_process_own(tmp_path) -> None:
+    with _growing(small(), tmp_path / "small"), pytest.raises(UserError, match="another process"):
+        build(small(), tmp_path / "small", workers=1)
+
+
+@pytest.mark.parametrize("scenes", [10, 12, 100])
+def test_a_scene_has_one_split_in_every_size(scenes) -> None:
+    some, more = split_scenes(small(scenes=scenes)), split_scenes(small(scenes=500))
+    for split in ("train", "test"):
+        assert set(some[split]) <= set(more[split])
+        assert sorted(some[split]) == some[split]
+    assert len(more["test"]) == 100
+
+
+def test_a_split_without_scenes_is_refused() -> None:
+    with pytest.raises(UserError, match="leaves no scene to test on"):
+        split_scenes(small(scenes=4, test_share=0.01))
 
 
 @pytest.mark.parametrize("part", ["selection.parquet", "scenes", "frames"])
@@ -100,9 +132,19 @@ def test_a_store_of_another_version_is_named(copy, maker) -> None:
         open_store(copy)
 
 
-def test_a_damaged_manifest_is_named(copy) -> None:
-    manifest = json.loads((copy / MANIFEST).read_text())
-    (copy / MANIFEST).write_text(json.dumps(manifest)[:100])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: whole[:100],
+        lambda whole: b"[]",
+        lambda whole: b"\xff" + whole,
+        lambda whole: whole.replace(b'"scenes": 6', b'"scenes": 7'),
+    ],
+    ids=["cut", "a list", "no text", "edited"],
+)
+def test_a_damaged_manifest_is_named(copy, damage) -> None:
+    whole = (copy / MANIFEST).read_bytes()
+    (copy / MANIFEST).write_bytes(damage(whole))
     with pytest.raises(UserError, match=r"manifest\.json is damaged"):
         open_store(copy)
 
@@ -124,9 +166,11 @@ def test_a_benchmark_that_would_be_empty_is_refused(built, tmp_path) -> None:
 
 
 def test_an_unknown_cell_is_named(tmp_path) -> None:
-    unknown = SelectionConfig(event={"future_sideways": Quota(train=1)})
-    with pytest.raises(UserError, match=r"selection\.event\.future_sideways"):
+    unknown = SelectionConfig(event={"future_offset_gap11": Quota(train=1)})
+    said = r"selection\.event\.future_offset_gap11: .* did you mean future_offset_gap10\?"
+    with pytest.raises(SettingsError, match=said):
         build(small(selection=unknown), tmp_path / "small", workers=1)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_write_that_fails_leaves_nothing(tmp_path, monkeypatch) -> None:
