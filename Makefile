@@ -1,6 +1,7 @@
 # Everything a user types. `make help` prints what stands behind each ##.
 PYTHON ?= python3.11
 BIN := .venv/bin
+INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[test]'
 READY := .venv/.ready
 
 .PHONY: help setup run test check lint format base constraints clean
@@ -10,11 +11,11 @@ help: ## Print this
 
 setup: $(READY) ## Make .venv with everything that is needed
 
-# The tested versions are wishes, not demands: where a machine's registry lacks one, the ranges hold.
+# Where a machine's registry lacks one of the tested versions, the ranges have to do.
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --upgrade uv
-	$(BIN)/uv pip install --quiet --python $(BIN)/python --constraint constraints.txt --editable '.[test]'
+	$(INSTALL) --constraint constraints.txt || $(INSTALL)
 	@touch $(READY)
 
 run: setup ## Train and measure the tiny student and the tiny retriever, and report on both
