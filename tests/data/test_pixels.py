@@ -27,7 +27,18 @@ def test_the_origin_is_seen_at_the_images_centre() -> None:
     assert depth == pytest.approx(5.0, abs=1e-3)
 
 
-@pytest.mark.parametrize("frame", [20, 45, 60, 100])
+SEEN_AT = [0, 10, 15, 20, 60, 100]
+
+
+def test_the_frames_looked_at_show_all_there_is_to_see(scene: Scene) -> None:
+    """Objects out of view, whole and partly hidden, or the next test could not fail."""
+    fractions = scene.visible_fraction[SEEN_AT]
+    assert not scene.in_view[SEEN_AT].all()
+    assert (fractions == 1).any()
+    assert ((fractions > 0.2) & (fractions < 0.8)).any()
+
+
+@pytest.mark.parametrize("frame", SEEN_AT)
 def test_visibility_agrees_with_bullets_mask(scene: Scene, frame: int) -> None:
     drawn = BulletRenderer(240, 160)  # twice that inside: the oracle's own 480 x 320
     drawn.render(scene, frame)
@@ -36,7 +47,6 @@ def test_visibility_agrees_with_bullets_mask(scene: Scene, frame: int) -> None:
     mask = np.reshape(bullet.getCameraImage(*take, renderer=bullet.ER_TINY_RENDERER)[4], (320, 480))
     for k in range(len(scene.objects)):
         seen = int((mask == drawn._handles[k]).sum())
-        assert (seen > 8) <= scene.in_view[frame, k]
         for j, handle in enumerate(drawn._handles):
             if j != k:
                 bullet.resetBasePositionAndOrientation(handle, [0, 0, -50], [0, 0, 0, 1])
@@ -45,6 +55,8 @@ def test_visibility_agrees_with_bullets_mask(scene: Scene, frame: int) -> None:
         )
         covers = int((alone == drawn._handles[k]).sum())
         drawn.render(scene, frame)
+        if covers > 8 or covers == 0:
+            assert scene.in_view[frame, k] == (covers > 0)
         if covers > 100:
             assert scene.visible_fraction[frame, k] == pytest.approx(seen / covers, abs=0.05)
 

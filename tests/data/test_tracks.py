@@ -21,7 +21,9 @@ def items(micro_store: Store) -> list[SelectionItem]:
 
 
 def test_every_cell_has_items_and_letters_are_balanced(micro_store, items) -> None:
-    assert {i.family for i in items} == {"event", "time", "window"}
+    track = micro_store.manifest["config"]["selection"]
+    asked = {(f, cell) for f in ("event", "time", "window") for cell in track[f]}
+    assert {(i.family, i.subtype) for i in items} == asked
     for cell in {(i.subtype, i.split) for i in items}:
         letters = Counter(i.answer for i in items if (i.subtype, i.split) == cell)
         assert max(letters.values()) - min(letters[k] for k in range(4)) <= 1
@@ -75,6 +77,33 @@ def test_window_items_are_of_their_group_and_horizon(micro_store, items) -> None
         assert item.subtype == f"{group}_A_h{item.horizon}_{item.difficulty}"
 
 
+def test_each_builder_asks_what_it_may_of_a_scene(micro_store) -> None:
+    queries = micro_store.retrieval()
+    assert {q.builder for q in queries} == set(range(1, 7))
+    for builder in range(1, 7):
+        asked = [q for q in queries if q.builder == builder]
+        moments = {(q.scene_id, q.prefix_start, q.prefix_stop, q.target) for q in asked}
+        assert len(moments) == len(asked)
+        targets = Counter(q.scene_id for q in asked)
+        if builder == 3:
+            events = {(q.scene_id, q.target.frame) for q in asked}
+            assert max(Counter(s for s, _ in events).values()) <= 3
+        if builder in (4, 5, 6):
+            assert max(targets.values()) == 1
+
+
+def test_a_question_says_how_far_ahead_it_asks(micro_store) -> None:
+    for q in micro_store.retrieval():
+        seconds = (q.target.frame - q.prefix_stop + (q.builder == 1)) // FPS
+        told = "1 second" if seconds == 1 else f"{seconds} seconds"
+        if q.anchor == "time":
+            assert f"{told} after the observation" in q.question
+        if q.builder == 4:
+            assert f"{told} after that collision" in q.question
+        if q.builder == 6:
+            assert "half a second after the next collision" in q.question
+
+
 def test_builders_keep_the_papers_clock(micro_store) -> None:
     for q in micro_store.retrieval():
         events = {c.frame for c in micro_store.scene(q.scene_id).collisions}
@@ -88,6 +117,7 @@ def test_builders_keep_the_papers_clock(micro_store) -> None:
         elif q.builder == 3:
             assert q.target.frame in events
             assert 0 <= ahead - 1 <= 5
+            assert length == FPS
         elif q.builder == 4:
             assert q.prefix_stop in events
             assert (length, ahead) == (FPS, FPS)
