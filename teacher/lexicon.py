@@ -20,7 +20,8 @@ ORDINALS = _words(
     "second third fourth fifth sixth seventh eighth eigth ninth nineth tenth eleventh twelfth "
     "twelth thirteenth fourteenth fifteenth sixteenth seventeenth eighteenth nineteenth twentieth "
     "thirtieth fortieth fourtieth fiftieth sixtieth seventieth eightieth ninetieth hundredth "
-    "thousandth millionth billionth trillionth umpteenth nth secondly thirdly fourthly fifthly"
+    "thousandth millionth billionth trillionth umpteenth nth secondary tertiary secondly "
+    "thirdly fourthly fifthly"
 )
 """Every English ordinal but "first", which has rules of its own."""
 
@@ -29,7 +30,8 @@ QUANTITIES = _words(
     "sevenths eighths ninths tenths hundredths thousandths twice thrice double doubles doubled "
     "doubling doubly triple triples tripled tripling triply treble trebled quadruple quadruples "
     "quadrupled quintuple quintupled sextuple septuple octuple onefold dozen dozens dozenth couple "
-    "couples duo trio quartet quintet sextet septet octet twain single singly percent percentage "
+    "couples duo trio triad triads triplet triplets umpteen quartet quintet sextet septet octet "
+    "twain single singly percent percentage "
     "percentages percentile permille cent cents fortnight decade decades century centuries "
     "millennium oclock"
 )

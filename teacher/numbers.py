@@ -50,12 +50,14 @@ PHRASES = [
         rf"\b(?:{_any(lexicon.VAGUE)})(?:\s+(?:of|more|the|further|additional|short|brief|video))"
         rf"{{0,3}}\s+(?:{_any(lexicon.COUNTED)})\b",
         r"\ban?\s+(?:frame|moment|step|instant|beat)\s+(?:later|earlier|ago|before|after)\b",
+        r"\b(?:within|after|in)\s+an?\s+(?:frame|step|beat)\b|\ba\s+pixel\b|\ba\s+score\s+of\b",
         r"\b(?:a|per|each|every|the|within|this|next|last)\s+minute\s*"
         r"(?=[.,;:!?)]|$|(?:later|ago|or|of|after|before|passes|passed|has|long|in|and)\b)",
         r"\bper\s+(?:mille|cent|second|minute)\b",
         r"\((?:i|v|x)\)",
         rf"\b(?:{_any(lexicon.ENUMERATED)})\s+(?-i:[IVX])\b(?!')",
-        r"\bonce\b(?=\s*(?:[.,;:!?)]|$|(?:or|and|per|every|each|in|a|only|during|before)\b))",
+        r"\bonce\b(?=\s*(?:[.,;:!?)]|$|(?:or|and|per|every|each|in|a|only|during|before"
+        r"|with|off|against|near|into|on|by)\b))",
         r"\b(?:only|just|exactly|than|least|most)\s+once\b",
     )
 ]

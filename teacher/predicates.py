@@ -72,7 +72,8 @@ class ObjectFacts:
 
     `sight` and `target_sight` are "shown", "hidden" (in view but covered) or "out of view";
     `speed` is "stationary" or a speed word; `heading` and `travel` are compass words of the motion
-    at the cut and from cut to target, None where there is none to speak of; `extent` says how far
+    at the cut and from cut to target, None where there is none to speak of or, at a contact, none
+    to see yet; `extent` says how far
     it goes from cut to target.
     """
 
@@ -97,7 +98,8 @@ class ObjectFacts:
 
 @dataclass(frozen=True)
 class Meeting:
-    """A pair and when it collides, from the cut: imminent, soon, later, or None for never."""
+    """A pair and when it collides, from the cut: imminent, soon, later, None for never, or
+    "unseen" where the clip ends with the pair still closing."""
 
     objects: tuple[str, str]
     when: str | None
@@ -105,7 +107,7 @@ class Meeting:
 
 @dataclass(frozen=True)
 class Closeness:
-    """A pair that is very close at the target, and where."""
+    """A pair that is very close at the target, and the region that it is around."""
 
     objects: tuple[str, str]
     region: str
@@ -191,7 +193,7 @@ def facts_of(
         moment=moment,
         objects=tuple(_object_facts(scene, i, cut, target) for i in range(len(names))),
         courses=tuple(
-            Meeting((names[i], names[j]), _when(scene.collisions, i, j, cut))
+            Meeting((names[i], names[j]), _outcome(scene, i, j, cut))
             for i, j in courses(scene, cut)
         ),
         contacts=tuple(
@@ -225,11 +227,17 @@ def predicates_of(
 
 
 def courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
-    """Pairs that straight lines through the last COURSE_FRAMES frames bring together."""
+    """Pairs that straight lines through the last COURSE_FRAMES frames bring together, each line
+    through the frames since its object's last contact; none that has just met."""
     ground = scene.positions[:, :, :2]
-    step = (ground[cut] - ground[cut - COURSE_FRAMES + 1]) / (COURSE_FRAMES - 1)
+    count = len(scene.objects)
+    starts = [free_since(scene, i, cut) for i in range(count)]
+    met = {c.objects for c in scene.collisions if cut - COURSE_FRAMES < c.frame <= cut}
+    step = [(ground[cut, i] - ground[starts[i], i]) / max(cut - starts[i], 1) for i in range(count)]
     pairs = []
-    for i, j in combinations(range(len(scene.objects)), 2):
+    for i, j in combinations(range(count), 2):
+        if (i, j) in met or cut in (starts[i], starts[j]):
+            continue
         apart, closing = ground[cut, j] - ground[cut, i], step[j] - step[i]
         speed = float(np.linalg.norm(closing))
         if speed * FPS < STATIONARY or np.dot(apart, closing) >= 0:
@@ -238,6 +246,24 @@ def courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
         if np.linalg.norm(apart + time * closing) < CONTACT + COURSE_MARGIN:
             pairs.append((i, j))
     return pairs
+
+
+def free_since(scene: Scene, index: int, cut: int) -> int:
+    """The first of the COURSE_FRAMES frames up to the cut that an object passed without a contact
+    after it: its motion is one motion from there on. The cut itself where it has just been hit."""
+    hits = [c.frame for c in scene.collisions if index in c.objects and c.frame <= cut]
+    return max([cut - COURSE_FRAMES + 1, *hits])
+
+
+def _outcome(scene: Scene, i: int, j: int, cut: int) -> str | None:
+    when = _when(scene.collisions, i, j, cut)
+    return "unseen" if when is None and _closing_at_end(scene, i, j) else when
+
+
+def _closing_at_end(scene: Scene, i: int, j: int) -> bool:
+    apart = scene.positions[-1, j, :2] - scene.positions[-1, i, :2]
+    closing = scene.velocities[-1, j, :2] - scene.velocities[-1, i, :2]
+    return bool(np.dot(apart, closing) < -STATIONARY * np.linalg.norm(apart))
 
 
 def compass(delta: np.ndarray) -> str | None:
@@ -252,7 +278,11 @@ def region_of(scene: Scene, frame: int, index: int) -> str:
     """The cell of the 3x3 grid that an object's centre lies in, in words, or "out of view"."""
     if not scene.in_view[frame, index]:
         return OUT
-    cell = scene.image_positions[frame, index] / scene.image_size * 3
+    return _cell(scene, scene.image_positions[frame, index])
+
+
+def _cell(scene: Scene, point: np.ndarray) -> str:
+    cell = point / scene.image_size * 3
     column, row = np.clip(np.floor(cell), 0, 2).astype(int)
     return REGIONS[row][column]
 
@@ -278,7 +308,7 @@ def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFact
         region=region_of(scene, cut, index),
         sight=_sight(scene, cut, index),
         speed=word if moving else "stationary",
-        heading=compass(pixels[cut] - pixels[cut - COURSE_FRAMES + 1]) if moving else None,
+        heading=compass(pixels[cut] - pixels[free_since(scene, index, cut)]) if moving else None,
         target_region=region_of(scene, target, index),
         target_sight=_sight(scene, target, index),
         extent=extent,
@@ -297,9 +327,13 @@ def _when(
 
 def _close_pairs(scene: Scene, target: int) -> tuple[Closeness, ...]:
     ground = scene.positions[target, :, :2]
+    places = scene.image_positions[target]
     seen = [i for i in range(len(scene.objects)) if scene.in_view[target, i]]
     return tuple(
-        Closeness((scene.objects[i].phrase, scene.objects[j].phrase), region_of(scene, target, i))
+        Closeness(
+            (scene.objects[i].phrase, scene.objects[j].phrase),
+            _cell(scene, (places[i] + places[j]) / 2),
+        )
         for i, j in combinations(seen, 2)
         if np.linalg.norm(ground[i] - ground[j]) < VERY_CLOSE
     )

@@ -10,7 +10,7 @@ from data.records import SelectionItem
 from teacher.predicates import Predicates
 from teacher.validate import SECTIONS
 
-PROMPT_VERSION = "1"
+PROMPT_VERSION = "2"
 
 SYSTEM = """You write short chains of reasoning about scenes of moving objects. You are given a \
 question with candidate images and a JSON record of true qualitative facts: the objects when the \
@@ -22,6 +22,8 @@ colon: {sections}. End with a line "Answer: " and the letter of the candidate th
 - Scene parse says where each object is and how it moves. Motion analysis says what the motions \
 lead to. Prediction says the layout at the target moment. Candidate analysis goes through every \
 candidate by its letter and says what agrees or differs. Outcome sums up.
+- A course whose "when" is null ends without contact; where it is "unseen", say only that the \
+pair is on a collision course.
 - Say only what the facts say, with their own words for regions, speeds and directions. Name \
 objects exactly as they do. Write as someone who watches the scene, and mention no record.
 - State no number of any kind: no digits, counts, ordinals, fractions, times, frames or \

@@ -10,7 +10,7 @@ from data.records import LETTERS, SelectionItem
 from teacher.numbers import find_numbers
 from teacher.predicates import Predicates
 
-VALIDATOR_VERSION = "1"
+VALIDATOR_VERSION = "2"
 SECTIONS = ("Scene parse", "Motion analysis", "Prediction", "Candidate analysis", "Outcome")
 """Headings of a rationale in order; the line "Answer: X" ends it."""
 HEADING = re.compile(rf"^({'|'.join(SECTIONS)}|Answer):[ \t]*", re.MULTILINE)
@@ -40,7 +40,8 @@ def validate(text: str, predicates: Predicates, item: SelectionItem, cfg: Teache
     reasons += problems
     analysis = sections.get("Candidate analysis", "")
     for candidate in predicates.candidates:
-        if analysis and not re.search(rf"\b{candidate.letter}\b", analysis):
+        # In a sentence about candidates, for "A" is also an article.
+        if analysis and not re.search(rf"[Cc]andidates?\b[^.]*\b{candidate.letter}\b", analysis):
             reasons.append(f"candidate not analysed: {candidate.letter}")
     if answer is not None and answer != item.letter:
         reasons.append(f"wrong answer: {answer}")
@@ -67,7 +68,10 @@ def _parse(text: str) -> tuple[dict[str, str], str | None, list[str]]:
         problems.append("sections out of order")
     if text[: headings[0].start() if headings else 0].strip():
         problems.append("text before the sections")
-    answer = answers[-1] if answers else None
-    if answer is None or answer not in tuple(LETTERS):
-        return sections, None, [*problems, "no answer" if answer is None else "unclear answer"]
+    if not answers:
+        return sections, None, [*problems, "no answer"]
+    answer = answers[-1]
+    # The letter is trained on and read as the token that follows this very line.
+    if answer not in tuple(LETTERS) or not text.rstrip().endswith(f"\nAnswer: {answer}"):
+        return sections, None, [*problems, "unclear answer"]
     return sections, answer, problems

@@ -126,6 +126,14 @@ It collides once.
 It happens once, then stops.
 It bounces once or twice.
 It strikes only once.
+It collides once with the red cube.
+It bounces once off the wall.
+A secondary collision follows.
+A tertiary contact is likely.
+A score of contacts follows.
+It moves within a frame.
+It drifts a pixel away.
+The triplet of objects stays.
 Phase II begins.
 Object IV leaves.
 Region iii is empty.

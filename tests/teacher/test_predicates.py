@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from teacher.numbers import find_numbers
-from teacher.predicates import compass, courses, cut_of, facts_of, predicates_of
+from teacher.predicates import REGIONS, compass, courses, cut_of, facts_of, predicates_of
 from tests.teacher import synthetic
 
 
@@ -54,6 +54,22 @@ def test_a_pair_on_a_course_meets():
         assert facts.close[0].objects == names
 
 
+def test_a_pair_that_has_just_met_is_on_no_course():
+    scene = synthetic.scene([(-1.5, 0), (1.5, 0)], [(1, 0), (-1, 0)])
+    contact = scene.collisions[0].frame
+    assert courses(scene, contact - 1) == [(0, 1)]
+    for cut in range(contact, contact + 4):
+        assert courses(scene, cut) == []
+
+
+def test_what_the_clip_does_not_show_is_not_foretold():
+    """A pair that would meet after the last frame neither will nor will not meet."""
+    scene = synthetic.scene([(-1.5, 0), (1.5, 0)], [(0.4, 0), (-0.4, 0)], frames=60)
+    assert not scene.collisions
+    assert courses(scene, 50) == [(0, 1)]
+    assert facts_of(scene, 20, 50, 55).courses[0].when == "unseen"
+
+
 def test_parallel_and_parting_pairs_are_on_no_course():
     scene = synthetic.scene([(0, 0), (0, 1), (-1, -1)], [(0.5, 0), (0.5, 0), (-0.5, -0.5)])
     assert courses(scene, 10) == []
@@ -74,6 +90,57 @@ def test_leaving_the_view():
     moving = facts_of(scene, 0, 10, 80).objects[0]
     assert moving.leaves
     assert moving.target_region == "out of view"
+
+
+DIRECTIONS = {
+    "north": np.array([0, -1]),
+    "south": np.array([0, 1]),
+    "east": np.array([1, 0]),
+    "west": np.array([-1, 0]),
+    "northeast": np.array([1, -1]),
+    "northwest": np.array([-1, -1]),
+    "southeast": np.array([1, 1]),
+    "southwest": np.array([-1, 1]),
+}
+
+
+def test_facts_of_real_scenes_are_true(micro_store):
+    """What a predicate says holds in the oracle's own positions, velocities and collisions."""
+    never = headings = close = 0
+    for item in micro_store.selection():
+        scene = micro_store.scene(item.scene_id)
+        cut = cut_of(scene, item.prefix_start, item.prefix_stop)
+        facts = facts_of(scene, item.prefix_start, item.prefix_stop, item.target_frame)
+        if facts is None:
+            continue
+        index = {o.phrase: i for i, o in enumerate(scene.objects)}
+        for meeting in facts.courses:
+            pair = {index[name] for name in meeting.objects}
+            met = [c.frame for c in scene.collisions if set(c.objects) == pair]
+            assert (meeting.when in (None, "unseen")) == (not any(frame > cut for frame in met))
+            assert not any(cut - 4 <= frame <= cut for frame in met)
+            never += meeting.when is None
+        for o in facts.objects:
+            if o.heading is not None:
+                way = scene.image_positions[cut + 1, index[o.object]]
+                way = way - scene.image_positions[cut, index[o.object]]
+                hit = any(
+                    cut < c.frame <= cut + 2 and index[o.object] in c.objects
+                    for c in scene.collisions
+                )
+                if not hit and np.hypot(*way) > 0.5:
+                    assert way @ DIRECTIONS[o.heading] > 0
+                    headings += 1
+        for pair in facts.close:
+            i, j = (index[name] for name in pair.objects)
+            ground = scene.positions[item.target_frame, :, :2]
+            assert np.hypot(*(ground[i] - ground[j])) < 0.6
+            middle = scene.image_positions[item.target_frame, [i, j]].mean(0)
+            column, row = np.floor(middle / scene.image_size * 3).astype(int)
+            assert pair.region == REGIONS[row][column]
+            close += 1
+    assert min(headings, close) > 5
+    assert never > 0
 
 
 def cases(count):
@@ -104,12 +171,31 @@ def test_no_number_in_any_predicate():
         assert not find_numbers(text)
 
 
-def test_wrong_candidates_disagree_and_the_right_one_agrees():
-    for item, predicates in cases(200):
-        assert predicates.answer == item.letter
-        for candidate in predicates.candidates:
-            assert candidate.agrees == (candidate.letter == item.letter)
-            assert candidate.agrees == (not candidate.differences)
+def test_differences_of_a_candidate_are_there(micro_store):
+    """A region or a missing object that a candidate is said to show is what its frame shows."""
+    told = 0
+    for item in micro_store.selection():
+        scene = micro_store.scene(item.scene_id)
+        predicates = predicates_of(item, scene, micro_store.scene)
+        for candidate in predicates.candidates if predicates else ():
+            frame = item.candidates["ABCD".index(candidate.letter)].frame
+            assert candidate.agrees == (frame == item.target_frame)
+            for d in candidate.differences:
+                i = [o.phrase for o in scene.objects].index(d.object)
+                if d.kind == "region":
+                    cell = scene.image_positions[frame, i] / scene.image_size * 3
+                    column, row = np.clip(np.floor(cell), 0, 2).astype(int)
+                    assert d.region in (REGIONS[row][column], "out of view")
+                if d.kind == "missing":
+                    assert scene.visible_fraction[frame, i] <= 0.05
+                if d.kind == "extra":
+                    assert scene.visible_fraction[item.target_frame, i] <= 0.05
+                if d.kind == "displaced" and d.heading:
+                    way = scene.image_positions[frame, i]
+                    way = way - scene.image_positions[item.target_frame, i]
+                    assert way @ DIRECTIONS[d.heading] > 0
+                told += 1
+    assert told > 50
 
 
 def test_a_displaced_object_is_named_with_its_direction():

@@ -1,5 +1,6 @@
 """The built-in narrator passes the validator, and the validator catches what is broken."""
 
+import re
 import subprocess
 import sys
 
@@ -96,6 +97,12 @@ def swap(text, item):
         (without("Prediction"), "missing section: Prediction"),
         (without("Outcome"), "missing section: Outcome"),
         (without("Answer"), "no answer"),
+        (lambda t, i: t.replace("Answer: ", "Answer:"), "unclear answer"),
+        (lambda t, i: t.replace("Answer: ", "Answer:\n\n"), "unclear answer"),
+        (
+            lambda t, i: re.sub(r"[Cc]andidate A[^.]*\.", "A wrong layout is seen.", t),
+            "candidate not analysed: A",
+        ),
         (other_letter, "wrong answer"),
         (lambda t, i: t[: len(t) // 2], "no answer"),
         (lambda t, i: t[:-1] + "none", "unclear answer"),
