@@ -244,10 +244,11 @@ def _backbone_problems(group: str, cfg: StudentConfig | RetrieverConfig) -> list
             f"{group}.quantization=nf4 with {group}.lora.rank=0: 4-bit weights cannot be trained "
             f"whole, set {group}.quantization=none or raise {group}.lora.rank"
         )
-    if cfg.quantization == "nf4" and cfg.architecture is not None:
+    if cfg.architecture is not None and (cfg.quantization == "nf4" or cfg.lora.rank > 0):
         problems.append(
-            f"{group}.quantization=nf4 with {group}.architecture: a model built from a seed is "
-            f"trained whole, set {group}.quantization=none"
+            f"{group}.quantization={cfg.quantization} and {group}.lora.rank={cfg.lora.rank} with "
+            f"{group}.architecture: a model built from a seed is trained whole, set "
+            f"{group}.quantization=none and {group}.lora.rank=0"
         )
     return problems
 
@@ -394,7 +395,7 @@ class SftCommand(CommandConfig):
     student: StudentConfig = MISSING
     train: SftTrainConfig = field(default_factory=SftTrainConfig)
     seed: int = 0
-    """Of the held-out training scenes, the order of samples and new adapters."""
+    """Of the order of samples and of new adapters."""
 
 
 @dataclass
@@ -403,7 +404,7 @@ class ContrastiveCommand(CommandConfig):
     retriever: RetrieverConfig = MISSING
     train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
     seed: int = 0
-    """Of the held-out training scenes, the order of queries and new adapters."""
+    """Of the order of queries and of new adapters."""
 
     def check(self) -> list[str]:
         problems = super().check()

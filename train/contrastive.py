@@ -44,7 +44,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     set_seed(cfg.seed)
     frames = Frames(store, cfg.retriever.image_size)
     queries = store.retrieval("train")
-    held_out = held_out_scenes(store, cfg.seed)
+    held_out = held_out_scenes(store)
     training = [q for q in queries if q.scene_id not in held_out]
     # Queries stand builder by builder: a shuffled slice measures all of them.
     validation = shuffled([q for q in queries if q.scene_id in held_out], cfg.seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -61,13 +62,17 @@ class Samples(Dataset):
         return self[max(range(len(self)), key=lambda k: len(encoded[k]))]
 
 
-def held_out_scenes(store: Store, seed: int) -> set[str]:
-    """A seeded share of the training scenes, kept from training to measure it. Test scenes are
-    never touched here."""
-    names = store.scene_ids("train")
-    count = max(1, round(HELD_OUT * len(names)))
-    picked = np.random.default_rng([seed, 1]).permutation(len(names))[:count]
-    return {names[k] for k in picked}
+def held_out_scenes(store: Store) -> set[str]:
+    """A share of the training scenes, kept from training to measure it. Test scenes are never
+    touched here.
+
+    It goes by the scenes alone, not by a run's seed: a base must not have been trained on what
+    measures a student that is trained over it.
+    """
+    names = sorted(
+        store.scene_ids("train"), key=lambda name: hashlib.sha256(name.encode()).digest()
+    )
+    return set(names[: max(1, round(HELD_OUT * len(names)))])
 
 
 def shuffled(rows: list[Row], seed: int) -> list[Row]:
@@ -147,7 +152,7 @@ def splits(
     store: Store, rationales: list[Rationale], cfg: SftCommand, frames: Frames
 ) -> tuple[Samples, dict[str, Samples]]:
     """Training samples of a regime, and what measures it on held-out training scenes, by mode."""
-    held_out = held_out_scenes(store, cfg.seed)
+    held_out = held_out_scenes(store)
     others = set(store.scene_ids("train")) - held_out
     limit = cfg.train.validation_items
     if cfg.train.regime == "describe":
