@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Any
+from urllib.parse import urlsplit
 
 from omegaconf import MISSING
 
@@ -106,6 +107,7 @@ class TeacherConfig:
     model: str | None = None
     """The model's name at the server."""
     seed: int = 0
+    """Of the built-in narrator's phrasings; with a server, a label of one narration."""
     min_words: int = 80
     max_words: int = 250
     attempts: int = 4
@@ -141,6 +143,11 @@ class TeacherConfig:
             problems.append(
                 f"teacher.min_words={self.min_words} and teacher.max_words={self.max_words}: "
                 "need 0 < min <= max"
+            )
+        if self.url is not None and not _is_url(self.url):
+            problems.append(
+                f"teacher.url={self.url} is no address of a server, such as "
+                "http://127.0.0.1:8000/v1"
             )
         if not 0 < self.top_p <= 1:
             problems.append(f"teacher.top_p={self.top_p} must be above 0 and at most 1")
@@ -459,6 +466,14 @@ class RetrieveCommand(CommandConfig):
 @dataclass
 class ReportCommand(CommandConfig):
     pass
+
+
+def _is_url(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+        return parts.scheme in ("http", "https") and parts.port != 0 and " " not in text
+    except ValueError:
+        return False
 
 
 def _too_small(cfg: Any, above: str, least: dict[str, float]) -> list[str]:

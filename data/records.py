@@ -228,6 +228,8 @@ class Rationale:
     teacher: str
     prompt_version: str
     validator_version: str
+    settings: str
+    """A short hash of the teacher's settings that shape an answer or its verdict."""
     seed: int
     reasons: tuple[str, ...] = ()
     sections: dict[str, str] = field(default_factory=dict)

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from conf.errors import UserError
 from data.records import Rationale
+
+DIGEST = "sha256"
+UNREADABLE = (ValueError, TypeError, KeyError, AttributeError)
 
 
 class Journal:
@@ -41,9 +46,7 @@ class Journal:
 
     def append(self, rationales: Iterable[Rationale]) -> None:
         """Write answers and wait until they are on the disk."""
-        lines = [json.dumps(r.to_row(), ensure_ascii=False) + "\n" for r in rationales]
-        # A teacher may answer with half of a surrogate pair, which UTF-8 cannot hold.
-        self.file.write("".join(lines).encode("utf-8", "replace"))
+        self.file.write(b"".join(_line(r) for r in rationales))
         self.file.flush()
         os.fsync(self.file.fileno())
 
@@ -55,25 +58,43 @@ class Journal:
         if not torn:
             return
         try:
-            Rationale.from_row(json.loads(torn))
-        except (ValueError, TypeError, KeyError):
+            _read(torn)
+        except UNREADABLE:
             self.file.truncate(whole)
         else:
             self.file.write(b"\n")
         self.file.flush()
 
 
+def _line(rationale: Rationale) -> bytes:
+    # A teacher may answer with half of a surrogate pair, which UTF-8 cannot hold.
+    whole = json.dumps(rationale.to_row(), ensure_ascii=False).encode("utf-8", "replace")
+    row = json.loads(whole)
+    return json.dumps({**row, DIGEST: _digest(row)}, ensure_ascii=False).encode() + b"\n"
+
+
+def _read(line: bytes) -> Rationale:
+    row = json.loads(line)
+    if row.pop(DIGEST) != _digest(row):
+        raise ValueError("it was changed after it was written")
+    return Rationale.from_row(row)
+
+
+def _digest(row: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(row).encode()).hexdigest()[:16]
+
+
 def read_rationales(path: Path) -> list[Rationale]:
     """Every answer in a rationales.jsonl.
 
     Raises:
-        UserError: a line cannot be read; names the file and the line.
+        UserError: a line cannot be read or was changed; names the file and the line.
     """
     rationales = []
     for number, line in enumerate(path.read_bytes().splitlines(), start=1):
         try:
-            rationales.append(Rationale.from_row(json.loads(line)))
-        except (ValueError, TypeError, KeyError) as error:
+            rationales.append(_read(line))
+        except UNREADABLE as error:
             raise UserError(
                 f"{path}, line {number}: not a rationale ({error}); delete the line, and its "
                 "answer is asked for again"

@@ -7,6 +7,8 @@ killed goes on from there; the built-in narrator then ends with the very bytes o
 from __future__ import annotations
 
 import asyncio
+import hashlib
+import json
 import logging
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -140,12 +142,19 @@ def _version(cfg: TeacherConfig) -> str:
     return NARRATOR_VERSION if cfg.url is None else PROMPT_VERSION
 
 
-def _signature_of(cfg: TeacherConfig) -> tuple[str, str, str, int]:
-    return (cfg.name, _version(cfg), VALIDATOR_VERSION, cfg.seed)
+def _settings(cfg: TeacherConfig) -> str:
+    shaping = [cfg.min_words, cfg.max_words]
+    if cfg.url is not None:
+        shaping += [cfg.model, cfg.temperature, cfg.top_p, cfg.top_k, cfg.max_tokens]
+    return hashlib.sha256(json.dumps(shaping).encode()).hexdigest()[:8]
 
 
-def _signature(r: Rationale) -> tuple[str, str, str, int]:
-    return (r.teacher, r.prompt_version, r.validator_version, r.seed)
+def _signature_of(cfg: TeacherConfig) -> tuple[str, str, str, str, int]:
+    return (cfg.name, _version(cfg), VALIDATOR_VERSION, _settings(cfg), cfg.seed)
+
+
+def _signature(r: Rationale) -> tuple[str, str, str, str, int]:
+    return (r.teacher, r.prompt_version, r.validator_version, r.settings, r.seed)
 
 
 def _open(given: list[Rationale], cfg: TeacherConfig) -> bool:
@@ -170,6 +179,7 @@ def _judged(
         teacher=cfg.name,
         prompt_version=_version(cfg),
         validator_version=VALIDATOR_VERSION,
+        settings=_settings(cfg),
         seed=cfg.seed,
         reasons=("cut off",) if cut_off else verdict.reasons,
         sections=verdict.sections,

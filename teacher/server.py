@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import http.client
 import time
 import urllib.error
 import urllib.request
@@ -15,6 +16,10 @@ from conf.schema import TeacherConfig
 
 PAUSE, LONGEST_PAUSE = 0.5, 5.0
 """Seconds between looks at a server that is down: the first, doubled up to the longest."""
+
+
+NO_REPLY = (AttributeError, IndexError, TypeError, ValueError)
+"""What the client raises at a reply that is not of the API's form."""
 
 
 @dataclass(frozen=True)
@@ -78,24 +83,31 @@ class Server:
 
     async def _ask(self, messages: list[dict[str, str]]) -> Reply:
         cfg = self.cfg
-        completion = await self.client.chat.completions.create(
-            model=cfg.model,
-            messages=messages,
-            temperature=cfg.temperature,
-            top_p=cfg.top_p,
-            max_tokens=cfg.max_tokens,
-            extra_body={"top_k": cfg.top_k, "chat_template_kwargs": {"enable_thinking": False}},
-        )
-        choice = completion.choices[0]
-        return Reply((choice.message.content or "").strip(), choice.finish_reason == "length")
+        try:
+            completion = await self.client.chat.completions.create(
+                model=cfg.model,
+                messages=messages,
+                temperature=cfg.temperature,
+                top_p=cfg.top_p,
+                max_tokens=cfg.max_tokens,
+                extra_body={"top_k": cfg.top_k, "chat_template_kwargs": {"enable_thinking": False}},
+            )
+            choice = completion.choices[0]
+            return Reply((choice.message.content or "").strip(), choice.finish_reason == "length")
+        except NO_REPLY as error:
+            raise UserError(
+                f"{cfg.url} does not answer as an OpenAI-compatible server does "
+                f"({type(error).__name__}: {error}); such a URL ends in /v1"
+            ) from error
 
     async def _unknown_model(self) -> UserError:
         try:
             served = ", ".join([m.id async for m in self.client.models.list()])
-        except openai.OpenAIError:
+        except (openai.OpenAIError, *NO_REPLY):
             served = "an unknown set"
         return UserError(
-            f"{self.cfg.url} does not serve teacher.model={self.cfg.model}; it has {served}"
+            f"{self.cfg.url} does not serve teacher.model={self.cfg.model}; it has {served}. Is "
+            "that the URL of an OpenAI-compatible server, ending in /v1?"
         )
 
     def _gone(self, problem: object) -> UserError:
@@ -113,5 +125,5 @@ def _problem(health: str) -> str | None:
             return None
     except urllib.error.HTTPError as error:
         return f"HTTP {error.code}" if error.code >= 500 else None
-    except OSError as error:
-        return str(error)
+    except (OSError, http.client.HTTPException) as error:
+        return str(error) or type(error).__name__

@@ -96,6 +96,12 @@ def test_every_failed_check_is_told_at_once():
     ]
 
 
+@pytest.mark.parametrize("url", ["localhost:8000/v1", "http://h:P/v1", "http://h h/v1"])
+def test_an_address_that_is_none_is_told(url):
+    said = problem(f"teacher.url='{url}'", "teacher=qwen3_32b")
+    assert said.startswith(f"teacher.url={url} is no address of a server, such as http")
+
+
 def test_a_check_across_groups_is_told():
     text = problem("train.hard_negatives=9", command="train.contrastive", schema=ContrastiveCommand)
     assert text.startswith("train.hard_negatives=9 is more than benchmark.retrieval.hard_negatives")

@@ -11,8 +11,8 @@ import pytest
 
 from conf.errors import UserError
 from conf.schema import TeacherConfig
-from data.records import Rationale, Scene, SelectionItem
-from teacher.journal import Journal
+from data.records import Scene, SelectionItem
+from teacher.journal import Journal, read_rationales
 from teacher.narrate import ensure_rationales, narrate_store
 from teacher.predicates import predicates_of
 from teacher.template import narrate
@@ -99,6 +99,23 @@ def test_a_damaged_line_is_named(store):
         narrate_store(store, TEMPLATE, 1)
 
 
+def test_an_edited_line_is_named(store):
+    narrate_store(store, TEMPLATE, 1)
+    edited = lines(store).replace(b"Scene parse: ", b"Scene parse: There are 3 cubes. ", 1)
+    (store.folder / "rationales.jsonl").write_bytes(edited)
+    with pytest.raises(UserError, match=r"rationales\.jsonl, line 1: .* changed after it was"):
+        narrate_store(store, TEMPLATE, 1)
+
+
+def test_answers_under_other_settings_are_not_taken(store):
+    first = narrate_store(store, TEMPLATE, 1)
+    strict = TeacherConfig(name="template", min_words=240, max_words=250, attempts=1)
+    assert narrate_store(store, strict, 1).rationales == []
+    before = lines(store)
+    assert narrate_store(store, TEMPLATE, 1).rationales == first.rationales
+    assert lines(store) == before
+
+
 def test_only_one_writer(store):
     with Journal(store.folder / "rationales.jsonl"), pytest.raises(UserError, match="another run"):
         narrate_store(store, TEMPLATE, 1)
@@ -107,7 +124,7 @@ def test_only_one_writer(store):
 def test_rejected_answers_are_kept_and_set_aside(store):
     cfg = TeacherConfig(name="template", min_words=240, max_words=250, attempts=2)
     report = narrate_store(store, cfg, 1)
-    kept = [Rationale.from_row(json.loads(line)) for line in lines(store).splitlines()]
+    kept = read_rationales(store.folder / "rationales.jsonl")
     assert report.rationales == []
     assert (report.set_aside, report.rejected) == (12, {"too short": 24})
     assert [r.attempt for r in kept[:4]] == [0, 1, 0, 1]
@@ -158,6 +175,14 @@ class Handler(BaseHTTPRequestHandler):
         with self.server.lock:
             self.server.asked.append(request)
             fault = self.server.faults.pop(0) if self.server.faults else None
+        if isinstance(fault, bytes):
+            self.send_response(200)
+            self.send_header(
+                "Content-Type", "application/json" if fault[:1] in b"{[" else "text/html"
+            )
+            self.end_headers()
+            self.wfile.write(fault)
+            return
         if isinstance(fault, int):
             self.say(fault, {"error": {"message": "fault", "type": "t", "code": fault}})
             return
@@ -238,6 +263,25 @@ def test_an_unknown_model_is_named_with_those_there(store, serve):
 def test_a_refused_request_is_told(store, serve):
     with pytest.raises(UserError, match="refused a request"):
         narrate_store(store, config(serve(400), concurrency=1), 1)
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [b"<html>hello</html>", b"{}", b'{"choices": []}', b"{", b"[]",
+     b'{"choices": [{"message": null}]}'],
+)  # fmt: skip
+def test_a_server_of_another_kind_is_told(store, serve, reply):
+    with pytest.raises(UserError, match="does not answer as an OpenAI-compatible server"):
+        narrate_store(store, config(serve(reply), concurrency=1), 1)
+
+
+def test_another_models_answers_are_not_taken(store, serve):
+    server = serve()
+    narrate_store(store, config(server), 1)
+    asked = len(server.asked)
+    other = TeacherConfig(name="served", url=server.url, model="other", concurrency=2)
+    narrate_store(store, other, 1)
+    assert len(server.asked) == 2 * asked
 
 
 def test_patience_ends_with_the_url(store, serve):
