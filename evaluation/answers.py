@@ -4,7 +4,7 @@ goes on from."""
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from torch import nn
 from tqdm import tqdm
 from transformers import ProcessorMixin
 
+from conf.runs import write_text
 from conf.schema import StudentConfig
 from data.frames import Frames
 from data.records import SelectionItem
@@ -41,27 +42,35 @@ class Answer:
 class AnswerLog:
     """The answers in a file, one JSON line each, below a line that says what was `measured`.
 
-    Answers of other weights or to other items are no answers to these: the file begins anew.
+    Answers of other weights or to other items are no answers to these: the file begins anew. Only
+    what was said is taken from it; what is right is judged again.
     """
 
-    def __init__(self, path: Path, measured: str) -> None:
+    def __init__(self, path: Path, measured: str, items: Sequence[SelectionItem]) -> None:
         self._path = path
         self.answers: dict[tuple[str, str], Answer] = {}
-        text = path.read_text() if path.exists() else ""
-        # What follows the last line's end was torn by a kill: that item is asked again.
-        head, *lines = text[: text.rfind("\n") + 1].splitlines() or [""]
+        item_of = {item.item_id: item for item in items}
+        text = path.read_text(errors="replace") if path.exists() else ""
+        head, *lines = text.splitlines() or [""]
         top = json.dumps({"measured": measured})
-        if head != top:
-            lines = []
-        path.write_text("".join(f"{line}\n" for line in [top, *lines]))
-        for line in lines:
-            answer = Answer(**json.loads(line))
+        for line in lines if head == top else []:
+            try:
+                row = json.loads(line)
+                answer = judge(item_of[row["item_id"]], row["mode"], row["text"])
+            except (ValueError, TypeError, KeyError):
+                # Torn by a kill: that item is asked again.
+                continue
             self.answers[answer.item_id, answer.mode] = answer
+        write_text(path, "".join([f"{top}\n", *map(_line, self.answers.values())]))
 
     def append(self, answers: list[Answer]) -> None:
         with open(self._path, "a") as file:
-            file.writelines(json.dumps(asdict(a)) + "\n" for a in answers)
+            file.writelines(map(_line, answers))
         self.answers |= {(a.item_id, a.mode): a for a in answers}
+
+
+def _line(answer: Answer) -> str:
+    return json.dumps(asdict(answer)) + "\n"
 
 
 def ask_all(
@@ -83,7 +92,7 @@ def ask_all(
         for group in _groups(waiting, batch):
             inputs = collator([selection_sample(i, mode, frames, cfg) for i in group])
             texts = generate(model, processor, inputs, limit, precision)
-            log.append([_judge(i, mode, t) for i, t in zip(group, texts, strict=True)])
+            log.append([judge(i, mode, t) for i, t in zip(group, texts, strict=True)])
             bar.update(len(group))
     return [log.answers[i.item_id, mode] for i in items]
 
@@ -101,7 +110,8 @@ def generate(
     return processor.tokenizer.batch_decode(new, skip_special_tokens=True)
 
 
-def _judge(item: SelectionItem, mode: str, text: str) -> Answer:
+def judge(item: SelectionItem, mode: str, text: str) -> Answer:
+    """What a text says to an item, and whether that is right."""
     choice = parse(text)
     reason = str(choice.reason) if choice.letter is None and choice.reason else None
     return Answer(item.item_id, mode, text, choice.letter, reason, choice.letter == item.letter)

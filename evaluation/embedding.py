@@ -8,6 +8,7 @@ import numpy as np
 from sentence_transformers import SentenceTransformer
 from tqdm import tqdm
 
+from conf.errors import UserError
 from conf.schema import RetrieverConfig
 from data.frames import Frames
 from data.records import FrameRef, RetrievalQuery
@@ -26,8 +27,14 @@ def rank_all(
     name: str,
 ) -> list[RetrievalRow]:
     """Rank the test database for every test query: a row a width, widest first. Scores are fp32
-    cosines of the embeddings' first `width` entries."""
+    cosines of the embeddings' first `width` entries.
+
+    Raises:
+        UserError: there is no test query.
+    """
     queries, database = store.retrieval("test"), store.database("test")
+    if not queries:
+        raise UserError(f"{store.folder} has no test queries of the retrieval track to measure on")
     asked = embed_queries(model, queries, frames, cfg, batch)
     shown = embed_frames(model, database, frames, cfg, batch)
     column = {frame: k for k, frame in enumerate(database)}
@@ -36,7 +43,7 @@ def rank_all(
     for width in cfg.widths:
         scores = normalise(asked[:, :width]) @ normalise(shown[:, :width]).T
         metrics = rank_metrics(scores, gold, RECALLS)
-        rows.append(RetrievalRow.of(name, width, metrics, len(queries), len(database)))
+        rows.append(RetrievalRow.of(store.name, name, width, metrics, len(queries), len(database)))
     return rows
 
 

@@ -73,14 +73,14 @@ def retrieval_figure(rows: Sequence[RetrievalRow], path: Path | str) -> None:
     from matplotlib.ticker import NullLocator
 
     rows = sorted((r for r in rows if r.width), key=lambda r: r.width)
-    names = sorted({r.name for r in rows}, key=lambda name: (name == UNTRAINED, name))
+    names = sorted({r.name for r in rows}, key=lambda name: (name.startswith(UNTRAINED), name))
     widths = sorted({r.width for r in rows})
     figure = empty_figure(9, 3.8)
     panels = figure.subplots(1, len(RECALLS), sharey=True)
     for axes, k in zip(panels, RECALLS, strict=True):
         for i, name in enumerate(names):
             points = [(r.width, 100 * getattr(r, f"recall_{k}")) for r in rows if r.name == name]
-            untrained = name == UNTRAINED
+            untrained = name.startswith(UNTRAINED)
             axes.plot(
                 *zip(*points, strict=True),
                 color=_color(name, i),
@@ -156,7 +156,7 @@ def item_figure(
 
 
 def _color(name: str, index: int) -> str:
-    return "#999999" if name == UNTRAINED else COLORS[index % len(COLORS)]
+    return "#999999" if name.startswith(UNTRAINED) else COLORS[index % len(COLORS)]
 
 
 def _number(axes: Axes, x: float, y: float, value: float) -> None:

@@ -34,20 +34,25 @@ def main(cfg: ReportCommand, run: Run) -> None:
         selection_table,
     )
 
-    choices = [SelectionRow.from_dict(r) for f in selected for r in _rows(f)]
-    ranks = [RetrievalRow(**r) for f in retrieved for r in _rows(f)]
-    ranks = list(dict.fromkeys(ranks))
     trained = [f for kind in ("sft", "contrastive") for f in _finished(root, kind)]
-    parts = [training_table(trained)] if trained else []
+    parts = [training_table(trained, root)] if trained else []
     pictures = [f / "curves.png" for f in trained]
-    if choices:
-        parts.append(selection_table(choices))
-        selection_figure(choices, run.folder / "selection.png")
-        pictures = [selected[-1] / "item.png", run.folder / "selection.png", *pictures]
-    if ranks:
-        parts.append(retrieval_table(ranks))
-        retrieval_figure(ranks, run.folder / "retrieval.png")
-        pictures.append(run.folder / "retrieval.png")
+    if selected:
+        pictures.insert(0, selected[-1] / "item.png")
+    # Measured on another benchmark is measured on other items: never in one table.
+    choices = [SelectionRow.from_dict(r) for f in selected for r in _rows(f)]
+    for benchmark in dict.fromkeys(r.benchmark for r in choices):
+        rows = [r for r in choices if r.benchmark == benchmark]
+        parts.append(f"benchmark {benchmark}\n{selection_table(rows)}")
+        pictures.insert(1, run.folder / f"selection-{benchmark}.png")
+        selection_figure(rows, pictures[1])
+    ranks = [RetrievalRow(**r) for f in retrieved for r in _rows(f)]
+    for benchmark in dict.fromkeys(r.benchmark for r in ranks):
+        # The same untrained row stands in the reports of several trained ones.
+        rows = list(dict.fromkeys(r for r in ranks if r.benchmark == benchmark))
+        parts.append(f"benchmark {benchmark}\n{retrieval_table(rows)}")
+        pictures.append(run.folder / f"retrieval-{benchmark}.png")
+        retrieval_figure(rows, pictures[-1])
     picture = run.folder / "report.png"
     compose_page([p for p in pictures if p.exists()], picture)
     page = "\n\n".join(parts) + f"\n\npicture: {picture}"
@@ -56,16 +61,22 @@ def main(cfg: ReportCommand, run: Run) -> None:
 
 
 def _finished(root: Path, command_name: str) -> list[Path]:
-    """The folders of a command's finished runs, oldest first."""
-    done = root.glob(f"{command_name}/*/metrics.json")
+    """The folders of a command's finished runs, a sweep's jobs among them, oldest first."""
+    done = [*root.glob(f"{command_name}/*/metrics.json")]
+    done += root.glob(f"{command_name}/*/*/metrics.json")
     return [p.parent for p in sorted(done, key=lambda p: p.stat().st_mtime)]
 
 
 def _rows(folder: Path) -> list[dict[str, Any]]:
-    return json.loads((folder / "report.json").read_text())["rows"]
+    try:
+        return json.loads((folder / "report.json").read_text())["rows"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{folder / 'report.json'} is missing or damaged: delete {folder} and measure again"
+        ) from error
 
 
-def training_table(runs: list[Path]) -> str:
+def training_table(runs: list[Path], root: Path) -> str:
     """What each run measured on held-out training scenes, at its start and at its end."""
     lines = [f"{'Training (held-out scenes)':<44}{'start':>10}{'end':>10}"]
     lines.append("-" * 64)
@@ -74,7 +85,7 @@ def training_table(runs: list[Path]) -> str:
         for name, value in metrics.items():
             start = metrics.get(f"{name}{AT_START}")
             if start is not None:
-                label = f"{folder.parent.name}/{folder.name} {name.replace('_', ' ')}"
+                label = f"{folder.relative_to(root)} {name.replace('_', ' ')}"
                 lines.append(f"{label:<44}{start:>10.3f}{value:>10.3f}")
     return "\n".join(lines)
 

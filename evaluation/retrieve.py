@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.retrieve", RetrieveCommand)
 def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
-    from evaluation.trained import settings_of
+    from evaluation.trained import run_title, settings_of
 
     folder = Path(cfg.model) if cfg.model is not None else None
     trained = settings_of(folder, ContrastiveCommand, "retriever") if folder else cfg
@@ -36,12 +36,13 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     rows: list[RetrievalRow] = []
     if folder is not None:
         log.info("ranking with the retriever of %s", folder)
+        backbone.check_base(folder, preset.model)
         model = retriever.load_trained(preset, precision, folder / "retriever")
-        rows += rank_all(model, preset, store, frames, cfg.batch, folder.name)
+        rows += rank_all(model, preset, store, frames, cfg.batch, run_title(folder))
     log.info("ranking with the untrained %s", preset.name)
     texts = retriever.corpus(store.retrieval("train"), preset)
     untrained = retriever.load_retriever(preset, precision, texts, run.folder / "untrained")
-    rows += rank_all(untrained, preset, store, frames, cfg.batch, UNTRAINED)
+    rows += rank_all(untrained, preset, store, frames, cfg.batch, f"{UNTRAINED} {preset.name}")
 
     table = retrieval_table(rows)
     log.info("%s", table)

@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.select", SelectCommand)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
-    from evaluation.trained import settings_of, weights_digest
+    from evaluation.trained import run_title, settings_of
 
     folder = Path(cfg.model) if cfg.model is not None else None
     trained = settings_of(folder, SftCommand, "student") if folder else cfg
@@ -36,13 +36,15 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
         raise UserError(f"{store.folder} has no test items of the selection track to measure on")
     backbone.keep_big_blocks()
     if folder is not None:
+        backbone.check_base(folder, student.model)
         model, processor = backbone.load_trained(student, precision, folder / "student")
     else:
         model, processor = backbone.load_base(student, precision, list)
-    name = folder.name if folder else f"{student.name} base"
+    name = run_title(folder) if folder else f"{student.name} base"
     frames = Frames(store, student.image_size)
-    weights = weights_digest(student.model, folder / "student" if folder else None)
-    journal = answers.AnswerLog(run.folder / "answers.jsonl", f"{weights} on {store.identity}")
+    weights = backbone.weights_digest(student.model, folder and folder / "student")
+    measured = f"{weights} on {store.identity}"
+    journal = answers.AnswerLog(run.folder / "answers.jsonl", measured, items)
     rows, subtypes, metrics = [], {}, {}
     for mode in cfg.modes:
         log.info("asking %s in %s mode", name, mode)
@@ -52,19 +54,17 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
         right = [float(a.right) for a in given]
         accuracy = accuracy_table([i.family for i in items], right)
         parsed = sum(a.letter is not None for a in given) / len(given)
-        rows.append(tables.SelectionRow.of(name, mode, accuracy, parsed))
-        subtypes[mode] = {
-            cell: vars(found)
-            for cell, found in accuracy_by([i.subtype for i in items], right).items()
-        }
+        rows.append(tables.SelectionRow.of(store.name, name, mode, accuracy, parsed))
+        subtypes[mode] = accuracy_by([f"{i.family}/{i.subtype}" for i in items], right)
         metrics |= {f"{mode}_{f}": found.value for f, found in accuracy.families.items()}
         metrics |= {f"{mode}_macro": accuracy.macro, f"{mode}_micro": accuracy.micro.value}
         metrics[f"{mode}_parse_rate"] = parsed
 
     table = tables.selection_table(rows)
     log.info("%s", table)
-    write_text(run.folder / "report.txt", table + "\n")
-    report = {"rows": [r.to_dict() for r in rows], "subtypes": subtypes}
+    write_text(run.folder / "report.txt", f"{table}\n\n{tables.subtype_table(subtypes)}\n")
+    cells = {mode: {c: vars(found) for c, found in by.items()} for mode, by in subtypes.items()}
+    report = {"rows": [r.to_dict() for r in rows], "subtypes": cells}
     write_text(run.folder / "report.json", json.dumps(report, indent=1))
     figures.selection_figure(rows, run.folder / "selection.png")
     answer = journal.answers[items[0].item_id, cfg.modes[0]]

@@ -13,19 +13,21 @@ from evaluation.metrics import Accuracy, Interval
 RECALLS = (1, 10, 50)
 """Cut-offs that the retrieval rows report."""
 UNTRAINED = "untrained"
-"""Name of the rows that a trained retriever is held against."""
+"""What the names of rows begin with that a trained retriever is held against."""
 
 NAME_WIDTH = 40
 
 
 @dataclass(frozen=True)
 class SelectionRow:
-    """One model on one selection suite, in shares. What could not be parsed counts as wrong.
+    """One model on one benchmark's selection items, in shares. What could not be parsed counts as
+    wrong.
 
     `mode` says how it was asked, such as answer, reasoning or similarity; `parse_rate` is None
     where nothing is parsed; `n` is the number of items.
     """
 
+    benchmark: str
     name: str
     mode: str
     families: dict[str, Interval]
@@ -35,8 +37,11 @@ class SelectionRow:
     n: int
 
     @classmethod
-    def of(cls, name: str, mode: str, found: Accuracy, parse_rate: float | None) -> SelectionRow:
-        return cls(name, mode, found.families, found.macro, found.micro, parse_rate, found.micro.n)
+    def of(
+        cls, benchmark: str, name: str, mode: str, found: Accuracy, parse_rate: float | None
+    ) -> SelectionRow:
+        shares = (found.families, found.macro, found.micro, parse_rate)
+        return cls(benchmark, name, mode, *shares, found.micro.n)
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -51,6 +56,7 @@ class SelectionRow:
 class RetrievalRow:
     """One retriever at one width (None for a pipeline without widths), recalls in shares."""
 
+    benchmark: str
     name: str
     width: int | None
     recall_1: float
@@ -64,12 +70,22 @@ class RetrievalRow:
 
     @classmethod
     def of(
-        cls, name: str, width: int | None, metrics: dict[str, float], queries: int, frames: int
+        cls,
+        benchmark: str,
+        name: str,
+        width: int | None,
+        metrics: dict[str, float],
+        queries: int,
+        frames: int,
     ) -> RetrievalRow:
         """From what `rank_metrics` gives with `ks=RECALLS`."""
         recalls = [metrics[f"recall@{k}"] for k in RECALLS]
         rest = [metrics[key] for key in ("mrr", "median_rank", "tie_rate")]
-        return cls(name, width, *recalls, *rest, queries, frames)
+        return cls(benchmark, name, width, *recalls, *rest, queries, frames)
+
+    @property
+    def untrained(self) -> bool:
+        return self.name.startswith(UNTRAINED)
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -96,9 +112,20 @@ def selection_table(rows: Sequence[SelectionRow]) -> str:
     return f"{table}\nIntervals are Wilson's; an answer that cannot be parsed is wrong."
 
 
+def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> str:
+    """Accuracy of each subtype (`family/subtype`) in each mode, with its interval and items."""
+    modes = list(subtypes)
+    rows = []
+    for cell in subtypes[modes[0]]:
+        found = [subtypes[mode][cell] for mode in modes]
+        shares = [f"{_percent(i.value)} [{_range(i)}]" for i in found]
+        rows.append([cell, *shares, str(found[0].n)])
+    return _table(["Accuracy by subtype, %", *modes, "Items"], {"": rows})
+
+
 def retrieval_table(rows: Sequence[RetrievalRow]) -> str:
     """The rows by width, widest first, each width's untrained row on top; then the paper's."""
-    ordered = sorted(rows, key=lambda r: (-(r.width or 0), r.name != UNTRAINED))
+    ordered = sorted(rows, key=lambda r: (-(r.width or 0), not r.untrained))
     own = [
         [
             _short(r.name, NAME_WIDTH),

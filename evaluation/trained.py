@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import TypeVar
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from conf.errors import UserError
-from data.store import digest
 
 Command = TypeVar("Command")
+
+
+def run_title(folder: Path) -> str:
+    """A run's name for a table; a sweep's job goes by the sweep and its number."""
+    return f"{folder.parent.name}/{folder.name}" if folder.name.isdigit() else folder.name
 
 
 def settings_of(folder: Path, schema: type[Command], product: str) -> Command:
@@ -20,33 +24,25 @@ def settings_of(folder: Path, schema: type[Command], product: str) -> Command:
 
     Raises:
         UserError: `folder` is no run folder, holds no finished `product` (student, retriever), or
-            settings that this version does not know.
+            settings that cannot be read.
     """
     config = folder / "config.yaml"
-    if not config.exists():
+    try:
+        there = OmegaConf.load(config)
+        if not OmegaConf.is_dict(there) or product not in there:
+            raise UserError(f"model={folder} trained no {product}: it is another command's")
+        if not (folder / "metrics.json").exists() or not (folder / product).is_dir():
+            raise UserError(
+                f"model={folder} is not finished: run its command again to go on with it"
+            )
+        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), there))
+    except FileNotFoundError as error:
         raise UserError(
             f"model={folder} is no run folder of a trained {product}: {config} is missing; give "
             "the folder that the training command named, below checkpoints/"
-        )
-    if not (folder / product).is_dir():
-        raise UserError(
-            f"model={folder} is not finished: {folder / product} is missing; run its command again "
-            "to go on with it"
-        )
-    try:
-        settings = OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.load(config))
-    except OmegaConfBaseException as error:
-        raise UserError(
-            f"{config} is of another version of DynaPix: {error.full_key} is not known; train again"
         ) from error
-    return OmegaConf.to_object(settings)
-
-
-def weights_digest(model: str | None, trained: Path | None) -> str:
-    """A short hash of every safetensors file of a model: of its base, where that is a folder, and
-    of what training wrote."""
-    whole = hashlib.sha256(str(model).encode())
-    for folder in (model, trained):
-        for path in sorted(Path(folder).rglob("*.safetensors")) if folder else []:
-            whole.update(digest(path).encode())
-    return whole.hexdigest()[:16]
+    except (YAMLError, OmegaConfBaseException) as error:
+        first = str(error).partition("\n")[0]
+        raise UserError(
+            f"{config} is damaged or of another version of DynaPix ({first}); train again"
+        ) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -93,13 +94,22 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
     whole = log.read_text()
     log.write_text(whole[: len(whole) * 2 // 3])
     measured = json.loads(whole.partition("\n")[0])["measured"]
-    assert 0 < len(AnswerLog(log, measured).answers) < 16
+    assert 0 < len(AnswerLog(log, measured, micro_store.selection("test")).answers) < 16
     select.main.__wrapped__(asked, run)
     assert (run.folder / "report.json").read_text() == told
     assert sorted(log.read_text().splitlines()) == sorted(whole.splitlines())
 
+    # What is right is judged anew, and a damaged line is asked again.
+    items = micro_store.selection("test")
+    edited = whole.replace('"right": false', '"right": true').splitlines()
+    log.write_text("\n".join([*edited[:4], "{", *edited[5:]]) + "\n")
+    kept = AnswerLog(log, measured, items).answers
+    assert len(kept) == 15
+    rights = {i.item_id: i.letter for i in items}
+    assert all(a.right == (a.letter == rights[a.item_id]) for a in kept.values())
+
     # Answers of other weights are not taken for these.
-    assert not AnswerLog(log, "another").answers
+    assert not AnswerLog(log, "another", micro_store.selection("test")).answers
 
     ranked = RetrieveCommand(
         benchmark=micro, retriever=RetrieverConfig(name="unused", model="unused"), store=store,
@@ -125,6 +135,38 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
 def test_a_model_that_is_no_run_is_named(tmp_path) -> None:
     with pytest.raises(UserError, match="is no run folder of a trained student"):
         settings_of(tmp_path / "nowhere", SftCommand, "student")
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda run: (run / "metrics.json").unlink(), "is not finished"),
+        (lambda run: (run / "config.yaml").write_text("student: [1"), "is damaged or of another"),
+        (lambda run: (run / "config.yaml").write_text(""), "trained no student"),
+        (lambda run: (run / "config.yaml").write_text("student: {rank: 1}"), "is damaged or of"),
+        (lambda run: (run / "config.yaml").write_text("retriever: {}"), "trained no student"),
+    ],
+)
+def test_a_run_that_cannot_be_measured_is_told(runs, tmp_path, damage, said) -> None:
+    shutil.copytree(runs / "sft" / "run", tmp_path / "run")
+    damage(tmp_path / "run")
+    with pytest.raises(UserError, match=said):
+        settings_of(tmp_path / "run", SftCommand, "student")
+
+
+def test_a_torn_model_is_named(runs, tmp_path) -> None:
+    folder = tmp_path / "student"
+    shutil.copytree(runs / "sft" / "run" / "student", folder)
+    weights = folder / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:1000])
+    cfg = StudentConfig(name="small", max_length=1500, **SHARED)
+    with pytest.raises(UserError, match="cannot be loaded from that folder"):
+        backbone.load_trained(cfg, "bf16", folder)
+    shutil.copytree(runs / "contrastive" / "run" / "retriever", tmp_path / "retriever")
+    (tmp_path / "retriever" / "model.safetensors").write_bytes(b"{")
+    cfg = RetrieverConfig(name="small", widths=[64, 32], **SHARED)
+    with pytest.raises(UserError, match="is damaged and cannot be read"):
+        retriever.load_trained(cfg, "bf16", tmp_path / "retriever")
 
 
 def test_nothing_to_report_says_what_to_run_first(tmp_path) -> None:

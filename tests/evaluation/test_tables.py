@@ -25,11 +25,12 @@ from train.plots import curves_figure
 @pytest.fixture(scope="module")
 def selection_rows() -> list[SelectionRow]:
     families = ["event"] * 20 + ["time"] * 30 + ["window"] * 50
+    quarter = [1, 0, 0, 0] * 25
     name = "a student with a name that is much too long for any table"
     return [
-        SelectionRow.of(UNTRAINED, "answer", accuracy_table(families, [1, 0, 0, 0] * 25), 0.9),
-        SelectionRow.of(name, "reasoning", accuracy_table(families, [1] * 100), 1.0),
-        SelectionRow.of("transfer", "similarity", accuracy_table(["event"], [1]), None),
+        SelectionRow.of("tiny", UNTRAINED, "answer", accuracy_table(families, quarter), 0.9),
+        SelectionRow.of("tiny", name, "reasoning", accuracy_table(families, [1] * 100), 1.0),
+        SelectionRow.of("tiny", "transfer", "similarity", accuracy_table(["event"], [1]), None),
     ]
 
 
@@ -38,7 +39,7 @@ def retrieval_rows() -> list[RetrievalRow]:
     scores, gold = np.random.default_rng(0).random((20, 10_000)), np.arange(20)
     metrics = rank_metrics(scores, gold, RECALLS)
     return [
-        RetrievalRow.of(name, width, metrics, 20, 10_000)
+        RetrievalRow.of("tiny", name, width, metrics, 20, 10_000)
         for name in ("contrastive", UNTRAINED)
         for width in (64, 4096, 256)
     ]
