@@ -231,8 +231,12 @@ class RetrieverConfig:
 
     def check(self) -> list[str]:
         problems = _backbone_problems("retriever", self)
-        if sorted(set(self.widths), reverse=True) != list(self.widths):
-            problems.append(f"retriever.widths={self.widths} must fall strictly, widest first")
+        falling = sorted(set(self.widths), reverse=True) == list(self.widths)
+        if not self.widths or not falling or self.widths[-1] < 1:
+            problems.append(
+                f"retriever.widths={self.widths} must be one or more widths that fall strictly, "
+                "widest first"
+            )
         return problems
 
 
@@ -357,6 +361,13 @@ class ContrastiveTrainConfig(TrainConfig):
                 f"train.accumulation={self.accumulation}: the cached loss already splits "
                 "train.batch into train.mini_batch, leave train.accumulation=1"
             )
+        if self.micro_batch != 1:
+            problems.append(
+                f"train.micro_batch={self.micro_batch}: a retriever's step is train.batch queries, "
+                "of which train.mini_batch pass the model at once; leave train.micro_batch=1"
+            )
+        if self.scale <= 0:
+            problems.append(f"train.scale={self.scale} must be above 0")
         if not 1 <= self.mini_batch <= self.batch:
             problems.append(
                 f"train.mini_batch={self.mini_batch} must lie between 1 and "
@@ -442,8 +453,8 @@ class SelectCommand(CommandConfig):
 
     def check(self) -> list[str]:
         problems = super().check() + _too_small(self, "", {"batch": 1, "limit": 1})
-        if not self.modes or not set(self.modes) <= {"reasoning", "answer"}:
-            problems.append(f"modes={self.modes}: the options are reasoning and answer")
+        if sorted(self.modes) not in (["answer"], ["reasoning"], ["answer", "reasoning"]):
+            problems.append(f"modes={self.modes}: give reasoning, answer or both, each once")
         return problems
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
+import json
 import re
 import sys
 import warnings
@@ -11,6 +13,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import torch
+from safetensors import SafetensorError
 from torch import nn
 from transformers import (
     AutoModelForImageTextToText,
@@ -22,6 +25,7 @@ from transformers import (
 from transformers.utils import logging as transformers_logging
 
 from conf.errors import UserError
+from conf.runs import write_json
 from conf.schema import LoraConfig, RetrieverConfig, StudentConfig
 from train.tiny import build_model, build_processor
 
@@ -29,6 +33,10 @@ UNQUANTIZED = ["model.visual", "visual", "lm_head"]
 """Modules that keep their precision. Matching is anchored at the name's start, so the tower is
 named both as it stands in the generative model and in the bare one."""
 DTYPES = {"bf16": torch.bfloat16, "fp32": torch.float32}
+UNREADABLE = (OSError, ValueError, KeyError, TypeError, SafetensorError)
+"""What the libraries raise at files that are missing, cut or of another kind."""
+BASE = "base.json"
+MEBIBYTE = 1 << 20
 TOWERS = ("vision", "language", "embeddings and head")
 
 Corpus = Callable[[], Iterable[str]]
@@ -66,7 +74,7 @@ def load_base(
             use_safetensors=True,
             **origin,
         )
-    except (OSError, ValueError) as error:
+    except UNREADABLE as error:
         raise load_failure("student", cfg.model, error) from error
     pin_sizes(processor, cfg.image_size, cfg.frames)
     processor.tokenizer.padding_side = "left"
@@ -111,6 +119,14 @@ def load_failure(group: str, model: str, error: Exception) -> UserError:
         f"folder of that name, and the hub's cache does not hold it. Point at a local copy with "
         f"{group}.model=FOLDER (config.json, *.safetensors, tokenizer and processor files), or "
         f"fetch it where there is a network with: hf download {model}"
+    )
+
+
+def damaged(folder: Path, error: Exception) -> UserError:
+    """What to tell a user whose trained model cannot be read back."""
+    first = next(iter(str(error).strip().splitlines()), type(error).__name__)
+    return UserError(
+        f"{folder} is damaged and cannot be read ({first}): delete the run's folder and train again"
     )
 
 
@@ -181,12 +197,46 @@ def load_trained(
         if not (weights := folder / "adapter_model.safetensors").exists():
             raise UserError(f"{folder} holds no student: {weights} is missing")
         base, processor = load_base(cfg, precision, list)
-        return peft.PeftModel.from_pretrained(base, folder).eval(), processor
+        try:
+            return peft.PeftModel.from_pretrained(base, folder).eval(), processor
+        except UNREADABLE as error:
+            raise damaged(folder, error) from error
     whole = replace(
         cfg, model=str(folder), architecture=None, quantization="none", lora=LoraConfig(rank=0)
     )
     model, processor = load_base(whole, precision, list)
     return model.eval(), processor
+
+
+def weights_digest(*models: str | Path | None) -> str:
+    """A short hash of the safetensors of models in folders, by each file's name, size and last
+    mebibyte, which training changes; a hub's name stands for itself."""
+    whole = hashlib.sha256()
+    for model in models:
+        whole.update(str(model).encode())
+        for path in sorted(Path(model).rglob("*.safetensors")) if model else []:
+            size = path.stat().st_size
+            with open(path, "rb") as file:
+                file.seek(max(0, size - MEBIBYTE))
+                whole.update(f"{path.name} {size}".encode() + file.read())
+    return whole.hexdigest()[:16]
+
+
+def note_base(folder: Path, model: str | None) -> None:
+    """Note in a run's folder which weights it is trained over, and hold them to an earlier note:
+    a run that goes on goes on over the same."""
+    check_base(folder, model)
+    write_json(folder / BASE, weights_digest(model))
+
+
+def check_base(folder: Path, model: str | None) -> None:
+    """Raises UserError where a run's base is not the one that it was trained over."""
+    note = folder / BASE
+    if note.exists() and json.loads(note.read_text()) != weights_digest(model):
+        raise UserError(
+            f"the weights in {model} are not those that {folder} is trained over: put those back, "
+            "or delete that run and train again"
+        )
 
 
 def save(model: nn.Module, processor: ProcessorMixin, folder: Path, precision: str) -> None:

@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 
 from conf.entry import Run, command
+from conf.errors import UserError
 from conf.runs import finished
 from conf.schema import ContrastiveCommand
 
@@ -27,6 +28,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
         SentenceTransformerTrainer,
         SentenceTransformerTrainingArguments,
     )
+    from sentence_transformers.base.sampler import BatchSamplers
     from sentence_transformers.sentence_transformer.losses import (
         CachedMultipleNegativesRankingLoss,
         MatryoshkaLoss,
@@ -50,8 +52,15 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     validation = shuffled([q for q in queries if q.scene_id in held_out], cfg.seed)
     validation = validation[: cfg.train.validation_queries]
     loop.check_not_empty(len(training), "training queries")
+    loop.check_not_empty(len(validation), "queries of held-out training scenes")
+    if len(training) < cfg.train.batch:
+        raise UserError(
+            f"train.batch={cfg.train.batch} is more than the {len(training)} training queries of "
+            f"{store.folder}: lower it"
+        )
 
     log.info("loading retriever %s", cfg.retriever.name)
+    backbone.note_base(run.folder, cfg.retriever.model)
     model = retriever.load_retriever(
         cfg.retriever,
         cfg.train.precision,
@@ -68,12 +77,11 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
         ),
         matryoshka_dims=list(cfg.retriever.widths),
     )
-    count = cfg.train.hard_negatives
+    rows = [retriever.row(q, cfg.train.hard_negatives) for q in training]
     collator = retriever.LateFrames(
-        preprocess_fn=model.preprocess, prompts=retriever.column_prompts(cfg.retriever, count)
+        preprocess_fn=model.preprocess, prompts=retriever.column_prompts(cfg.retriever, rows[0])
     )
     collator.resolve(training, frames, cfg.retriever)
-    rows = Dataset.from_list([{"query": k, "negatives": count} for k in range(len(training))])
     checkpoint = loop.newest_checkpoint(run.folder)
     trainer = SentenceTransformerTrainer(
         model=model,
@@ -81,8 +89,10 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
             **loop.arguments(cfg.train, run, cfg.seed, checkpoint),
             per_device_train_batch_size=cfg.train.batch,
             dataloader_drop_last=True,
+            # A frame that two rows name would be a negative of itself.
+            batch_sampler=BatchSamplers.NO_DUPLICATES,
         ),
-        train_dataset=rows,
+        train_dataset=Dataset.from_list(rows),
         evaluator=ranking,
         loss=loss,
         data_collator=collator,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.entry import Run
 from conf.errors import UserError
+from conf.runs import write_text
 from conf.schema import TrainConfig
 from conf.sweep import AT_START
 from train.plots import curves_figure
@@ -118,7 +120,7 @@ class Journal(TrainerCallback):
         kept = [r for r in read_journal(self._path.parent) if r["step"] <= state.global_step]
         resumed = state.global_step > 0
         lines = [json.dumps(r) + "\n" for r in kept] if resumed else []
-        self._path.write_text("".join(lines))
+        write_text(self._path, "".join(lines))
 
     def on_log(self, args, state: TrainerState, control: TrainerControl, logs=None, **_) -> None:
         values = {k: v for k, v in (logs or {}).items() if not k.endswith(UNSHARED)}
@@ -149,27 +151,29 @@ class Bar(ProgressCallback):
 
 
 def read_journal(folder: Path) -> list[dict[str, Any]]:
-    """The lines of a run's metrics.jsonl; a torn last line, left by a kill, is passed over."""
+    """The lines of a run's metrics.jsonl; one torn by a kill is passed over."""
     path = folder / JOURNAL
     if not path.exists():
         return []
     records = []
-    for line in path.read_text().splitlines():
+    for line in path.read_text(errors="replace").splitlines():
         try:
-            records.append(json.loads(line))
-        except json.JSONDecodeError:
+            record = json.loads(line)
+        except ValueError:
             continue
+        if isinstance(record, dict) and "step" in record:
+            records.append(record)
     return records
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
     """The newest whole checkpoint below a run's folder. The trainer writes its state last, so a
     checkpoint without a readable one was cut off."""
-    numbered = [(int(p.name.rpartition("-")[2]), p) for p in folder.glob("checkpoint-*")]
-    for _, path in sorted(numbered, reverse=True):
+    named = [(re.fullmatch(r"checkpoint-(\d+)", p.name), p) for p in folder.glob("checkpoint-*")]
+    for _, path in sorted(((int(m[1]), p) for m, p in named if m), reverse=True):
         try:
             json.loads((path / "trainer_state.json").read_text())
-        except (OSError, json.JSONDecodeError):
+        except (OSError, ValueError):
             continue
         return path
     return None
@@ -179,6 +183,6 @@ def check_not_empty(samples: int, what: str) -> None:
     """Raises UserError where nothing is left to train on."""
     if samples == 0:
         raise UserError(
-            f"there are no {what}: look at the shortfalls that python -m data.build prints and at "
-            "the rejects that python -m teacher.narrate prints"
+            f"there are no {what} to train on or measure: look at the shortfalls that python -m "
+            "data.build prints and at the rejects that python -m teacher.narrate prints"
         )

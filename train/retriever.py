@@ -7,6 +7,7 @@ saved is a plain `SentenceTransformer`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,9 @@ from data.frames import Frames
 from data.records import FPS, FRAMES, FrameRef, RetrievalQuery, shown_frames
 from train.backbone import (
     DTYPES,
+    UNREADABLE,
     check_reachable,
+    damaged,
     keep_differentiable,
     load_failure,
     nf4_config,
@@ -63,7 +66,7 @@ def load_retriever(
             config_kwargs=origin,
             processing_kwargs=PROCESSING,
         )
-    except (OSError, ValueError) as error:
+    except UNREADABLE as error:
         raise load_failure("retriever", cfg.model, error) from error
     pin_sizes(backbone.processor, cfg.image_size, cfg.frames)
     width = backbone.get_embedding_dimension()
@@ -92,13 +95,20 @@ def load_retriever(
 
 def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> SentenceTransformer:
     """The retriever that `train.contrastive` saved in `folder`, its adapters over the same 4-bit
-    weights that they were trained on."""
-    return SentenceTransformer(
-        str(folder),
-        model_kwargs=weight_options(cfg, precision),
-        trust_remote_code=cfg.trust_remote_code,
-        local_files_only=True,
-    )
+    weights that they were trained on.
+
+    Raises:
+        UserError: `folder` holds no whole retriever, or its base is not on this machine.
+    """
+    try:
+        return SentenceTransformer(
+            str(folder),
+            model_kwargs=weight_options(cfg, precision),
+            trust_remote_code=cfg.trust_remote_code,
+            local_files_only=True,
+        )
+    except UNREADABLE as error:
+        raise damaged(folder, error) from error
 
 
 def weight_options(cfg: RetrieverConfig, precision: str) -> dict[str, Any]:
@@ -144,24 +154,31 @@ class LateFrames(SentenceTransformerDataCollator):
     batch is made."""
 
     def resolve(self, queries: list[RetrievalQuery], frames: Frames, cfg: RetrieverConfig) -> None:
-        """Say what the rows' numbers stand for."""
-        self._queries, self._frames, self._cfg = queries, frames, cfg
+        """Say what the rows' names stand for."""
+        self._queries = {q.query_id: q for q in queries}
+        self._frames, self._cfg = frames, cfg
 
-    def __call__(self, features: list[dict[str, int]]) -> dict[str, Any]:
-        return super().__call__([self._row(f["query"], f["negatives"]) for f in features])
+    def __call__(self, features: list[dict[str, str]]) -> dict[str, Any]:
+        return super().__call__([self._loaded(f) for f in features])
 
-    def _row(self, index: int, negatives: int) -> dict[str, Any]:
-        query = self._queries[index]
-        row = {
+    def _loaded(self, names: dict[str, str]) -> dict[str, Any]:
+        query = self._queries[names["query"]]
+        shown = [query.target, *query.hard_negatives]
+        columns = [column for column in names if column != "query"]
+        return {
             "query": query_input(query, self._frames, self._cfg),
-            "target": frame_input(query.target, self._frames),
+            **{c: frame_input(f, self._frames) for c, f in zip(columns, shown, strict=False)},
         }
-        for k, frame in enumerate(query.hard_negatives[:negatives]):
-            row[f"negative_{k}"] = frame_input(frame, self._frames)
-        return row
 
 
-def column_prompts(cfg: RetrieverConfig, negatives: int) -> dict[str, str]:
+def row(query: RetrievalQuery, negatives: int) -> dict[str, str]:
+    """A query, its target and so many of its hard negatives, by name."""
+    shown = [query.target, *query.hard_negatives[:negatives]]
+    columns = ["target", *(f"negative_{k}" for k in range(negatives))]
+    names = [f"{f.scene_id}/{f.frame}" for f in shown]
+    return {"query": query.query_id, **dict(zip(columns, names, strict=True))}
+
+
+def column_prompts(cfg: RetrieverConfig, columns: Iterable[str]) -> dict[str, str]:
     """The instruction of each of a row's columns."""
-    frames = ["target", *(f"negative_{k}" for k in range(negatives))]
-    return {"query": cfg.query_instruction, **dict.fromkeys(frames, cfg.frame_instruction)}
+    return dict.fromkeys(columns, cfg.frame_instruction) | {"query": cfg.query_instruction}

@@ -38,6 +38,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
     log.info("loading student %s", cfg.student.name)
+    backbone.note_base(run.folder, cfg.student.model)
     model, processor = backbone.load_student(
         cfg.student, cfg.train.precision, lambda: samples.corpus(store, rationales)
     )
@@ -46,6 +47,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         loop.check_not_empty(len(rationales), f"accepted rationales of teacher {cfg.teacher.name}")
     training, validation = samples.splits(store, rationales, cfg, frames)
     loop.check_not_empty(len(training), f"samples for train.regime={cfg.train.regime}")
+    loop.check_not_empty(sum(map(len, validation.values())), "items of held-out training scenes")
     collator = Collator(processor, cfg.student.max_length)
     longest = training.longest(processor.tokenizer)
     log.info(audit(model, processor, cfg.student, longest, collator))

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from conf.entry import Run
+from conf.errors import UserError
 from conf.schema import (
     ContrastiveCommand,
     ContrastiveTrainConfig,
@@ -18,6 +20,7 @@ from conf.schema import (
     TeacherConfig,
 )
 from train import contrastive, sft
+from train.backbone import check_base, note_base
 from train.loop import newest_checkpoint, read_journal
 
 
@@ -78,6 +81,50 @@ def test_a_student_goes_on_as_if_undisturbed(sft_settings, tmp_path) -> None:
     same_weights(*(f / "student" / "adapter_model.safetensors" for f in (whole, killed)))
     same_journals(whole, killed)
     assert (whole / "curves.png").stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_a_token_weighs_the_same_however_a_batch_is_split(sft_settings, tmp_path) -> None:
+    """The first step's loss and gradient of four unequal samples, at once and one by one."""
+    first = []
+    for micro_batch in (4, 1):
+        split = {"micro_batch": micro_batch, "accumulation": 4 // micro_batch}
+        train = replace(sft_settings.train, max_steps=1, validation_items=1, **split)
+        run = Run(f"by {micro_batch}", tmp_path / str(micro_batch))
+        run.folder.mkdir()
+        sft.main.__wrapped__(replace(sft_settings, train=train), run)
+        first.append(next(r for r in read_journal(run.folder) if "grad_norm" in r))
+    assert first[0]["loss"] == pytest.approx(first[1]["loss"], rel=1e-4)
+    assert first[0]["grad_norm"] == pytest.approx(first[1]["grad_norm"], rel=1e-3)
+
+
+def test_a_run_holds_to_its_base(saved_base, tmp_path) -> None:
+    base = tmp_path / "base"
+    shutil.copytree(saved_base, base)
+    note_base(tmp_path, str(base))
+    check_base(tmp_path, str(base))
+    weights = load_file(base / "model.safetensors")
+    changed = {name: weight + 1e-3 for name, weight in weights.items()}
+    save_file(changed, base / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(UserError, match="are not those that"):
+        check_base(tmp_path, str(base))
+
+
+def test_a_batch_beyond_the_queries_is_refused(contrastive_settings, tmp_path) -> None:
+    train = replace(contrastive_settings.train, batch=5000)
+    settings = replace(contrastive_settings, train=train)
+    with pytest.raises(UserError, match=r"train\.batch=5000 is more than the \d+ training queries"):
+        contrastive.main.__wrapped__(settings, Run("run", tmp_path))
+
+
+def test_other_folders_are_no_checkpoints(tmp_path) -> None:
+    for name in ("checkpoint-best", "checkpoint-10-old", "checkpoint-7"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "trainer_state.json").write_text("{}")
+    (tmp_path / "checkpoint-9").mkdir()
+    assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-7"
+    (tmp_path / "metrics.jsonl").write_bytes(b'3\n{"step": 1, "loss": 2}\n\xff\n{"step": 2, "lo')
+    assert read_journal(tmp_path) == [{"step": 1, "loss": 2}]
 
 
 @pytest.mark.slow
