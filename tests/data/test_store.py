@@ -55,6 +55,7 @@ def test_two_builds_are_the_same_bytes_whatever_the_workers(built, tmp_path) -> 
     assert contents(tmp_path / "small") == contents(built)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["scenes", "frames"])
 def test_a_killed_build_goes_on_to_the_same_bytes(built, tmp_path, part) -> None:
     code = (
