@@ -167,27 +167,56 @@ def _pixels_around(
     return columns.ravel().astype(float), rows.ravel().astype(float)
 
 
+def on_screen(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """(F, N, 2) where objects stand in px at 336 x 336, and (F, N) whether their centre shows."""
+    places = scene.image_positions * (MODEL_SIZE / np.array(scene.image_size))
+    inside = (places >= 0).all(-1) & (places <= MODEL_SIZE).all(-1)
+    return places, scene.in_view & inside
+
+
 @lru_cache(maxsize=64)
-def displacements(scene: Scene) -> np.ndarray:
-    """(F, F) how far two frames of a scene are apart: the largest image displacement of an object
-    between them, px at 336 x 336, the image's diagonal at most.
+def displacements(scene: Scene, about: tuple[int, ...] | None = None) -> np.ndarray:
+    """(F, F) how far two frames of a scene are apart: the largest image displacement between them
+    of an object (of one in `about`, where that is given), px at 336 x 336, the image's diagonal at
+    most.
 
     An object counts where its centre is on screen in at least one of the two frames, so that a
     sliver at the edge tells no frames apart.
     """
-    width, height = scene.image_size
-    places = scene.image_positions * (MODEL_SIZE / np.array([width, height]))
-    on_screen = scene.in_view & (places >= 0).all(-1) & (places <= MODEL_SIZE).all(-1)
+    places, shown = on_screen(scene)
+    if about is not None:
+        places, shown = places[:, about], shown[:, about]
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
-    counts = on_screen[:, None] | on_screen[None]
+    counts = shown[:, None] | shown[None]
     return np.minimum(np.where(counts, apart, 0.0).max(axis=-1), DIAGONAL)
 
 
-def object_match(scene: Scene, target: int) -> np.ndarray:
-    """(F,) how unlike `target` each frame of a scene looks, 0 for itself: the mean over objects of
-    the image-plane displacement as a share of the image's diagonal, where an object in view in
-    only one of the two counts as 1 and one in view in neither as 0."""
+def displacement_across(scene: Scene, frame: int, other: Scene, other_frame: int) -> float:
+    """How far frames of two scenes are apart: as `displacements` over objects that look alike. One
+    that shows and is in only one of the scenes makes them as far apart as can be."""
+    here, there = _shown_at(scene, frame), _shown_at(other, other_frame)
+    apart = 0.0
+    for look in here.keys() | there.keys():
+        (place, shown), (other_place, other_shown) = (
+            side.get(look, (np.full(2, np.inf), False)) for side in (here, there)
+        )
+        if shown or other_shown:
+            apart = max(apart, float(np.linalg.norm(place - other_place)))
+    return min(apart, DIAGONAL)
+
+
+def _shown_at(scene: Scene, frame: int) -> dict[SceneObject, tuple[np.ndarray, bool]]:
+    places, shown = on_screen(scene)
+    return {o: (places[frame, k], bool(shown[frame, k])) for k, o in enumerate(scene.objects)}
+
+
+def object_match(scene: Scene, target: int, about: tuple[int, ...] | None = None) -> np.ndarray:
+    """(F,) how unlike `target` each frame of a scene looks, 0 for itself: the mean over objects
+    (those in `about`, where that is given) of the image-plane displacement as a share of the
+    image's diagonal, where an object in view in only one of the two counts as 1 and one in view in
+    neither as 0."""
     apart = np.linalg.norm(scene.image_positions - scene.image_positions[target], axis=-1)
     share = np.minimum(apart / np.hypot(*scene.image_size), 1.0)
     seen, seen_too = scene.in_view, scene.in_view[target]
-    return np.where(seen & seen_too, share, seen ^ seen_too).mean(axis=-1)
+    unlike = np.where(seen & seen_too, share, seen ^ seen_too)
+    return (unlike if about is None else unlike[:, about]).mean(axis=-1)

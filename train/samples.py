@@ -14,7 +14,7 @@ from transformers import PreTrainedTokenizerBase
 
 from conf.schema import SftCommand, StudentConfig
 from data.frames import Frames
-from data.records import LETTERS, Rationale, SelectionItem
+from data.records import LETTERS, Rationale, Scene, SelectionItem
 from data.store import Store
 from teacher.predicates import OUT, region_of
 from teacher.template import describe
@@ -130,22 +130,22 @@ def looks(
     for item in store.selection("train"):
         if item.scene_id not in scenes:
             continue
-        scene = store.scene(item.scene_id)
-        shown = [
-            [region_of(scene, c.frame, k) for k in range(len(scene.objects))]
-            for c in item.candidates
-        ]
+        shown = [_regions(store.scene(c.scene_id), c.frame) for c in item.candidates]
         telling = [
-            (letter, f"the {look.phrase} {shown[at][k]}")
-            for at, letter in enumerate(LETTERS)
-            for k, look in enumerate(scene.objects)
-            if shown[at][k] != OUT and sum(row[k] == shown[at][k] for row in shown) == 1
+            (letter, f"the {look} {region}")
+            for letter, regions in zip(LETTERS, shown, strict=True)
+            for look, region in regions.items()
+            if region != OUT and sum(other.get(look) == region for other in shown) == 1
         ]
         for letter, what in shuffled(telling, seed)[:LOOKS]:
             asked = replace(item, question=f"Which candidate shows {what}?")
             text = f"Candidate {letter} shows {what}.\n{answer_line(letter)}"
             made.append(_asked(asked, "answer", frames, cfg, text))
     return made
+
+
+def _regions(scene: Scene, frame: int) -> dict[str, str]:
+    return {o.phrase: region_of(scene, frame, k) for k, o in enumerate(scene.objects)}
 
 
 def splits(

@@ -7,17 +7,18 @@ at most one item of a cell from a scene. `fill` draws scenes until a cell has it
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from conf.schema import Quota
-from data.geometry import DIAGONAL, displacements
-from data.records import SPLITS, Candidate, Scene, SelectionItem
+from data.geometry import displacement_across, displacements
+from data.records import SPLITS, Candidate, FrameRef, Scene, SelectionItem
 
-BUILDERS_VERSION = "2"
+BUILDERS_VERSION = "3"
 """Of the items' and queries' builders: changes whenever the same scenes would give others."""
 
 
@@ -40,35 +41,56 @@ class Draft:
 class Picker:
     """Picks distractors that can be told apart, and counts the targets for which it could not.
 
-    `least` is the least displacement between two candidates (px at 336 x 336, in some object).
+    `least` is the least displacement between two candidates (px at 336 x 336, in some object);
+    `scene_ids` are the scenes of the split, to which cross-scene distractors keep.
     """
 
     least: float
+    scene_ids: list[str]
+    scene_of: Callable[[str], Scene]
     dropped: int = 0
 
     def pick(
-        self, scene: Scene, target: int, pool: Iterable[int]
-    ) -> tuple[list[int], float] | None:
-        """The first three frames of `pool` that can be told apart from the target and each other,
-        and the least displacement among the four; None where there are no such three."""
-        apart = displacements(scene)
-        chosen = [target]
-        for frame in pool:
-            if apart[frame, chosen].min() >= self.least:
-                chosen.append(int(frame))
-                if len(chosen) == 4:
-                    among = apart[np.ix_(chosen, chosen)][np.triu_indices(4, 1)]
-                    return chosen[1:], float(min(among.min(), DIAGONAL))
+        self,
+        target: FrameRef,
+        pool: Iterable[Candidate],
+        about: tuple[int, ...] | None = None,
+    ) -> tuple[tuple[Candidate, ...], float] | None:
+        """The first three of `pool` that can be told apart from the target and each other, by one
+        of the objects `about` where those are given, and the least displacement between any two of
+        the four; None where there are no such three."""
+        chosen: list[FrameRef] = [target]
+        for candidate in pool:
+            if all(self._apart(candidate, c, about) >= self.least for c in chosen):
+                chosen.append(candidate)
+            if len(chosen) == 4:
+                least = min(self._apart(a, b, None) for a, b in combinations(chosen, 2))
+                return tuple(chosen[1:]), least
         self.dropped += 1
         return None
+
+    def _apart(self, one: FrameRef, two: FrameRef, about: tuple[int, ...] | None) -> float:
+        scene = self.scene_of(one.scene_id)
+        if one.scene_id == two.scene_id:
+            return float(displacements(scene, about)[one.frame, two.frame])
+        return displacement_across(scene, one.frame, self.scene_of(two.scene_id), two.frame)
+
+    def others(self, scene: Scene, rng: np.random.Generator, count: int) -> list[Scene]:
+        """So many other scenes of the split in a random order, those that share most of the
+        scene's objects first."""
+        drawn = rng.choice(self.scene_ids, min(count + 1, len(self.scene_ids)), replace=False)
+        scenes = [self.scene_of(str(name)) for name in drawn if name != scene.scene_id]
+        looks = set(scene.objects)
+        return sorted(scenes, key=lambda s: -len(looks & set(s.objects)))
 
 
 Draw = Callable[[Scene, np.random.Generator, Picker], Draft | None]
 """Makes at most one draft of a cell from a scene."""
 
 
-def same_scene(scene: Scene, frames: Sequence[int], source: str) -> tuple[Candidate, ...]:
-    return tuple(Candidate(scene.scene_id, frame, source) for frame in frames)
+def of_scene(scene: Scene, frames: Iterable[int], source: str) -> Iterator[Candidate]:
+    """Frames of a scene as candidates."""
+    return (Candidate(scene.scene_id, int(frame), source) for frame in frames)
 
 
 def fill(
@@ -83,8 +105,9 @@ def fill(
     """Items of one cell up to its quota in each split, at most one a scene, scenes in a seeded
     order, and how many targets were dropped for want of distractors that can be told apart. What
     falls short is the caller's to report."""
-    items, picker = [], Picker(least)
+    items, dropped = [], 0
     for split in SPLITS:
+        picker = Picker(least, scene_ids[split], scene_of)
         rng = cell_rng(seed, subtype, split)
         drafts: list[Draft] = []
         for index in rng.permutation(len(scene_ids[split])):
@@ -97,7 +120,8 @@ def fill(
         # random letter, or the last letter would be right in fewer cells than the first.
         positions = rng.permutation((np.arange(len(drafts)) + rng.integers(4)) % 4)
         items += [finish(d, int(p), rng) for d, p in zip(drafts, positions, strict=True)]
-    return items, picker.dropped
+        dropped += picker.dropped
+    return items, dropped
 
 
 def finish(draft: Draft, position: int, rng: np.random.Generator) -> SelectionItem:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from data.records import SELECTION_SECOND, Scene
-from data.selection.drafts import Draft, Picker, same_scene
+from data.records import SELECTION_SECOND, FrameRef, Scene
+from data.selection.drafts import Draft, Picker, of_scene
 
 CELLS = {"in_1s": 1, "in_2s": 2}
 """Seconds from the observation's end to the target, by subtype."""
@@ -25,10 +25,11 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) 
     seconds = CELLS[subtype]
     start, stop = 0, SELECTION_SECOND - 1
     target = start + SELECTION_SECOND + SELECTION_SECOND * seconds
-    picked = picker.pick(scene, target, rng.permutation(np.arange(stop + 1, scene.frames)))
+    later = rng.permutation(np.arange(stop + 1, scene.frames))
+    pool = of_scene(scene, later[later != target], "same_time")
+    picked = picker.pick(FrameRef(scene.scene_id, target), pool)
     if picked is None:
         return None
-    frames, apart = picked
     return Draft(
         scene,
         "time",
@@ -36,7 +37,6 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) 
         question(seconds),
         (start, stop),
         target,
-        same_scene(scene, frames, "same_time"),
-        apart,
+        *picked,
         {"distractors": "same_time", "horizon": target - stop},
     )

@@ -1,8 +1,9 @@
 """The window family: which frame shows the scene a short horizon after the observation.
 
 A cell is a group by what happens ahead, a family that says what the item is built around (A: the
-whole scene), a horizon in frames, and a difficulty: hard keeps the frames most alike to the target
-among those that can still be told apart, easy the least alike.
+whole scene, B: the pair of the next collision, C: the object that moves most), a horizon in frames,
+and a difficulty: hard keeps the frames most alike to the target among those that can still be told
+apart, easy the least alike. Alike and apart go by the objects that the item is built around.
 """
 
 from __future__ import annotations
@@ -12,16 +13,17 @@ from itertools import product
 
 import numpy as np
 
-from data.events import window_group
-from data.geometry import object_match
-from data.records import Scene
-from data.selection.drafts import Draft, Picker, same_scene
+from data.events import collisions_in, window_group
+from data.geometry import object_match, on_screen
+from data.records import FrameRef, Scene
+from data.selection.drafts import Draft, Picker, of_scene
 
 QUESTION = "Which image best matches the next scene state?"
 PREFIX_FRAMES = 16
 HORIZONS = (8, 16, 24)
 DIFFICULTIES = ("easy", "hard")
-FAMILIES_OF_GROUP = {"G1": "A", "G2": "A", "G3": "A", "G4": "A"}
+FAMILIES_OF_GROUP = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
+"""Family B needs a collision ahead, family C leaves out G4 (paper, Window-anchored)."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +51,16 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) 
         if window_group(scene, start, stop, cell.horizon) != cell.group:
             continue
         target = stop + cell.horizon
-        unlike = np.argsort(object_match(scene, target), kind="stable")
+        about = built_around(cell, scene, stop, target)
+        if about == ():
+            continue
+        unlike = np.argsort(object_match(scene, target, about), kind="stable")
         pool = unlike if cell.difficulty == "hard" else unlike[::-1]
         source = "same_near" if cell.difficulty == "hard" else "same_far"
-        picked = picker.pick(scene, target, pool[pool != target])
+        wrong = of_scene(scene, pool[pool != target], source)
+        picked = picker.pick(FrameRef(scene.scene_id, target), wrong, about)
         if picked is None:
             continue
-        frames, apart = picked
         return Draft(
             scene,
             "window",
@@ -63,8 +68,7 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) 
             QUESTION,
             (start, stop),
             target,
-            same_scene(scene, frames, source),
-            apart,
+            *picked,
             {
                 "distractors": source,
                 "horizon": cell.horizon,
@@ -74,3 +78,17 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) 
             },
         )
     return None
+
+
+def built_around(cell: WindowCell, scene: Scene, stop: int, target: int) -> tuple[int, ...] | None:
+    """The objects that an item is built around: None for the whole scene, none at all where the
+    stretch ahead has nothing of the kind."""
+    if cell.window_family == "A":
+        return None
+    if cell.window_family == "B":
+        ahead = collisions_in(scene, stop + 1, target)
+        return ahead[0].objects if ahead else ()
+    places, shown = on_screen(scene)
+    moved = np.linalg.norm(places[target] - places[stop], axis=-1)
+    moved[~(shown[target] & shown[stop])] = 0
+    return (int(moved.argmax()),) if moved.max() > 0 else ()

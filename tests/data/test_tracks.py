@@ -10,8 +10,9 @@ import pytest
 
 from data.events import window_group
 from data.frames import Frames
-from data.geometry import displacements
+from data.geometry import displacement_across, displacements, object_match
 from data.records import FPS, SelectionItem
+from data.selection import window
 from data.store import Store
 
 
@@ -41,8 +42,13 @@ def test_scenes_keep_to_their_split(micro_store, items) -> None:
 def test_candidates_can_be_told_apart(micro_store, items) -> None:
     least = micro_store.manifest["config"]["selection"]["min_displacement"]
     for item in items:
-        apart = displacements(micro_store.scene(item.scene_id))
-        gaps = [apart[a.frame, b.frame] for a, b in combinations(item.candidates, 2)]
+        gaps = []
+        for a, b in combinations(item.candidates, 2):
+            scene, other = micro_store.scene(a.scene_id), micro_store.scene(b.scene_id)
+            gap = displacement_across(scene, a.frame, other, b.frame)
+            if a.scene_id == b.scene_id:
+                assert gap == pytest.approx(displacements(scene)[a.frame, b.frame])
+            gaps.append(gap)
         assert item.min_displacement == pytest.approx(min(gaps), rel=1e-5)
         assert min(gaps) >= least
 
@@ -52,12 +58,33 @@ def test_event_items_stand_at_their_collision(micro_store, items) -> None:
         events = [c.frame for c in micro_store.scene(item.scene_id).collisions]
         assert item.event_frame in events
         assert item.prefix_stop - item.prefix_start == 20
-        stop = item.event_frame - (10 if item.framing == "future" else 0)
-        assert item.prefix_stop == stop
-        assert item.target_frame == stop + 10
+        assert item.gap == (5 if item.subtype == "future_match_gap5" else 10)
+        assert item.prefix_stop == item.event_frame - (item.gap if item.framing == "future" else 0)
+        assert item.target_frame == item.prefix_stop + item.gap
         assert item.target_frame <= 127 - 10
-        offsets = {abs(c.frame - item.target_frame) for c in item.candidates}
-        assert offsets <= {0, 16, 32, 48}
+
+
+def test_event_distractors_are_of_their_source(micro_store, items) -> None:
+    split = {s: set(micro_store.scene_ids(s)) for s in ("train", "test")}
+    least = micro_store.manifest["config"]["selection"]["min_displacement"]
+    for item in (i for i in items if i.family == "event"):
+        scene = micro_store.scene(item.scene_id)
+        wrong = [c for c in item.candidates if c.source != "target"]
+        assert {c.source for c in wrong} == {item.distractors}
+        elsewhere = {c.scene_id for c in wrong} - {item.scene_id}
+        if item.distractors == "cross_scene":
+            assert len(elsewhere) == 3
+            assert elsewhere <= split[item.split]
+        else:
+            assert not elsewhere
+        if item.distractors == "same_offset":
+            assert {abs(c.frame - item.target_frame) for c in wrong} <= {16, 32, 48}
+        if item.distractors == "same_obj_match":
+            # No frame that is more alike to the target than the first could be told from it.
+            score, apart = object_match(scene, item.target_frame), displacements(scene)
+            closest = min(score[c.frame] for c in wrong)
+            nearer = np.flatnonzero(score < closest)
+            assert (apart[item.target_frame, nearer] < least).all()
 
 
 def test_time_items_count_26_frames_a_second(items) -> None:
@@ -74,7 +101,47 @@ def test_window_items_are_of_their_group_and_horizon(micro_store, items) -> None
         assert item.target_frame - item.prefix_stop == item.horizon
         scene = micro_store.scene(item.scene_id)
         group = window_group(scene, item.prefix_start, item.prefix_stop, item.horizon)
-        assert item.subtype == f"{group}_A_h{item.horizon}_{item.difficulty}"
+        family = item.window_family
+        assert item.subtype == f"{group}_{family}_h{item.horizon}_{item.difficulty}"
+
+
+def test_families_b_and_c_are_told_apart_by_what_they_are_built_around(micro_store, items) -> None:
+    least = micro_store.manifest["config"]["selection"]["min_displacement"]
+    built = Counter()
+    for item in (i for i in items if i.window_family in ("B", "C")):
+        scene = micro_store.scene(item.scene_id)
+        cell = window.CELLS[item.subtype]
+        about = window.built_around(cell, scene, item.prefix_stop, item.target_frame)
+        if item.window_family == "B":
+            assert item.group in ("G2", "G4")
+            pairs = {c.objects for c in scene.collisions
+                     if item.prefix_stop < c.frame <= item.target_frame}  # fmt: skip
+            assert about in pairs
+        else:
+            assert item.group != "G4"
+            assert len(about) == 1
+        apart = displacements(scene, about)
+        for a, b in combinations(item.candidates, 2):
+            assert apart[a.frame, b.frame] >= least
+        built[item.window_family] += 1
+    assert min(built["B"], built["C"]) > 2
+
+
+def test_hard_is_more_alike_than_easy(micro_store, items) -> None:
+    """Of the frames that could stand in for a distractor, hard takes from one end and easy from the
+    other."""
+    score = {"easy": [], "hard": []}
+    for item in (i for i in items if i.window_family == "A"):
+        match = object_match(micro_store.scene(item.scene_id), item.target_frame)
+        score[item.difficulty] += [match[c.frame] for c in item.candidates if c.source != "target"]
+    assert np.median(score["hard"]) < np.median(score["easy"])
+
+
+def test_scenes_are_as_far_apart_as_their_objects(micro_store) -> None:
+    one, two = (micro_store.scene(s) for s in micro_store.scene_ids("train")[:2])
+    assert one.objects != two.objects
+    assert displacement_across(one, 60, two, 60) == pytest.approx(336 * 2**0.5)
+    assert displacement_across(one, 60, one, 60) == 0
 
 
 def test_each_builder_asks_what_it_may_of_a_scene(micro_store) -> None:

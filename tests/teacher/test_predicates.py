@@ -178,20 +178,25 @@ def test_differences_of_a_candidate_are_there(micro_store):
         scene = micro_store.scene(item.scene_id)
         predicates = predicates_of(item, scene, micro_store.scene)
         for candidate in predicates.candidates if predicates else ():
-            frame = item.candidates["ABCD".index(candidate.letter)].frame
-            assert candidate.agrees == (frame == item.target_frame)
+            named = item.candidates["ABCD".index(candidate.letter)]
+            frame, other = named.frame, micro_store.scene(named.scene_id)
+            right = (named.scene_id, frame) == (item.scene_id, item.target_frame)
+            assert candidate.agrees == right
+            here, there = ([o.phrase for o in s.objects] for s in (scene, other))
+            assert candidate.other_objects == (set(here) != set(there))
             for d in candidate.differences:
-                i = [o.phrase for o in scene.objects].index(d.object)
+                i = here.index(d.object) if d.object in here else None
+                j = there.index(d.object) if d.object in there else None
                 if d.kind == "region":
-                    cell = scene.image_positions[frame, i] / scene.image_size * 3
+                    cell = other.image_positions[frame, j] / other.image_size * 3
                     column, row = np.clip(np.floor(cell), 0, 2).astype(int)
                     assert d.region in (REGIONS[row][column], "out of view")
                 if d.kind == "missing":
-                    assert scene.visible_fraction[frame, i] <= 0.05
+                    assert j is None or other.visible_fraction[frame, j] <= 0.05
                 if d.kind == "extra":
-                    assert scene.visible_fraction[item.target_frame, i] <= 0.05
+                    assert i is None or scene.visible_fraction[item.target_frame, i] <= 0.05
                 if d.kind == "displaced" and d.heading:
-                    way = scene.image_positions[frame, i]
+                    way = other.image_positions[frame, j]
                     way = way - scene.image_positions[item.target_frame, i]
                     assert way @ DIRECTIONS[d.heading] > 0
                 told += 1
