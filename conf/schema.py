@@ -48,15 +48,18 @@ class RetrievalTrackConfig:
     """Builders of the retrieval track (spec names 1 to 6) and the test database."""
 
     builders: dict[str, Quota] = field(default_factory=dict)
+    counterfactual: Quota = field(default_factory=Quota)
+    """Queries about scenes that are simulated again with an object absent."""
     hard_negatives: int = 3
     """Same-scene wrong-time frames a query."""
     database: int = 10_000
-    """Frames of the test database; it always holds every test target."""
+    """Frames of the test database; it always holds every test target of the builders."""
 
     def check(self) -> list[str]:
         return [
             *_too_small(self, "benchmark.retrieval.", {"hard_negatives": 1, "database": 0}),
             *_quota_problems("benchmark.retrieval.builders", self.builders),
+            *_quota_problems("benchmark.retrieval", {"counterfactual": self.counterfactual}),
         ]
 
 

@@ -24,11 +24,19 @@ from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
 from conf.keys import nearest
 from conf.schema import BenchmarkConfig, BuildCommand, Quota
-from data.bullet import scene_id, simulate_scene
+from data.bullet import record, sample_bodies, scene_id, without
 from data.frames import load_frames, save_frames
-from data.records import SPLITS, FrameRef, RetrievalQuery, Scene, SelectionItem, shown_frames
+from data.records import (
+    POOLS,
+    SPLITS,
+    FrameRef,
+    RetrievalQuery,
+    Scene,
+    SelectionItem,
+    shown_frames,
+)
 from data.render import renderer
-from data.retrieval import future
+from data.retrieval import counterfactual, future
 from data.retrieval.database import choose_frames, distinct, drop_twin_targets, share_of_scene
 from data.selection import drafts, event, time, window
 from data.store import (
@@ -88,17 +96,18 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: int) -> None:
         )
         items, dropped = select_items(cfg, scene_ids, scene_of)
         made, dropped_queries = make_queries(cfg, scene_ids, scene_of)
-        queries, database, twins = render(cfg, growing, scene_ids, items, made, workers)
+        queries, databases, twins = render(cfg, growing, scene_ids, items, made, workers)
         _check_not_empty(cfg, items, queries)
         save_rows([i.to_row() for i in items], growing / "selection.parquet")
         save_rows([q.to_row() for q in queries], growing / "retrieval.parquet")
-        save_rows([{**vars(f), "database": "test"} for f in database], growing / "database.parquet")
-        counts = _counts(scene_ids, items, queries, database) | dropped | dropped_queries
+        rows = [{**vars(f), "database": name} for name in databases for f in databases[name]]
+        save_rows(rows, growing / "database.parquet")
+        counts = _counts(scene_ids, items, queries, databases) | dropped | dropped_queries
         counts |= {
             "queries dropped, target has a twin": len(made) - len(queries),
             "frames left out, twins": twins,
         }
-        shortfalls = _shortfalls(cfg, items, queries, database)
+        shortfalls = _shortfalls(cfg, items, queries, databases)
         _finish(cfg, growing, scene_ids, counts, shortfalls)
         growing.rename(folder)
         (folder / PLAN).unlink()
@@ -146,7 +155,16 @@ def simulate(
 
 
 def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> None:
-    save_scene(simulate_scene(cfg.seed, index, split, cfg), path)
+    """Simulate a scene and, where the benchmark asks for it, the scene with an object absent."""
+    bodies = sample_bodies(cfg.seed, index, cfg)
+    scene = record(path.stem, split, bodies)
+    if getattr(cfg.retrieval.counterfactual, split):
+        removed = counterfactual.removed_object(scene, cfg.seed)
+        if removed is not None:
+            name = counterfactual.absent_id(scene.scene_id, removed)
+            save_scene(without(name, split, bodies, removed), path.with_name(f"{name}.npz"))
+    # Last, for where it stands the whole job is done.
+    save_scene(scene, path)
 
 
 def select_items(
@@ -160,35 +178,29 @@ def select_items(
     for family, quotas in _family_quotas(cfg).items():
         for subtype, quota in quotas.items():
             draw = partial(FAMILY_BUILDERS[family].draft, subtype)
-            found, without = drafts.fill(
+            found, few = drafts.fill(
                 subtype, draw, scene_ids, scene_of, quota, cfg.seed, track.min_displacement
             )
             items += found
-            dropped[f"items dropped, too alike/{family}"] += without
+            dropped[f"items dropped, too alike/{family}"] += few
     return items, dict(dropped)
 
 
 def make_queries(
     cfg: BenchmarkConfig, scene_ids: dict[str, list[str]], scene_of: Callable[[str], Scene]
 ) -> tuple[list[RetrievalQuery], dict[str, int]]:
-    """Every future-state query, builder by builder, and how many were dropped for want of hard
-    negatives."""
+    """Every future-state query, builder by builder, then the counterfactual ones, and how many were
+    dropped for want of hard negatives."""
     track = cfg.retrieval
     queries: list[RetrievalQuery] = []
     dropped = 0
+    shared = (track.hard_negatives, cfg.selection.min_displacement, cfg.seed)
     for builder, quota in track.builders.items():
-        found, without = future.fill(
-            int(builder),
-            scene_ids,
-            scene_of,
-            quota,
-            track.hard_negatives,
-            cfg.selection.min_displacement,
-            cfg.seed,
-        )
+        found, few = future.fill(int(builder), scene_ids, scene_of, quota, *shared)
         queries += found
-        dropped += without
-    return queries, {"queries dropped, too alike": dropped}
+        dropped += few
+    found, few = counterfactual.fill(scene_ids, scene_of, track.counterfactual, *shared)
+    return [*queries, *found], {"queries dropped, too alike": dropped + few}
 
 
 def render(
@@ -198,37 +210,57 @@ def render(
     items: list[SelectionItem],
     queries: list[RetrievalQuery],
     workers: int,
-) -> tuple[list[RetrievalQuery], list[FrameRef], int]:
-    """Render every frame that an item, a query or the test database names.
+) -> tuple[list[RetrievalQuery], dict[str, list[FrameRef]], int]:
+    """Render every frame that an item, a query or a database names.
 
     Returns:
-        The queries whose target has pixels of its own, the test database, and how many frames were
-        left out of it as twins.
+        The queries whose target has pixels of its own, the databases, and how many frames were left
+        out of these as twins.
     """
     named = named_frames(cfg, items, queries)
-    targets: dict[str, list[int]] = defaultdict(list)
-    for query in queries:
-        if query.split == "test":
-            targets[query.target.scene_id].append(query.target.frame)
-    total = cfg.retrieval.database if targets else 0
-    jobs = {}
-    for split, names in scene_ids.items():
-        for k, name in enumerate(names):
-            wanted = share_of_scene(total, len(names), k) if split == "test" else 0
-            path = folder / "frames" / f"{name}.zip"
-            jobs[name] = partial(
-                _render_one, cfg, folder, name, named[name], targets[name], wanted, path
-            )
-    looked_at = dict(_run_jobs(jobs, "rendering scenes", len(jobs), workers))
-    named_targets = [FrameRef(name, frame) for name in targets for frame in targets[name]]
-    pixels = {
-        FrameRef(name, frame): digest
-        for name in sorted(looked_at)
-        for frame, digest in looked_at[name].items()
+    first = database_frames(queries)
+    total = cfg.retrieval.database if first["test"] else 0
+    shares = {
+        name: share_of_scene(total, len(scene_ids["test"]), k)
+        for k, name in enumerate(scene_ids["test"])
     }
-    stands_for = distinct(pixels, first=named_targets)
-    database = sorted({f for f, shown in stands_for.items() if f == shown}, key=astuple)
-    return drop_twin_targets(queries, stands_for), database, len(pixels) - len(database)
+    jobs = {
+        name: partial(
+            _render_one, cfg, folder, name, named[name],
+            {base: _frames_of(first[base], name) for base in first}, shares.get(name, 0),
+        )
+        for name in sorted({*named, *shares})
+    }  # fmt: skip
+    looked_at = dict(_run_jobs(jobs, "rendering scenes", len(jobs), workers))
+    databases, twins = {}, 0
+    for base, frames in first.items():
+        pixels = {
+            FrameRef(name, frame): digest
+            for name in sorted(looked_at)
+            for frame, digest in looked_at[name][base].items()
+        }
+        stands_for = distinct(pixels, first=frames)
+        databases[base] = sorted({f for f, shown in stands_for.items() if f == shown}, key=astuple)
+        twins += len(pixels) - len(databases[base])
+        queries = drop_twin_targets(queries, stands_for)
+    return queries, databases, twins
+
+
+def database_frames(queries: list[RetrievalQuery]) -> dict[str, list[FrameRef]]:
+    """The frames that each database holds in any case, targets first: the targets of the test
+    queries, and for counterfactual ones their hard negatives too."""
+    test = {pool: [q for q in queries if q.split == "test" and q.pool == pool] for pool in POOLS}
+    asked = [q.target for q in test["counterfactual"]]
+    return {
+        "test": list(dict.fromkeys(q.target for q in test["future"])),
+        "counterfactual": list(
+            dict.fromkeys([*asked, *(f for q in test["counterfactual"] for f in q.hard_negatives)])
+        ),
+    }
+
+
+def _frames_of(frames: list[FrameRef], name: str) -> list[int]:
+    return [f.frame for f in frames if f.scene_id == name]
 
 
 def _render_one(
@@ -236,10 +268,11 @@ def _render_one(
     folder: Path,
     name: str,
     named: set[int],
-    targets: list[int],
+    first: dict[str, list[int]],
     wanted: int,
-    path: Path,
-) -> dict[int, str]:
+) -> dict[str, dict[int, str]]:
+    """Render a scene's frames, and give the pixels' hash of those that each database looks at."""
+    path = folder / "frames" / f"{name}.zip"
     images = load_frames(path) if path.exists() else {}
     there = len(images)
     scene = load_scene(folder / "scenes" / f"{name}.npz")
@@ -251,10 +284,15 @@ def _render_one(
 
     for frame in sorted(named):
         image_of(frame)
-    chosen = choose_frames(targets, image_of, scene.frames, wanted, cfg.seed, name)
+    looked_at = {
+        base: choose_frames(
+            frames, image_of, scene.frames, wanted if base == "test" else 0, cfg.seed, name
+        )
+        for base, frames in first.items()
+    }
     if images and len(images) > there:
         save_frames(images, path)
-    return chosen
+    return looked_at
 
 
 def named_frames(
@@ -361,12 +399,12 @@ def _counts(
     scene_ids: dict[str, list[str]],
     items: list[SelectionItem],
     queries: list[RetrievalQuery],
-    database: list[FrameRef],
+    databases: dict[str, list[FrameRef]],
 ) -> dict[str, int]:
     tally = Counter({f"scenes/{split}": len(names) for split, names in scene_ids.items()})
     tally.update(f"selection/{i.family}/{i.split}" for i in items)
-    tally.update(f"retrieval/builder {q.builder}/{q.split}" for q in queries)
-    tally["database/test"] = len(database)
+    tally.update(f"retrieval/{_builder(q)}/{q.split}" for q in queries)
+    tally.update({f"database/{name}": len(frames) for name, frames in databases.items()})
     return dict(tally)
 
 
@@ -374,11 +412,11 @@ def _shortfalls(
     cfg: BenchmarkConfig,
     items: list[SelectionItem],
     queries: list[RetrievalQuery],
-    database: list[FrameRef],
+    databases: dict[str, list[FrameRef]],
 ) -> dict[str, str]:
     """What every cell, builder and database has, where that is less than its quota."""
     found = Counter((f"{i.family}/{i.subtype}", i.split) for i in items)
-    found.update((f"builder {q.builder}", q.split) for q in queries)
+    found.update((_builder(q), q.split) for q in queries)
     wanted = {
         **{
             f"{family}/{cell}": quota
@@ -386,6 +424,7 @@ def _shortfalls(
             for cell, quota in quotas.items()
         },
         **{f"builder {b}": quota for b, quota in cfg.retrieval.builders.items()},
+        "counterfactual": cfg.retrieval.counterfactual,
     }
     short = {
         f"{cell}/{split}": f"{found[cell, split]} of {getattr(quota, split)}"
@@ -393,9 +432,13 @@ def _shortfalls(
         for split in SPLITS
         if found[cell, split] < getattr(quota, split)
     }
-    if queries and len(database) < cfg.retrieval.database:
-        short["database/test"] = f"{len(database)} of {cfg.retrieval.database}"
+    if databases["test"] and len(databases["test"]) < cfg.retrieval.database:
+        short["database/test"] = f"{len(databases['test'])} of {cfg.retrieval.database}"
     return short
+
+
+def _builder(query: RetrievalQuery) -> str:
+    return "counterfactual" if query.builder is None else f"builder {query.builder}"
 
 
 def _family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:

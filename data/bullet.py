@@ -348,11 +348,9 @@ def simulate_scene(seed: int, index: int, split: str, limits: BenchmarkConfig) -
     return record(scene_id(seed, index), split, bodies)
 
 
-def without(seed: int, index: int, split: str, limits: BenchmarkConfig, removed: int) -> Scene:
-    """The counterfactual of a scene: run again with object `removed` absent. What that object
-    never touched, directly or through others, moves bit for bit as before."""
-    bodies = sample_bodies(seed, index, limits)
-    name = f"{scene_id(seed, index)}-without-{removed}"
+def without(name: str, split: str, bodies: list[Body], removed: int) -> Scene:
+    """The counterfactual of a scene of `bodies`: run again with object `removed` absent. What that
+    object never touched, directly or through others, moves bit for bit as before."""
     return record(name, split, bodies[:removed] + bodies[removed + 1 :])
 
 

@@ -22,6 +22,7 @@ LETTERS = "ABCD"
 SHAPES = ("cube", "sphere", "cylinder")
 MATERIALS = ("metal", "rubber")
 COLORS = ("gray", "red", "blue", "green", "brown", "cyan", "purple", "yellow")
+POOLS = ("future", "counterfactual")
 SPLITS = ("train", "test")
 FAMILIES = ("event", "time", "window")
 

@@ -2,7 +2,7 @@
 
     store/<name>/
         manifest.json        what it is: config, versions, counts, a SHA-256 for every file below
-        scenes/<id>.npz      one scene's oracle
+        scenes/<id>.npz      one scene's oracle; <id>-without-<k> is it with object k absent
         frames/<id>.zip      that scene's rendered frames, one PNG each, named by frame index
         selection.parquet retrieval.parquet database.parquet
         rationales.jsonl     appended by the teacher, not part of the manifest
@@ -159,11 +159,14 @@ class Store:
         rows = load_rows(self.folder / "selection.parquet")
         return [SelectionItem.from_row(r) for r in rows if split in (None, r["split"])]
 
-    def retrieval(self, split: str | None = None) -> list[RetrievalQuery]:
+    def retrieval(self, split: str | None = None, pool: str = "future") -> list[RetrievalQuery]:
+        """Queries of a pool, future or counterfactual."""
         rows = load_rows(self.folder / "retrieval.parquet")
-        return [RetrievalQuery.from_row(r) for r in rows if split in (None, r["split"])]
+        kept = (r for r in rows if split in (None, r["split"]) and r["pool"] == pool)
+        return [RetrievalQuery.from_row(r) for r in kept]
 
     def database(self, name: str = "test") -> list[FrameRef]:
+        """Frames of a database: test, or counterfactual for that pool's test queries."""
         rows = load_rows(self.folder / "database.parquet")
         return [FrameRef(r["scene_id"], r["frame"]) for r in rows if r["database"] == name]
 

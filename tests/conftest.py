@@ -32,6 +32,7 @@ def micro_config(**changes: object) -> BenchmarkConfig:
         ),
         "retrieval": RetrievalTrackConfig(
             builders={str(k): Quota(train=4, test=2) for k in range(1, 7)},
+            counterfactual=Quota(train=4, test=2),
             hard_negatives=2,
             database=60,
         ),

@@ -12,14 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from conf.schema import Quota
-from data.geometry import displacements
-from data.records import FPS, SPLITS, FrameRef, RetrievalQuery, Scene
-from data.selection.drafts import cell_rng
+from data.records import FPS, FrameRef, RetrievalQuery, Scene
+from data.retrieval import queries
 
-OFFSETS = (16, 32, 48)
-"""First choice of hard negatives, in frames on either side of the target."""
-DENSE_STEP = 4
-"""Step of the denser grid that stands in where the first choices do not do."""
 EVENTS_A_SCENE = 3
 """Events of a scene that builder 3 uses at most."""
 ONE_A_SCENE = (4, 5, 6)
@@ -39,13 +34,13 @@ class Moment:
 def _clip_end(scene: Scene) -> Iterator[Moment]:
     for seconds in (2, 3, 4):
         text = "Which frame shows the scene at the end of the clip, {} after the observation ends?"
-        left = _seconds(5 - seconds)
+        left = spelled(5 - seconds)
         yield Moment("time", text.format(left), (0, seconds * FPS), scene.frames - 1)
 
 
 def _clock(scene: Scene) -> Iterator[Moment]:
     for seconds in (1, 2, 3):
-        text = f"Which frame shows the scene {_seconds(seconds)} after the observation ends?"
+        text = f"Which frame shows the scene {spelled(seconds)} after the observation ends?"
         yield Moment("time", text, (0, 2 * FPS), (2 + seconds) * FPS)
 
 
@@ -89,7 +84,7 @@ def _is_next(scene: Scene, stop: int, event: int) -> bool:
     return min((c.frame for c in scene.collisions if c.frame > stop), default=None) == event
 
 
-def _seconds(count: int) -> str:
+def spelled(count: int) -> str:
     return "1 second" if count == 1 else f"{count} seconds"
 
 
@@ -113,75 +108,30 @@ def fill(
     least: float,
     seed: int,
 ) -> tuple[list[RetrievalQuery], int]:
-    """Queries of one builder up to its quota in each split, and how many moments were dropped for
-    want of hard negatives that can be told apart.
+    """Queries of one builder up to its quota, and how many moments were dropped; see
+    `queries.fill`."""
 
-    Scenes come in a seeded order and give one moment each before any gives a second, so that
-    queries spread over scenes.
-    """
-    queries, dropped = [], 0
-    for split in SPLITS:
-        rng = cell_rng(seed, "retrieval", str(builder), split)
-        left = {}
-        for index in rng.permutation(len(scene_ids[split])):
-            scene = scene_of(scene_ids[split][index])
-            every = list(BUILDERS[builder](scene))
-            left[scene.scene_id] = [every[k] for k in rng.permutation(len(every))]
-        wanted = getattr(quota, split)
-        found: list[RetrievalQuery] = []
-        while len(found) < wanted and any(left.values()):
-            for scene_id, waiting in left.items():
-                if waiting and len(found) < wanted:
-                    scene = scene_of(scene_id)
-                    query = _query(builder, scene, waiting.pop(), hard_negatives, least, rng)
-                    if query is None:
-                        dropped += 1
-                        continue
-                    found.append(query)
-                    if builder in ONE_A_SCENE:
-                        waiting.clear()
-        queries += found
-    return queries, dropped
+    def ask(scene: Scene, moment: Moment, rng: np.random.Generator) -> RetrievalQuery | None:
+        negatives = queries.wrong_times(scene, moment.target, hard_negatives, least, rng)
+        if negatives is None:
+            return None
+        start, stop = moment.prefix
+        return RetrievalQuery(
+            query_id=f"future-{builder}-{scene.scene_id}-{start}-{stop}-{moment.target}",
+            split=scene.split,
+            pool="future",
+            builder=builder,
+            anchor=moment.anchor,
+            question=moment.question,
+            scene_id=scene.scene_id,
+            prefix_start=start,
+            prefix_stop=stop,
+            target=FrameRef(scene.scene_id, moment.target),
+            hard_negatives=tuple(FrameRef(scene.scene_id, frame) for frame in negatives),
+        )
 
+    def moments(scene: Scene) -> list[Moment]:
+        return list(BUILDERS[builder](scene))
 
-def _query(
-    builder: int,
-    scene: Scene,
-    moment: Moment,
-    count: int,
-    least: float,
-    rng: np.random.Generator,
-) -> RetrievalQuery | None:
-    negatives = _hard_negatives(scene, moment.target, count, least, rng)
-    if negatives is None:
-        return None
-    start, stop = moment.prefix
-    return RetrievalQuery(
-        query_id=f"future-{builder}-{scene.scene_id}-{start}-{stop}-{moment.target}",
-        split=scene.split,
-        pool="future",
-        builder=builder,
-        anchor=moment.anchor,
-        question=moment.question,
-        scene_id=scene.scene_id,
-        prefix_start=start,
-        prefix_stop=stop,
-        target=FrameRef(scene.scene_id, moment.target),
-        hard_negatives=tuple(FrameRef(scene.scene_id, frame) for frame in negatives),
-    )
-
-
-def _hard_negatives(
-    scene: Scene, target: int, count: int, least: float, rng: np.random.Generator
-) -> list[int] | None:
-    """`count` same-scene frames that can be told apart from the target and each other."""
-    apart = displacements(scene)
-    first = [target + side * offset for offset in OFFSETS for side in (-1, 1)]
-    dense = list(range(target % DENSE_STEP, scene.frames, DENSE_STEP))
-    chosen = [target]
-    for frame in [*rng.permutation(first), *rng.permutation(dense)]:
-        if len(chosen) == count + 1:
-            break
-        if 0 <= frame < scene.frames and apart[frame, chosen].min() >= least:
-            chosen.append(int(frame))
-    return chosen[1:] if len(chosen) == count + 1 else None
+    once = builder in ONE_A_SCENE
+    return queries.fill(str(builder), scene_ids, scene_of, quota, seed, moments, ask, once)

@@ -82,9 +82,10 @@ def test_scenes_keep_the_limits(index: int) -> None:
 
 @pytest.mark.parametrize("index", range(4))
 def test_removing_an_object_moves_nothing_it_never_touched(index: int) -> None:
-    factual = record("factual", "train", sample_bodies(1, index, LIMITS))
+    bodies = sample_bodies(1, index, LIMITS)
+    factual = record("factual", "train", bodies)
     for removed in range(len(factual.objects)):
-        other = without(1, index, "train", LIMITS, removed)
+        other = without("other", "train", bodies, removed)
         kept = [k for k in range(len(factual.objects)) if k != removed]
         reached = touched_by(factual, removed)
         for now, before in enumerate(kept):

@@ -11,7 +11,8 @@ import pytest
 from data.events import window_group
 from data.frames import Frames
 from data.geometry import displacement_across, displacements, object_match
-from data.records import FPS, SelectionItem
+from data.records import FPS, FrameRef, SelectionItem
+from data.retrieval.counterfactual import consequence
 from data.selection import window
 from data.store import Store
 
@@ -203,6 +204,46 @@ def test_hard_negatives_are_other_moments_of_the_scene(micro_store) -> None:
         assert len(frames) == 3
         assert {n.scene_id for n in q.hard_negatives} == {q.scene_id}
         assert min(apart[a, b] for a, b in combinations(frames, 2)) >= 12
+
+
+def test_counterfactuals_ask_for_what_the_absence_changes(micro_store) -> None:
+    queries = micro_store.retrieval(pool="counterfactual")
+    least = micro_store.manifest["config"]["selection"]["min_displacement"]
+    assert {q.split for q in queries} == {"train", "test"}
+    for q in queries:
+        scene, absent = micro_store.scene(q.scene_id), micro_store.scene(q.target.scene_id)
+        k = [o.phrase for o in scene.objects].index(q.removed_object)
+        assert q.target.scene_id == f"{q.scene_id}-without-{k}"
+        assert absent.objects == scene.objects[:k] + scene.objects[k + 1 :]
+        assert absent.split == scene.split == q.split
+        assert q.removed_object in q.question
+        # The object shows at the observation's end, and has met nothing by then.
+        assert scene.in_view[q.prefix_stop, k]
+        first = min(c.frame for c in scene.collisions if k in c.objects)
+        assert q.prefix_stop < first
+        kept = [i for i in range(len(scene.objects)) if i != k]
+        before = slice(0, first)
+        np.testing.assert_array_equal(scene.positions[before, kept], absent.positions[before])
+        assert consequence(scene, absent, k)[q.target.frame] >= least
+        assert consequence(scene, absent, k)[: q.prefix_stop].max() == 0
+        assert (q.target.frame - q.prefix_stop) % FPS == 0
+        factual, *others = q.hard_negatives
+        assert factual == FrameRef(q.scene_id, q.target.frame)
+        assert {n.scene_id for n in others} == {absent.scene_id}
+        for one, two in combinations([q.target, *q.hard_negatives], 2):
+            ends = [(micro_store.scene(f.scene_id), f.frame) for f in (one, two)]
+            assert displacement_across(*ends[0], *ends[1]) >= least
+
+
+def test_the_counterfactual_database_holds_targets_and_what_happened(micro_store) -> None:
+    queries = micro_store.retrieval("test", pool="counterfactual")
+    database = micro_store.database("counterfactual")
+    assert {q.target for q in queries} <= set(database)
+    frames = Frames(micro_store)
+    pixels = [frames.array(f.scene_id, f.frame).tobytes() for f in database]
+    factual = [frames.array(q.scene_id, q.target.frame).tobytes() for q in queries]
+    assert len(set(pixels)) == len(pixels)
+    assert set(factual) <= set(pixels)
 
 
 def test_the_database_holds_each_target_once_and_no_twins(micro_store) -> None:
