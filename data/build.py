@@ -498,7 +498,7 @@ def _flat(config: dict[str, Any], above: str = "") -> dict[str, Any]:
 def summary(store: Store) -> str:
     """What a store holds and where it fell short, as a small table."""
     lines = [f"{store.folder} ({len(store.manifest['files'])} files, {store.identity})"]
-    lines += [f"  {name:<28}{count:>8,}" for name, count in store.manifest["counts"].items()]
+    lines += [f"  {name:<36}{count:>8,}" for name, count in store.manifest["counts"].items()]
     for cell, found in store.manifest["shortfalls"].items():
         lines.append(f"  short: {cell} has {found}")
     return "\n".join(lines)
