@@ -156,8 +156,8 @@ def simulate(
 
 def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> None:
     """Simulate a scene and, where the benchmark asks for it, the scene with an object absent."""
-    bodies = sample_bodies(cfg.seed, index, cfg)
-    scene = record(path.stem, split, bodies)
+    bodies, motion = sample_bodies(cfg.seed, index, cfg)
+    scene = record(path.stem, split, bodies, motion)
     if getattr(cfg.retrieval.counterfactual, split):
         removed = counterfactual.removed_object(scene, cfg.seed)
         if removed is not None:

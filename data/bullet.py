@@ -8,13 +8,14 @@ needs no simulator.
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import pairwise, product
+from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -107,6 +108,7 @@ class World:
     def simulate(self, bodies: list[Body], frames: int = FRAMES) -> Motion:
         """Run `bodies` for `frames` frames. The same bodies give the same bits every time."""
         handles = self._place(bodies)
+        step, contact_points = self._bullet.stepSimulation, self._bullet.getContactPoints
         recorded = np.zeros((frames, len(bodies), 13))
         contacts: dict[tuple[int, int], list[int]] = {}
         recorded[0] = self._state(handles)
@@ -114,9 +116,9 @@ class World:
         for frame in range(1, frames):
             near = _near_pairs(recorded[frame - 1, :, :3])
             for _ in range(SUBSTEPS):
-                self._bullet.stepSimulation()
+                step()
                 for i, j in near:
-                    points = self._bullet.getContactPoints(handles[i], handles[j])
+                    points = contact_points(handles[i], handles[j])
                     # Bullet keeps points of pairs that no longer press on each other; only a
                     # force is a contact.
                     if any(point[9] > 0 for point in points):
@@ -178,11 +180,11 @@ class World:
         return handle
 
     def _state(self, handles: list[int]) -> np.ndarray:
-        bullet = self._bullet
+        pose, velocity = self._bullet.getBasePositionAndOrientation, self._bullet.getBaseVelocity
         rows = []
         for handle in handles:
-            position, turn = bullet.getBasePositionAndOrientation(handle)
-            linear, angular = bullet.getBaseVelocity(handle)
+            position, turn = pose(handle)
+            linear, angular = velocity(handle)
             rows.append([*position, *turn, *linear, *angular])
         return np.array(rows)
 
@@ -203,9 +205,13 @@ def world() -> World:
 def _near_pairs(positions: np.ndarray) -> list[tuple[int, int]]:
     """Pairs that could touch within the next frame. No object moves faster than 6 units a second,
     so a pair further apart than its outlines plus half a unit cannot, and is not polled."""
-    apart = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
     reach = 2 * max(BOUNDING_RADIUS.values()) + 0.5
-    return [(int(i), int(j)) for i, j in np.argwhere(np.triu(apart < reach, 1))]
+    places = positions.tolist()
+    return [
+        (i, j)
+        for (i, one), (j, two) in combinations(enumerate(places), 2)
+        if math.dist(one, two) < reach
+    ]
 
 
 def _debounce(contacts: dict[tuple[int, int], list[int]]) -> tuple[tuple[Collision, ...], bool]:
@@ -218,9 +224,9 @@ def _debounce(contacts: dict[tuple[int, int], list[int]]) -> tuple[tuple[Collisi
     return tuple(sorted(events, key=lambda c: (c.frame, c.objects))), repeated
 
 
-def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> list[Body]:
-    """The bodies of scene `index`: one that moves, then one after the other placed or aimed so
-    that it meets an earlier one, until the scene has its collisions; the rest stand by.
+def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> tuple[list[Body], Motion]:
+    """The bodies of scene `index` and what they do: one that moves, then one after the other placed
+    or aimed so that it meets an earlier one, until the scene has its collisions; the rest stand by.
 
     Scenes whose pairs touch at the start or meet again are thrown away and begun anew.
     """
@@ -239,7 +245,7 @@ def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> list[Body]:
                 break
             bodies, motion = grown
         if len(bodies) == count and motion.collisions:
-            return bodies
+            return bodies, motion
 
 
 def _entering(look: SceneObject, rng: np.random.Generator) -> Body:
@@ -344,19 +350,18 @@ def scene_id(seed: int, index: int) -> str:
 
 def simulate_scene(seed: int, index: int, split: str, limits: BenchmarkConfig) -> Scene:
     """Scene `index` of `seed` with its whole oracle."""
-    bodies = sample_bodies(seed, index, limits)
-    return record(scene_id(seed, index), split, bodies)
+    return record(scene_id(seed, index), split, *sample_bodies(seed, index, limits))
 
 
 def without(name: str, split: str, bodies: list[Body], removed: int) -> Scene:
     """The counterfactual of a scene of `bodies`: run again with object `removed` absent. What that
     object never touched, directly or through others, moves bit for bit as before."""
-    return record(name, split, bodies[:removed] + bodies[removed + 1 :])
+    rest = bodies[:removed] + bodies[removed + 1 :]
+    return record(name, split, rest, world().simulate(rest))
 
 
-def record(name: str, split: str, bodies: list[Body]) -> Scene:
-    """Simulate bodies and observe them with the camera: a scene."""
-    motion = world().simulate(bodies)
+def record(name: str, split: str, bodies: list[Body], motion: Motion) -> Scene:
+    """What bodies did, observed by the camera: a scene."""
     objects = tuple(body.look for body in bodies)
     camera = Camera()
     in_view, fraction = visibility(objects, motion.positions, motion.quaternions, camera)

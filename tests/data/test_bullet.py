@@ -82,8 +82,8 @@ def test_scenes_keep_the_limits(index: int) -> None:
 
 @pytest.mark.parametrize("index", range(4))
 def test_removing_an_object_moves_nothing_it_never_touched(index: int) -> None:
-    bodies = sample_bodies(1, index, LIMITS)
-    factual = record("factual", "train", bodies)
+    bodies, motion = sample_bodies(1, index, LIMITS)
+    factual = record("factual", "train", bodies, motion)
     for removed in range(len(factual.objects)):
         other = without("other", "train", bodies, removed)
         kept = [k for k in range(len(factual.objects)) if k != removed]
