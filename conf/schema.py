@@ -404,6 +404,11 @@ class BuildCommand(CommandConfig):
 
 
 @dataclass
+class StatisticsCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+
+
+@dataclass
 class NarrateCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     teacher: TeacherConfig = MISSING
