@@ -51,5 +51,4 @@ constraints: setup ## Write constraints.txt from the versions in .venv
 	$(BIN)/uv pip freeze --quiet --python $(BIN)/python --exclude-editable > constraints.txt
 
 clean: ## Remove built benchmarks and runs, not the environment
-	rm -rf store checkpoints/build checkpoints/narrate checkpoints/sft checkpoints/contrastive \
-	   checkpoints/select checkpoints/retrieve checkpoints/report
+	rm -rf store $(filter-out %/README.md %/bases,$(wildcard checkpoints/*))

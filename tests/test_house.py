@@ -13,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 FLOW = ("conf", "data", "teacher", "train", "evaluation")
 COMMANDS = (
     "data.build",
+    "data.statistics",
     "teacher.narrate",
     "train.sft",
     "train.contrastive",
