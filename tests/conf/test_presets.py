@@ -12,6 +12,7 @@ from conf.compose import compose
 CONF = Path(str(files("conf")))
 SCHEMAS = {
     "data.build": schema.BuildCommand,
+    "data.statistics": schema.StatisticsCommand,
     "teacher.narrate": schema.NarrateCommand,
     "train.sft": schema.SftCommand,
     "train.contrastive": schema.ContrastiveCommand,
