@@ -20,7 +20,6 @@ $(READY): pyproject.toml constraints.txt
 
 run: setup ## Train and measure the tiny student and the tiny retriever, and report on both
 	$(BIN)/python -m train.sft +exp=cot
-	$(BIN)/python -m evaluation.select
 	$(BIN)/python -m evaluation.select model=checkpoints/sft/exp-cot
 	$(BIN)/python -m train.contrastive
 	$(BIN)/python -m evaluation.retrieve model=checkpoints/contrastive/default
