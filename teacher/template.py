@@ -21,7 +21,7 @@ from teacher.predicates import (
     facts_of,
 )
 
-NARRATOR_VERSION = "2"
+NARRATOR_VERSION = "3"
 ENOUGH = 110
 """Words under which a rationale is told in full: well above the 80 that it needs (paper, Rationale
 construction)."""
@@ -212,7 +212,7 @@ class _Voice:
         differences = candidate.differences[: self.differences]
         told = " and ".join(self.difference(d, expected) for d in differences)
         if candidate.other_objects:
-            return f"{name} shows a different set of objects and {told}"
+            return f"{name} shows other objects and {told}"
         return self.pick(f"{name} {told}", f"{name} wrongly {told}")
 
     def difference(self, d: Difference, expected: dict[str, str]) -> str:
