@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import math
-import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import as_completed
-from contextlib import contextmanager
 from dataclasses import asdict, astuple
 from functools import lru_cache, partial
 from pathlib import Path
@@ -26,6 +23,7 @@ from conf.keys import nearest
 from conf.schema import BenchmarkConfig, BuildCommand, Quota
 from data.bullet import record, sample_bodies, scene_id, without
 from data.frames import load_frames, save_frames
+from data.growing import flat, growing_folder
 from data.records import (
     POOLS,
     SPLITS,
@@ -89,7 +87,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: int) -> None:
     check_names(cfg)
     scene_ids = split_scenes(cfg)
     log.info("building benchmark %s in %s", cfg.name, folder)
-    with _growing(cfg, folder) as growing:
+    with growing_folder(cfg, folder) as growing:
         simulate(cfg, growing, scene_ids, workers)
         scene_of = lru_cache(maxsize=512)(
             lambda name: load_scene(growing / "scenes" / f"{name}.npz")
@@ -327,54 +325,6 @@ def _run_jobs(
             raise
 
 
-@contextmanager
-def _growing(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path]:
-    """The folder beside `folder` that a build fills, held by this process alone.
-
-    Raises:
-        UserError: another process is building there, or a build of other settings was left there.
-    """
-    growing = folder.with_name(f".{folder.name}.partial")
-    growing.mkdir(parents=True, exist_ok=True)
-    plan = {**VERSIONS, "config": asdict(cfg)}
-    with _held(growing, folder):
-        if (growing / PLAN).exists():
-            _check_same_plan(json.loads((growing / PLAN).read_text()), plan, growing)
-        for leftover in growing.rglob(".*.partial"):
-            leftover.unlink()
-        write_atomically(growing / PLAN, json.dumps(plan).encode())
-        yield growing
-
-
-@contextmanager
-def _held(growing: Path, folder: Path) -> Iterator[None]:
-    handle = os.open(growing, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(handle)
-        raise UserError(
-            f"{folder} is being built by another process; run this again when it is done"
-        ) from error
-    try:
-        yield
-    finally:
-        os.close(handle)
-
-
-def _check_same_plan(there: dict[str, Any], plan: dict[str, Any], growing: Path) -> None:
-    """Work of hours is not thrown away for a changed setting."""
-    was, now = _flat(there), _flat(plan)
-    for key in was | now:
-        if was.get(key) != now.get(key):
-            name = key.replace("config.", "benchmark.", 1)
-            raise UserError(
-                f"{growing} holds an unfinished build with {name}={was.get(key)}, you ask for "
-                f"{now.get(key)}: go on with that one, choose another name with "
-                f"benchmark.name=NAME, or delete {growing}"
-            )
-
-
 def _finish(
     cfg: BenchmarkConfig,
     growing: Path,
@@ -477,7 +427,7 @@ def _check_not_empty(
 
 
 def _check_same_settings(store: Store, cfg: BenchmarkConfig) -> None:
-    built, asked = _flat(store.manifest["config"]), _flat(asdict(cfg))
+    built, asked = flat(store.manifest["config"]), flat(asdict(cfg))
     for key in built | asked:
         old, new = built.get(key), asked.get(key)
         if old != new:
@@ -485,14 +435,6 @@ def _check_same_settings(store: Store, cfg: BenchmarkConfig) -> None:
                 f"{store.folder} was built with benchmark.{key}={old}, you ask for {new}: "
                 f"choose another name with benchmark.name=NAME, or delete {store.folder}"
             )
-
-
-def _flat(config: dict[str, Any], above: str = "") -> dict[str, Any]:
-    flat = {}
-    for key, value in config.items():
-        name = f"{above}{key}"
-        flat |= _flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
-    return flat
 
 
 def summary(store: Store) -> str:

@@ -15,7 +15,8 @@ import pytest
 
 from conf.errors import SettingsError, UserError
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
-from data.build import _growing, build, ensure_benchmark, split_scenes
+from data.build import build, ensure_benchmark, split_scenes
+from data.growing import growing_folder
 from data.store import MANIFEST, digests, open_store, write_atomically
 
 
@@ -93,7 +94,10 @@ def test_a_build_of_other_settings_is_not_thrown_away(tmp_path) -> None:
 
 
 def test_a_build_is_one_process_own(tmp_path) -> None:
-    with _growing(small(), tmp_path / "small"), pytest.raises(UserError, match="another process"):
+    with (
+        growing_folder(small(), tmp_path / "small"),
+        pytest.raises(UserError, match="another process"),
+    ):
         build(small(), tmp_path / "small", workers=1)
 
 

@@ -1,0 +1,73 @@
+"""The folder that a build fills beside a store, so that a killed one goes on with what it has."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from conf.errors import UserError
+from conf.schema import BenchmarkConfig
+from data.store import PLAN, VERSIONS, write_atomically
+
+
+@contextmanager
+def growing_folder(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path]:
+    """The folder beside `folder` that a build fills, held by this process alone.
+
+    Raises:
+        UserError: another process is building there, or a build of other settings was left there.
+    """
+    growing = folder.with_name(f".{folder.name}.partial")
+    growing.mkdir(parents=True, exist_ok=True)
+    plan = {**VERSIONS, "config": asdict(cfg)}
+    with _held(growing, folder):
+        if (growing / PLAN).exists():
+            _check_same_plan(json.loads((growing / PLAN).read_text()), plan, growing)
+        for leftover in growing.rglob(".*.partial"):
+            leftover.unlink()
+        write_atomically(growing / PLAN, json.dumps(plan).encode())
+        yield growing
+
+
+@contextmanager
+def _held(growing: Path, folder: Path) -> Iterator[None]:
+    handle = os.open(growing, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        raise UserError(
+            f"{folder} is being built by another process; run this again when it is done"
+        ) from error
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
+def _check_same_plan(there: dict[str, Any], plan: dict[str, Any], growing: Path) -> None:
+    """Work of hours is not thrown away for a changed setting."""
+    was, now = flat(there), flat(plan)
+    for key in was | now:
+        if was.get(key) != now.get(key):
+            name = key.replace("config.", "benchmark.", 1)
+            raise UserError(
+                f"{growing} holds an unfinished build with {name}={was.get(key)}, you ask for "
+                f"{now.get(key)}: go on with that one, choose another name with "
+                f"benchmark.name=NAME, or delete {growing}"
+            )
+
+
+def flat(config: dict[str, Any], above: str = "") -> dict[str, Any]:
+    """Nested settings by dotted key."""
+    found: dict[str, Any] = {}
+    for key, value in config.items():
+        name = f"{above}{key}"
+        found |= flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return found
