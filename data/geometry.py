@@ -210,9 +210,13 @@ def displacement_across(scene: Scene, frame: int, other: Scene, other_frame: int
     return min(apart, DIAGONAL)
 
 
-def _shown_at(scene: Scene, frame: int) -> dict[SceneObject, tuple[np.ndarray, bool]]:
+def _shown_at(scene: Scene, frame: int) -> dict[tuple[SceneObject, int], tuple[np.ndarray, bool]]:
+    """Where each object is and whether it shows, by its look and which of those that look so."""
     places, shown = on_screen(scene)
-    return {o: (places[frame, k], bool(shown[frame, k])) for k, o in enumerate(scene.objects)}
+    return {
+        (look, scene.objects[:k].count(look)): (places[frame, k], bool(shown[frame, k]))
+        for k, look in enumerate(scene.objects)
+    }
 
 
 def object_match(scene: Scene, target: int, about: tuple[int, ...] | None = None) -> np.ndarray:

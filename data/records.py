@@ -29,16 +29,19 @@ FAMILIES = ("event", "time", "window")
 
 @dataclass(frozen=True)
 class SceneObject:
-    """What an object looks like. No two objects of a scene are equal."""
+    """What an object looks like. No two objects of a simulated scene are equal; a transfer suite's
+    may be. An attribute that a simulator's record does not give is empty."""
 
     shape: str
-    material: str
-    color: str
+    material: str = ""
+    color: str = ""
+    size: str = ""
+    """small or large where a simulator has objects of several sizes."""
 
     @property
     def phrase(self) -> str:
         """The noun phrase that names it, such as "blue metal cube"."""
-        return f"{self.color} {self.material} {self.shape}"
+        return " ".join(filter(None, (self.size, self.color, self.material, self.shape)))
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,15 @@ class Collision:
 
     frame: int
     objects: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Landing:
+    """The first contact with the ground of an object that was in the air: the first frame at or
+    after it, and the object's index."""
+
+    frame: int
+    object: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +74,14 @@ class Scene:
             and y down; defined for every object in front of the camera, on screen or not.
         in_view: (F, N) whether any part of the object falls inside the image.
         visible_fraction: (F, N) visible pixels over the pixels the object would cover alone, 0
-            where it covers none.
+            where it covers none; NaN where a simulator's record does not tell.
         collisions: first contacts in order of frame.
         image_size: (width, height) of the image plane that `image_positions` refers to.
+        fps: frames a second.
+        landings: in order of frame, where a simulator's record tells of the ground.
+        scenario: the kind of scene, where a simulator has several.
+        footage: where the recorded frames of another simulator's scene are, relative to the
+            folder of its release; None for a scene that is rendered from its oracle.
     """
 
     scene_id: str
@@ -79,6 +96,10 @@ class Scene:
     in_view: np.ndarray
     visible_fraction: np.ndarray
     image_size: tuple[int, int] = (480, 320)
+    fps: float = FPS
+    landings: tuple[Landing, ...] = ()
+    scenario: str = ""
+    footage: str | None = None
 
     ARRAYS = (
         "positions",
@@ -103,7 +124,7 @@ class Scene:
             raise ValueError(
                 f"scene {self.scene_id}: {len(self.objects)} objects named, {count} recorded"
             )
-        if len(set(self.objects)) != count:
+        if self.footage is None and len(set(self.objects)) != count:
             raise ValueError(f"scene {self.scene_id}: two objects share shape, material and color")
 
     @property

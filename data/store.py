@@ -30,6 +30,7 @@ from data.bullet import GENERATOR_VERSION
 from data.records import (
     Collision,
     FrameRef,
+    Landing,
     RetrievalQuery,
     Scene,
     SceneObject,
@@ -73,6 +74,10 @@ def save_scene(scene: Scene, path: Path) -> None:
         "objects": [vars(o) for o in scene.objects],
         "collisions": [{"frame": c.frame, "objects": c.objects} for c in scene.collisions],
         "image_size": scene.image_size,
+        "fps": scene.fps,
+        "landings": [vars(landing) for landing in scene.landings],
+        "scenario": scene.scenario,
+        "footage": scene.footage,
     }
     arrays = {name: getattr(scene, name) for name in Scene.ARRAYS}
     buffer = io.BytesIO()
@@ -91,6 +96,10 @@ def load_scene(path: Path) -> Scene:
                 Collision(c["frame"], tuple(c["objects"])) for c in header["collisions"]
             ),
             image_size=tuple(header["image_size"]),
+            fps=header["fps"],
+            landings=tuple(Landing(**landing) for landing in header["landings"]),
+            scenario=header["scenario"],
+            footage=header["footage"],
             **{name: file[name] for name in Scene.ARRAYS},
         )
 
