@@ -131,6 +131,7 @@ def test_a_sweep_outlives_a_failed_job_and_goes_on(room):
     assert json.loads((folder / "0/run.json").read_text())["earlier_starts"] == []
 
 
+@pytest.mark.slow
 def test_a_sweep_without_a_name_is_named_by_its_overrides(room):
     done = toy(room, "-m", "x=1,2")
     assert done.returncode == 0

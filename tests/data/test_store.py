@@ -51,6 +51,7 @@ def contents(folder: Path) -> dict[str, str]:
     return {**digests(folder), MANIFEST: (folder / MANIFEST).read_text()}
 
 
+@pytest.mark.slow
 def test_two_builds_are_the_same_bytes_whatever_the_workers(built, tmp_path) -> None:
     build(small(), tmp_path / "small", workers=2)
     assert contents(tmp_path / "small") == contents(built)
@@ -84,6 +85,7 @@ def test_a_killed_build_goes_on_to_the_same_bytes(built, tmp_path, part) -> None
     assert all((kept / name).stat().st_mtime_ns == when for name, when in first.items())
 
 
+@pytest.mark.slow
 def test_a_build_of_other_settings_is_not_thrown_away(tmp_path) -> None:
     with pytest.raises(UserError, match="would be empty"):
         build(small(selection=SelectionConfig(time={"in_1s": Quota()}),

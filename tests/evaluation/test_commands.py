@@ -74,6 +74,7 @@ def finish(run: Run, metrics: dict) -> None:
     (run.folder / "metrics.json").write_text(json.dumps(metrics))
 
 
+@pytest.mark.slow
 def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_store) -> None:
     store = str(micro_store.folder.parent)
     asked = SelectCommand(
