@@ -46,6 +46,12 @@ CONTACT_FREE_FRAMES = 5
 """A pair's contact is a new event only after more frames than this without one."""
 COLLISIONS = {2: 0.63, 3: 0.33, 4: 0.04}
 """How often a scene aims at how many collisions, as a sample of CLEVRER's release has them."""
+REACH = 2 * max(BOUNDING_RADIUS.values()) + 0.5
+"""Objects whose centres are further apart than this do not touch within the next frame: none moves
+faster than 6 units a second."""
+CLEAR = 2 * max(BOUNDING_RADIUS.values()) + 0.2
+"""Objects whose centres are further apart than this at every frame never touch: between two frames
+one comes nearer by less than a tenth."""
 PLACEMENTS = 40
 """Tries to place one object before the scene is begun again."""
 
@@ -62,15 +68,29 @@ class Body:
 
 @dataclass(frozen=True)
 class Motion:
-    """What Bullet did with some bodies: arrays (F, N, ...) as in `Scene`, and first contacts."""
+    """What Bullet did with some bodies: (F, N, 13) their positions, quaternions, linear and angular
+    velocities as in `Scene`, and first contacts."""
 
-    positions: np.ndarray
-    quaternions: np.ndarray
-    velocities: np.ndarray
-    angular_velocities: np.ndarray
+    states: np.ndarray
     collisions: tuple[Collision, ...]
     touching_at_start: bool
     repeated_pair: bool
+
+    @property
+    def positions(self) -> np.ndarray:
+        return self.states[..., 0:3]
+
+    @property
+    def quaternions(self) -> np.ndarray:
+        return self.states[..., 3:7]
+
+    @property
+    def velocities(self) -> np.ndarray:
+        return self.states[..., 7:10]
+
+    @property
+    def angular_velocities(self) -> np.ndarray:
+        return self.states[..., 10:13]
 
 
 def connect() -> BulletClient:
@@ -127,15 +147,7 @@ class World:
                             frames_of_pair.append(frame)
             recorded[frame] = self._state(handles)
         collisions, repeated = _debounce(contacts)
-        return Motion(
-            positions=recorded[..., 0:3],
-            quaternions=recorded[..., 3:7],
-            velocities=recorded[..., 7:10],
-            angular_velocities=recorded[..., 10:13],
-            collisions=collisions,
-            touching_at_start=touching_at_start,
-            repeated_pair=repeated,
-        )
+        return Motion(recorded, collisions, touching_at_start, repeated)
 
     def _place(self, bodies: list[Body]) -> list[int]:
         bullet = self._bullet
@@ -203,14 +215,12 @@ def world() -> World:
 
 
 def _near_pairs(positions: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs that could touch within the next frame. No object moves faster than 6 units a second,
-    so a pair further apart than its outlines plus half a unit cannot, and is not polled."""
-    reach = 2 * max(BOUNDING_RADIUS.values()) + 0.5
+    """Pairs that could touch within the next frame, and are polled."""
     places = positions.tolist()
     return [
         (i, j)
         for (i, one), (j, two) in combinations(enumerate(places), 2)
-        if math.dist(one, two) < reach
+        if math.dist(one, two) < REACH
     ]
 
 
@@ -273,7 +283,8 @@ def _add_body(
         if body is None:
             continue
         trial = [*bodies, body]
-        result = world().simulate(trial)
+        # A body that is to meet another needs them all; it seldom stays out of reach.
+        result = (None if wanted else _beside(motion, body)) or world().simulate(trial)
         met = any(len(bodies) in c.objects for c in result.collisions)
         if (
             not result.touching_at_start
@@ -283,6 +294,17 @@ def _add_body(
         ):
             return trial, result
     return None
+
+
+def _beside(motion: Motion, body: Body) -> Motion | None:
+    """What `body` and the bodies of `motion` do together, where it stays out of reach of them all:
+    what each does alone, to the bit, for Bullet solves what does not touch apart. None where it may
+    touch one."""
+    alone = world().simulate([body]).states
+    apart = np.linalg.norm(motion.positions - alone[..., :3], axis=-1)
+    if apart.min() < CLEAR:
+        return None
+    return replace(motion, states=np.concatenate([motion.states, alone], axis=1))
 
 
 def _meeting(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:

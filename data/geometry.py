@@ -128,7 +128,6 @@ def visibility(
     Returns:
         in_view (F, N) bool and visible_fraction (F, N) in [0, 1], as `Scene` defines them.
     """
-    count = positions.shape[1]
     centre, depth = camera.project(positions)
     bound = np.array([BOUNDING_RADIUS[o.shape] for o in objects])
     in_front = depth > bound + 0.05
@@ -141,25 +140,40 @@ def visibility(
     outside = ~in_front | (
         (centre + reach[..., None] < 0) | (centre - reach[..., None] > size)
     ).any(-1)
-    gaps = np.linalg.norm(centre[:, :, None] - centre[:, None, :], axis=-1)
-    overlap = (gaps < reach[:, :, None] + reach[:, None, :]) & ~np.eye(count, dtype=bool)
-    overlap &= ~outside[:, :, None] & ~outside[:, None, :]
+    hides = _may_hide(positions - np.asarray(camera.eye), bound)
+    hides &= ~outside[:, :, None] & ~outside[:, None, :]
 
     in_view = inside.copy()
     fraction = inside.astype(np.float64)
     eye = np.asarray(camera.eye)
-    for f, i in np.argwhere(~outside & (~inside | overlap.any(-1))):
+    for f, i in np.argwhere(~outside & (~inside | hides.any(-1))):
         columns, rows = _pixels_around(centre[f, i], reach[f, i], camera)
         rays = camera.rays(columns, rows)
         own = hit_depth(objects[i].shape, positions[f, i], quaternions[f, i], eye, rays)
         covered = np.isfinite(own)
         visible = covered.copy()
-        for j in np.flatnonzero(overlap[f, i]):
+        for j in np.flatnonzero(hides[f, i]):
             other = hit_depth(objects[j].shape, positions[f, j], quaternions[f, j], eye, rays)
             visible &= ~(other < own)
         in_view[f, i] = covered.any()
         fraction[f, i] = visible.sum() / covered.sum() if covered.any() else 0.0
     return in_view, fraction
+
+
+def _may_hide(seen: np.ndarray, bound: np.ndarray) -> np.ndarray:
+    """(F, N, N) whether object j may hide a part of object i: the cones in which the eye sees their
+    bounding balls meet, and j's is not wholly behind i's.
+
+    Args:
+        seen: (F, N, 3) centres as seen from the eye, and bound (N,) radii of the balls.
+    """
+    distance = np.linalg.norm(seen, axis=-1)
+    toward = seen / distance[..., None]
+    cone = np.arcsin(np.minimum(bound / distance, 1))
+    angle = np.arccos(np.clip(np.einsum("fic,fjc->fij", toward, toward), -1, 1))
+    meet = angle < cone[:, :, None] + cone[:, None, :]
+    behind = (distance - bound)[:, None, :] > (distance + bound)[:, :, None]
+    return meet & ~behind & ~np.eye(len(bound), dtype=bool)
 
 
 def _pixels_around(

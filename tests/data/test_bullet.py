@@ -113,3 +113,12 @@ def reached_in(scene: Scene, index: int, reached: dict[int, int], kept: list[int
             if index in collision.objects:
                 return collision.frame
     return scene.frames
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_a_motion_put_together_is_that_of_all_at_once(index: int) -> None:
+    """What is sampled body by body, some of them simulated alone, is what Bullet does with all."""
+    bodies, motion = sample_bodies(11, index, LIMITS)
+    together = world().simulate(bodies)
+    assert np.array_equal(together.states, motion.states)
+    assert together.collisions == motion.collisions
