@@ -22,6 +22,8 @@ class Quota:
     test: int = 0
 
 
+FRAMES_AHEAD = ("named", "all", "none")
+ENGINES = ("loky", "ray")
 LOOKS = 48
 """Objects that can be told apart by their names: 3 shapes, 8 colours, 2 materials."""
 
@@ -52,12 +54,20 @@ class RetrievalTrackConfig:
     """Queries about scenes that are simulated again with an object absent."""
     hard_negatives: int = 3
     """Same-scene wrong-time frames a query."""
+    standard: int = 2_002
+    """Of the builders' test queries, those of the standard test; as many of each builder."""
     database: int = 10_000
-    """Frames of the test database; it always holds every test target of the builders."""
+    """Frames of the standard test's database; it holds every target of its queries."""
+    source: int = 30_000
+    """Frames that the builders' queries have for a source; it holds every target of theirs."""
+    counterfactual_source: int = 26_995
+    """Frames that the counterfactual queries have for a source."""
 
     def check(self) -> list[str]:
+        sizes = ("standard", "database", "source", "counterfactual_source")
         return [
-            *_too_small(self, "benchmark.retrieval.", {"hard_negatives": 1, "database": 0}),
+            *_too_small(self, "benchmark.retrieval.", {"hard_negatives": 1}),
+            *_too_small(self, "benchmark.retrieval.", dict.fromkeys(sizes, 0)),
             *_quota_problems("benchmark.retrieval.builders", self.builders),
             *_quota_problems("benchmark.retrieval", {"counterfactual": self.counterfactual}),
         ]
@@ -401,6 +411,21 @@ class CommandConfig:
 @dataclass
 class BuildCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
+    frames: str = "named"
+    """Frames that are rendered ahead: named (by items, queries and databases), all or none. The
+    others are drawn when they are asked for."""
+    frames_gb: float | None = None
+    """Disk space that rendered frames may take; null sets no bound."""
+    parallel: str = "loky"
+    """loky spreads the work over this machine's processes, ray over a Ray cluster."""
+
+    def check(self) -> list[str]:
+        problems = super().check() + _too_small(self, "", {"frames_gb": 0})
+        for key, options in (("frames", FRAMES_AHEAD), ("parallel", ENGINES)):
+            if getattr(self, key) not in options:
+                listed = f"{', '.join(options[:-1])} and {options[-1]}"
+                problems.append(f"{key}={getattr(self, key)}: the options are {listed}")
+        return problems
 
 
 @dataclass

@@ -7,13 +7,14 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig
-from data.store import PLAN, VERSIONS, write_atomically
+from data.bullet import GENERATOR_VERSION
+from data.records import SPLITS
+from data.store import PLAN, write_atomically
 
 
 @contextmanager
@@ -25,7 +26,7 @@ def growing_folder(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path]:
     """
     growing = folder.with_name(f".{folder.name}.partial")
     growing.mkdir(parents=True, exist_ok=True)
-    plan = {**VERSIONS, "config": asdict(cfg)}
+    plan = _plan(cfg)
     with _held(growing, folder):
         if (growing / PLAN).exists():
             _check_same_plan(json.loads((growing / PLAN).read_text()), plan, growing)
@@ -33,6 +34,17 @@ def growing_folder(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path]:
             leftover.unlink()
         write_atomically(growing / PLAN, json.dumps(plan).encode())
         yield growing
+
+
+def _plan(cfg: BenchmarkConfig) -> dict[str, Any]:
+    """What the scenes of a build depend on; its other parts are named by what they depend on."""
+    keys = ("seed", "test_share", "min_objects", "max_objects", "max_collisions")
+    absent = {split: getattr(cfg.retrieval.counterfactual, split) > 0 for split in SPLITS}
+    return {
+        "generator": GENERATOR_VERSION,
+        "config": {key: getattr(cfg, key) for key in keys},
+        "counterfactual scenes": absent,
+    }
 
 
 @contextmanager
@@ -52,7 +64,7 @@ def _held(growing: Path, folder: Path) -> Iterator[None]:
 
 
 def _check_same_plan(there: dict[str, Any], plan: dict[str, Any], growing: Path) -> None:
-    """Work of hours is not thrown away for a changed setting."""
+    """Scenes that took hours are not thrown away for a changed setting."""
     was, now = flat(there), flat(plan)
     for key in was | now:
         if was.get(key) != now.get(key):

@@ -228,6 +228,8 @@ class RetrievalQuery:
     target: FrameRef
     hard_negatives: tuple[FrameRef, ...]
     removed_object: str | None = None
+    standard: bool = False
+    """Whether it belongs to the standard test."""
 
     def to_row(self) -> dict[str, Any]:
         return asdict(self)

@@ -1,14 +1,15 @@
 """A benchmark on disk.
 
     store/<name>/
-        manifest.json        what it is: config, versions, counts, a SHA-256 for every file below
+        manifest.json        what it is: config, versions, counts, a SHA-256 for every file of it
         scenes/<id>.npz      one scene's oracle; <id>-without-<k> is it with object k absent
-        frames/<id>.zip      that scene's rendered frames, one PNG each, named by frame index
         selection.parquet retrieval.parquet database.parquet
+        frames/<id>.zip      a cache of that scene's rendered frames, not part of the manifest
         rationales.jsonl     appended by the teacher, not part of the manifest
 
 A store is written in a folder beside it and renamed when it is whole, every part atomically, so
-that a killed build goes on with the parts it has.
+that a killed build goes on with the parts it has. Frames follow from the oracle and the renderer,
+so they can be rendered later, or deleted.
 """
 
 from __future__ import annotations
@@ -49,6 +50,10 @@ VERSIONS = {
     "builders": BUILDERS_VERSION,
 }
 """What makes the same config give another benchmark: scenes, pixels, items and queries."""
+DATABASES = ("test", "future", "counterfactual")
+"""Frames that retrieval ranks: the standard test's, drawn out of the source of the future-state
+queries, and the source of the counterfactual ones."""
+SCENES, FRAMES = "scenes", "frames"
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -65,6 +70,11 @@ def write_atomically(path: Path, content: bytes) -> None:
         partial.unlink(missing_ok=True)
         # A full disk names no file of itself.
         raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def scene_path(folder: Path, scene_id: str) -> Path:
+    """Where a scene's oracle is in a store, whole or growing."""
+    return folder / SCENES / f"{scene_id}.npz"
 
 
 def save_scene(scene: Scene, path: Path) -> None:
@@ -125,15 +135,12 @@ def digest(path: Path) -> str:
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file below `folder` but its manifest and rationales, by relative path."""
-    paths = sorted(
-        p
-        for p in folder.rglob("*")
-        if p.is_file() and p.name not in (MANIFEST, PLAN, "rationales.jsonl")
-    )
-    names = [p.relative_to(folder).as_posix() for p in paths]
+    """SHA-256 of every file that makes a store, by relative path."""
+    paths = [*(folder / SCENES).glob("*.npz"), *folder.glob("*.parquet")]
+    names = sorted(p.relative_to(folder).as_posix() for p in paths)
     with ThreadPoolExecutor(4) as pool:
-        return dict(zip(names, pool.map(digest, paths), strict=True))
+        found = pool.map(lambda name: digest(folder / name), names)
+        return dict(zip(names, found, strict=True))
 
 
 def sealed(manifest: dict[str, Any]) -> dict[str, Any]:
@@ -155,14 +162,17 @@ class Store:
 
     @property
     def identity(self) -> str:
-        """A short hash of everything in the benchmark."""
-        return hashlib.sha256(json.dumps(self.manifest["files"]).encode()).hexdigest()[:16]
+        """A short hash of everything in the benchmark, and of what its frames look like."""
+        config = self.manifest["config"]
+        frames = [self.manifest["renderer"], config["width"], config["height"]]
+        content = json.dumps([self.manifest["files"], *frames])
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
 
     def scene_ids(self, split: str) -> list[str]:
         return self.manifest["scenes"][split]
 
     def scene(self, scene_id: str) -> Scene:
-        return _cached_scene(self.folder / "scenes" / f"{scene_id}.npz")
+        return cached_scene(scene_path(self.folder, scene_id))
 
     def selection(self, split: str | None = None) -> list[SelectionItem]:
         rows = load_rows(self.folder / "selection.parquet")
@@ -174,14 +184,18 @@ class Store:
         kept = (r for r in rows if split in (None, r["split"]) and r["pool"] == pool)
         return [RetrievalQuery.from_row(r) for r in kept]
 
+    def standard_test(self) -> list[RetrievalQuery]:
+        """The queries that retrieval is measured on, over the database `test`."""
+        return [q for q in self.retrieval("test") if q.standard]
+
     def database(self, name: str = "test") -> list[FrameRef]:
-        """Frames of a database: test, or counterfactual for that pool's test queries."""
+        """Frames of one of `DATABASES`."""
         rows = load_rows(self.folder / "database.parquet")
         return [FrameRef(r["scene_id"], r["frame"]) for r in rows if r["database"] == name]
 
 
 @lru_cache(maxsize=512)
-def _cached_scene(path: Path) -> Scene:
+def cached_scene(path: Path) -> Scene:
     return load_scene(path)
 
 

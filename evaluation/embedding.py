@@ -32,9 +32,9 @@ def rank_all(
     Raises:
         UserError: there is no test query.
     """
-    queries, database = store.retrieval("test"), store.database("test")
+    queries, database = store.standard_test(), store.database("test")
     if not queries:
-        raise UserError(f"{store.folder} has no test queries of the retrieval track to measure on")
+        raise UserError(f"{store.folder} has no queries of the standard test to measure on")
     asked = embed_queries(model, queries, frames, cfg, batch)
     shown = embed_frames(model, database, frames, cfg, batch)
     column = {frame: k for k, frame in enumerate(database)}

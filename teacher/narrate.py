@@ -11,7 +11,7 @@ import hashlib
 import json
 import logging
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -22,7 +22,6 @@ from tqdm import tqdm
 from conf.entry import Run, command
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
-from data.workers import pool
 from teacher.journal import Journal
 from teacher.predicates import Predicates, predicates_of
 from teacher.prompts import PROMPT_VERSION, messages
@@ -36,8 +35,6 @@ log = logging.getLogger(__name__)
 
 BATCH = 200
 """Lines of the built-in narrator between two waits for the disk."""
-POOL_FROM = 2000
-"""Items from which processes are worth their start."""
 
 Job = tuple[SelectionItem, int]
 """An item and the number of its next attempt."""
@@ -73,7 +70,7 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
-    report = narrate_store(store, cfg.teacher, cfg.workers)
+    report = narrate_store(store, cfg.teacher)
     log.info(report)
     return {
         "accepted": float(len(report.rationales)),
@@ -84,15 +81,15 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
     }
 
 
-def ensure_rationales(store: Store, cfg: TeacherConfig, workers: int) -> list[Rationale]:
+def ensure_rationales(store: Store, cfg: TeacherConfig) -> list[Rationale]:
     """The accepted rationale of each training item that has one, in item order; asks for those
     that are still to come."""
-    report = narrate_store(store, cfg, workers)
+    report = narrate_store(store, cfg)
     log.info(report)
     return report.rationales
 
 
-def narrate_store(store: Store, cfg: TeacherConfig, workers: int) -> Report:
+def narrate_store(store: Store, cfg: TeacherConfig) -> Report:
     """Ask a teacher for what is missing, and report on all of its answers.
 
     Raises:
@@ -117,7 +114,7 @@ def narrate_store(store: Store, cfg: TeacherConfig, workers: int) -> Report:
                     answers[rationale.item_id].append(rationale)
 
             if cfg.url is None:
-                too_short = _narrate_all(jobs, store, cfg, workers, keep, bar)
+                too_short = _narrate_all(jobs, store, cfg, keep, bar)
             else:
                 too_short = asyncio.run(_ask_all(jobs, store, cfg, keep, bar))
     return _report(items, answers, cfg, too_short)
@@ -190,13 +187,13 @@ def _narrate_all(
     jobs: list[Job],
     store: Store,
     cfg: TeacherConfig,
-    workers: int,
     keep: Callable[[list[Rationale]], None],
     bar: tqdm,
 ) -> int:
     """Narrate in item order without a server; gives the count of too short prefixes."""
     too_short, batch = 0, []
-    for given in _narrated(jobs, store, cfg, workers):
+    for job in jobs:
+        given = _narrate_one(job, store, cfg)
         too_short += not given
         batch += given
         if len(batch) >= BATCH:
@@ -205,17 +202,6 @@ def _narrate_all(
         bar.update()
     keep(batch)
     return too_short
-
-
-def _narrated(
-    jobs: list[Job], store: Store, cfg: TeacherConfig, workers: int
-) -> Iterator[list[Rationale]]:
-    if workers < 2 or len(jobs) < POOL_FROM:
-        for job in jobs:
-            yield _narrate_one(job, store, cfg)
-        return
-    with pool(workers, _enter_worker, (store, cfg)) as processes:
-        yield from processes.map(_narrate_in_worker, jobs, chunksize=64)
 
 
 def _narrate_one(job: Job, store: Store, cfg: TeacherConfig) -> list[Rationale]:
@@ -231,18 +217,6 @@ def _narrate_one(job: Job, store: Store, cfg: TeacherConfig) -> list[Rationale]:
         if given[-1].accepted:
             break
     return given
-
-
-_worker: tuple[Store, TeacherConfig]
-
-
-def _enter_worker(store: Store, cfg: TeacherConfig) -> None:
-    global _worker
-    _worker = (store, cfg)
-
-
-def _narrate_in_worker(job: Job) -> list[Rationale]:
-    return _narrate_one(job, *_worker)
 
 
 async def _ask_all(

@@ -12,9 +12,9 @@ from conf.schema import (
     RetrievalTrackConfig,
     SelectionConfig,
 )
-from data.build import build
+from data.build import ensure_benchmark
 from data.selection import event, time, window
-from data.store import Store, open_store
+from data.store import Store
 
 
 def micro_config(**changes: object) -> BenchmarkConfig:
@@ -34,7 +34,10 @@ def micro_config(**changes: object) -> BenchmarkConfig:
             builders={str(k): Quota(train=4, test=2) for k in range(1, 7)},
             counterfactual=Quota(train=4, test=2),
             hard_negatives=2,
+            standard=12,
             database=60,
+            source=160,
+            counterfactual_source=60,
         ),
     }
     return BenchmarkConfig(**{**settings, **changes})
@@ -48,5 +51,4 @@ def micro() -> BenchmarkConfig:
 @pytest.fixture(scope="session")
 def micro_store(tmp_path_factory: pytest.TempPathFactory, micro: BenchmarkConfig) -> Store:
     folder: Path = tmp_path_factory.mktemp("store") / "micro"
-    build(micro, folder, workers=2)
-    return open_store(folder)
+    return ensure_benchmark(micro, folder.parent, workers=2)

@@ -24,7 +24,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     rationales = []
     if cfg.train.regime != "answer_only":
-        rationales = ensure_rationales(store, cfg.teacher, cfg.workers)
+        rationales = ensure_rationales(store, cfg.teacher)
 
     from transformers import Trainer, TrainingArguments, set_seed
 

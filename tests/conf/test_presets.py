@@ -99,8 +99,12 @@ def test_the_paper_quotas_add_up():
         assert sum(q.test for c, q in track.window.items() if c.startswith(name)) == test
     builders = benchmark.retrieval.builders
     assert sorted(builders) == ["1", "2", "3", "4", "5", "6"]
-    assert sum(q.train for q in builders.values()) == 22_500
-    assert sum(q.test for q in builders.values()) == 2_002
-    absent = benchmark.retrieval.counterfactual
-    assert absent.train + absent.test == 18_225
+    assert sum(q.train + q.test for q in builders.values()) == 22_500
+    retrieval = benchmark.retrieval
+    assert (retrieval.standard, retrieval.database, retrieval.source) == (2_002, 10_000, 30_000)
+    absent = retrieval.counterfactual
+    assert (absent.train + absent.test, retrieval.counterfactual_source) == (18_225, 26_995)
+    # The 80/20 division of scenes, kept in the pools.
+    for quota in (*builders.values(), absent):
+        assert quota.train == 4 * quota.test
     assert benchmark.selection.event["future_offset_gap10"] == schema.Quota(163, 35)

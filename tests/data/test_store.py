@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +16,11 @@ import pytest
 
 from conf.errors import SettingsError, UserError
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
-from data.build import build, ensure_benchmark, split_scenes
+from data.build import build, ensure_benchmark, ensure_items
 from data.growing import growing_folder
-from data.store import MANIFEST, digests, open_store, write_atomically
+from data.parallel import Workers
+from data.scenes import split_scenes
+from data.store import MANIFEST, digest, digests, open_store, write_atomically
 
 
 def small(**changes: object) -> BenchmarkConfig:
@@ -36,9 +39,7 @@ def small(**changes: object) -> BenchmarkConfig:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("built") / "small"
-    build(small(), folder, workers=1)
-    return folder
+    return ensure_benchmark(small(), tmp_path_factory.mktemp("built"), workers=1).folder
 
 
 @pytest.fixture
@@ -48,51 +49,77 @@ def copy(built: Path, tmp_path: Path) -> Path:
 
 
 def contents(folder: Path) -> dict[str, str]:
-    return {**digests(folder), MANIFEST: (folder / MANIFEST).read_text()}
+    frames = {p.name: digest(p) for p in (folder / "frames").glob("*.zip")}
+    return {**digests(folder), **frames, MANIFEST: (folder / MANIFEST).read_text()}
 
 
 @pytest.mark.slow
 def test_two_builds_are_the_same_bytes_whatever_the_workers(built, tmp_path) -> None:
-    build(small(), tmp_path / "small", workers=2)
+    ensure_benchmark(small(), tmp_path, workers=2)
     assert contents(tmp_path / "small") == contents(built)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", ["scenes", "frames"])
+@pytest.mark.parametrize("part", [".small.partial/scenes", "small/frames"])
 def test_a_killed_build_goes_on_to_the_same_bytes(built, tmp_path, part) -> None:
     code = (
         "from pathlib import Path\n"
         "from tests.data.test_store import *\n"
-        f"if __name__ == '__main__': build(small(), Path({str(tmp_path)!r}) / 'small', workers=2)"
+        f"if __name__ == '__main__': ensure_benchmark(small(), Path({str(tmp_path)!r}), workers=2)"
     )
     script = tmp_path / "run.py"
     script.write_text(code)
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     child = subprocess.Popen([sys.executable, script], env=env)
-    parts = tmp_path / ".small.partial" / part
-    while child.poll() is None and len(list(parts.glob("*"))) < 2:
-        time.sleep(0.02)
+    parts = tmp_path / part
+    while child.poll() is None and len(list(parts.glob("[!.]*"))) < 2:
+        time.sleep(0.005)
     workers = psutil.Process(child.pid).children()
     child.kill()
     child.wait()
-    assert not (tmp_path / "small").exists()
     assert workers
     assert not psutil.wait_procs(workers, timeout=30)[1]
     first = {p.name: p.stat().st_mtime_ns for p in parts.glob("[!.]*")}
-    build(small(), tmp_path / "small", workers=1)
+    ensure_benchmark(small(), tmp_path, workers=1)
     assert contents(tmp_path / "small") == contents(built)
-    kept = tmp_path / "small" / part
+    kept = tmp_path / "small" / parts.name
     assert all((kept / name).stat().st_mtime_ns == when for name, when in first.items())
 
 
 @pytest.mark.slow
-def test_a_build_of_other_settings_is_not_thrown_away(tmp_path) -> None:
+def test_a_cluster_that_loses_a_worker_builds_the_same_bytes(built, tmp_path) -> None:
+    killed = []
+
+    def kill_one() -> None:
+        parts = tmp_path / ".small.partial" / "scenes"
+        while not list(parts.glob("[!.]*")):
+            time.sleep(0.005)
+        actors = [p for p in psutil.process_iter(["name"]) if "PoolActor" in p.info["name"]]
+        actors[0].kill()
+        killed.append(actors[0].pid)
+
+    killer = threading.Thread(target=kill_one)
+    killer.start()
+    store = ensure_items(small(), tmp_path, Workers(2, "ray"))
+    killer.join()
+    assert killed
+    assert digests(store.folder) == digests(built)
+
+
+@pytest.mark.slow
+def test_a_build_of_other_scenes_is_not_thrown_away(tmp_path) -> None:
+    nothing = {"selection": SelectionConfig(), "retrieval": RetrievalTrackConfig()}
     with pytest.raises(UserError, match="would be empty"):
-        build(small(selection=SelectionConfig(time={"in_1s": Quota()}),
-                    retrieval=RetrievalTrackConfig()), tmp_path / "small", workers=1)  # fmt: skip
-    with pytest.raises(UserError, match=r"unfinished build with .*=\d+, you ask for"):
-        build(small(), tmp_path / "small", workers=1)
-    assert len(list((tmp_path / ".small.partial" / "scenes").iterdir())) == 6
+        build(small(**nothing), tmp_path / "small", Workers(1))
+    with pytest.raises(UserError, match=r"with benchmark\.max_objects=6, you ask for 5"):
+        build(small(max_objects=5), tmp_path / "small", Workers(1))
+    scenes = tmp_path / ".small.partial" / "scenes"
+    first = {p.name: p.stat().st_mtime_ns for p in scenes.iterdir()}
+    assert len(first) == 6
+    # Other items of the same scenes go on with them.
+    build(small(), tmp_path / "small", Workers(1))
+    kept = tmp_path / "small" / "scenes"
+    assert {p.name: p.stat().st_mtime_ns for p in kept.iterdir()} == first
 
 
 def test_a_build_is_one_process_own(tmp_path) -> None:
@@ -100,7 +127,7 @@ def test_a_build_is_one_process_own(tmp_path) -> None:
         growing_folder(small(), tmp_path / "small"),
         pytest.raises(UserError, match="another process"),
     ):
-        build(small(), tmp_path / "small", workers=1)
+        build(small(), tmp_path / "small", Workers(1))
 
 
 @pytest.mark.parametrize("scenes", [10, 12, 100])
@@ -117,7 +144,7 @@ def test_a_split_without_scenes_is_refused() -> None:
         split_scenes(small(scenes=4, test_share=0.01))
 
 
-@pytest.mark.parametrize("part", ["selection.parquet", "scenes", "frames"])
+@pytest.mark.parametrize("part", ["selection.parquet", "scenes"])
 def test_a_damaged_part_is_named(copy, part) -> None:
     path = copy / part
     path = next(path.iterdir()) if path.is_dir() else path
@@ -161,14 +188,14 @@ def test_other_settings_are_named(copy) -> None:
     with pytest.raises(
         UserError, match=r"benchmark\.selection\.time\.in_1s\.train=2, you ask for 3"
     ):
-        ensure_benchmark(asked, copy.parent, workers=1)
+        ensure_benchmark(asked, copy.parent, 1)
 
 
 def test_a_benchmark_that_would_be_empty_is_refused(built, tmp_path) -> None:
     subprocess.run(["cp", "-r", built / "scenes", tmp_path / "scenes"], check=True)
     nothing = replace(small().selection, min_displacement=1000.0)
     with pytest.raises(UserError, match="would be empty"):
-        build(small(selection=nothing), tmp_path / "small", workers=1)
+        build(small(selection=nothing), tmp_path / "small", Workers(1))
     assert not (tmp_path / "small").exists()
 
 
@@ -176,7 +203,7 @@ def test_an_unknown_cell_is_named(tmp_path) -> None:
     unknown = SelectionConfig(event={"future_offset_gap11": Quota(train=1)})
     said = r"selection\.event\.future_offset_gap11: .* did you mean future_offset_gap10\?"
     with pytest.raises(SettingsError, match=said):
-        build(small(selection=unknown), tmp_path / "small", workers=1)
+        build(small(selection=unknown), tmp_path / "small", Workers(1))
     assert not list(tmp_path.iterdir())
 
 

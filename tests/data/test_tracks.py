@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 
 from data.events import window_group
-from data.frames import Frames
+from data.frames import FrameCache, Frames, load_frames, save_frames
 from data.geometry import displacement_across, displacements, object_match
 from data.records import FPS, FrameRef, SelectionItem
 from data.retrieval.counterfactual import consequence
+from data.retrieval.database import Album
 from data.selection import window
 from data.store import Store
 
@@ -235,29 +237,78 @@ def test_counterfactuals_ask_for_what_the_absence_changes(micro_store) -> None:
             assert displacement_across(*ends[0], *ends[1]) >= least
 
 
-def test_the_counterfactual_database_holds_targets_and_what_happened(micro_store) -> None:
-    queries = micro_store.retrieval("test", pool="counterfactual")
-    database = micro_store.database("counterfactual")
-    assert {q.target for q in queries} <= set(database)
+def test_databases_hold_targets_and_no_twins(micro_store) -> None:
     frames = Frames(micro_store)
-    pixels = [frames.array(f.scene_id, f.frame).tobytes() for f in database]
-    factual = [frames.array(q.scene_id, q.target.frame).tobytes() for q in queries]
-    assert len(set(pixels)) == len(pixels)
-    assert set(factual) <= set(pixels)
+    for name, pool in (
+        ("test", "standard"), ("future", "future"), ("counterfactual", "counterfactual")
+    ):  # fmt: skip
+        queries = (
+            micro_store.standard_test() if pool == "standard" else micro_store.retrieval(pool=pool)
+        )
+        database = micro_store.database(name)
+        assert {q.target for q in queries} <= set(database)
+        pixels = {frames.array(f.scene_id, f.frame).tobytes() for f in database}
+        assert len(pixels) == len(database) == len(set(database))
 
 
-def test_the_database_holds_each_target_once_and_no_twins(micro_store) -> None:
-    database = micro_store.database()
-    assert {q.target for q in micro_store.retrieval("test")} <= set(database)
+def test_the_standard_test_is_of_test_scenes_alone(micro_store) -> None:
+    queries, database = micro_store.standard_test(), micro_store.database("test")
+    assert set(Counter(q.builder for q in queries).values()) == {2}
     assert {f.scene_id for f in database} <= set(micro_store.scene_ids("test"))
-    frames = Frames(micro_store)
-    pixels = {frames.array(f.scene_id, f.frame).tobytes() for f in database}
-    assert len(pixels) == len(database) == len(set(database))
+    assert set(database) <= set(micro_store.database("future"))
+
+
+def test_the_counterfactual_database_shows_what_happened_instead(micro_store) -> None:
+    database = set(micro_store.database("counterfactual"))
+    for query in micro_store.retrieval(pool="counterfactual"):
+        assert query.hard_negatives[0] in database
+
+
+def test_twins_are_those_that_do_not_move(micro_store) -> None:
+    scene = micro_store.scene(micro_store.scene_ids("test")[0])
+    still = replace(
+        scene,
+        **{
+            name: np.repeat(getattr(scene, name)[:1], scene.frames, axis=0) for name in scene.ARRAYS
+        },
+    )
+    album = Album({"moving": scene, "still": still}.get)
+    for frame in range(scene.frames):
+        album.add(FrameRef("still", frame))
+    assert list(album.frames) == [FrameRef("still", 0)]
+    assert album.left_out == scene.frames - 1
+    # The other scene begins as this one stands.
+    assert not album.add(FrameRef("moving", 0))
+    taken = [f.frame for f in album.fill(["moving"], 200, seed=0)]
+    apart = displacements(scene)[np.ix_(taken, taken)]
+    assert len(taken) > 20
+    assert apart[~np.eye(len(taken), dtype=bool)].min() > 0.9
 
 
 def test_a_stored_frame_is_the_frame_drawn_anew(micro_store) -> None:
     item = micro_store.selection("train")[0]
-    frames = Frames(micro_store)
-    drawn = frames._draw(micro_store.scene(item.scene_id), item.target_frame)
-    stored = frames.array(item.scene_id, item.target_frame)
-    np.testing.assert_array_equal(np.asarray(drawn), stored)
+    drawn = FrameCache.of(micro_store).draw(item.scene_id, [item.target_frame])
+    stored = Frames(micro_store).array(item.scene_id, item.target_frame)
+    np.testing.assert_array_equal(drawn[item.target_frame], stored)
+
+
+def test_frames_come_back_as_they_were_kept(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    frames = {k: rng.integers(0, 256, (6, 9, 3), dtype=np.uint8) for k in (7, 3, 120)}
+    save_frames(frames, tmp_path / "a.zip")
+    back = load_frames(tmp_path / "a.zip")
+    assert list(back) == [3, 7, 120]
+    for frame, pixels in frames.items():
+        np.testing.assert_array_equal(back[frame], pixels)
+        np.testing.assert_array_equal(load_frames(tmp_path / "a.zip", [frame])[frame], pixels)
+    assert load_frames(tmp_path / "a.zip", [4]) == {}
+    assert load_frames(tmp_path / "none.zip") == {}
+
+
+@pytest.mark.parametrize("damage", [lambda w: w[:40], lambda w: w[:60] + b"x" + w[61:]])
+def test_a_damaged_archive_is_told_and_drawn_again(tmp_path, caplog, damage) -> None:
+    path = tmp_path / "a.zip"
+    save_frames({5: np.full((8, 8, 3), 9, np.uint8)}, path)
+    path.write_bytes(damage(path.read_bytes()))
+    assert load_frames(path) == {}
+    assert "a.zip is damaged" in caplog.text

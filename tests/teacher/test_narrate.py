@@ -63,67 +63,58 @@ def lines(store):
 
 
 def test_template_narrates_every_training_item_but_short_ones(store):
-    report = narrate_store(store, TEMPLATE, 1)
+    report = narrate_store(store, TEMPLATE)
     assert [r.item_id for r in report.rationales] == [f"item-{k}" for k in range(13) if k != 5]
     assert (report.too_short, report.set_aside, report.rejected.total()) == (1, 0, 0)
     before = lines(store)
-    assert ensure_rationales(store, TEMPLATE, 1) == report.rationales
+    assert ensure_rationales(store, TEMPLATE) == report.rationales
     assert lines(store) == before
 
 
 @pytest.mark.parametrize("kept", [0, 10, 0.3, 0.5, -1])
 def test_a_killed_run_ends_with_the_same_bytes(store, kept):
-    narrate_store(store, TEMPLATE, 1)
+    narrate_store(store, TEMPLATE)
     whole = lines(store)
     cut = int(kept * len(whole)) if isinstance(kept, float) else kept
     (store.folder / "rationales.jsonl").write_bytes(whole[:cut])
-    narrate_store(store, TEMPLATE, 1)
-    assert lines(store) == whole
-
-
-def test_processes_write_the_same_bytes(store, monkeypatch):
-    narrate_store(store, TEMPLATE, 1)
-    whole = lines(store)
-    (store.folder / "rationales.jsonl").unlink()
-    monkeypatch.setattr("teacher.narrate.POOL_FROM", 1)
-    narrate_store(store, TEMPLATE, 2)
+    narrate_store(store, TEMPLATE)
     assert lines(store) == whole
 
 
 def test_a_damaged_line_is_named(store):
-    narrate_store(store, TEMPLATE, 1)
+    narrate_store(store, TEMPLATE)
     damaged = lines(store).splitlines(keepends=True)
     damaged[2] = b'{"item_id": "item-2"}\n'
     (store.folder / "rationales.jsonl").write_bytes(b"".join(damaged))
     with pytest.raises(UserError, match=r"rationales\.jsonl, line 3"):
-        narrate_store(store, TEMPLATE, 1)
+        narrate_store(store, TEMPLATE)
 
 
 def test_an_edited_line_is_named(store):
-    narrate_store(store, TEMPLATE, 1)
+    narrate_store(store, TEMPLATE)
     edited = lines(store).replace(b"Scene parse: ", b"Scene parse: There are 3 cubes. ", 1)
     (store.folder / "rationales.jsonl").write_bytes(edited)
     with pytest.raises(UserError, match=r"rationales\.jsonl, line 1: .* changed after it was"):
-        narrate_store(store, TEMPLATE, 1)
+        narrate_store(store, TEMPLATE)
 
 
 def test_answers_under_other_settings_are_not_taken(store):
-    first = narrate_store(store, TEMPLATE, 1)
+    first = narrate_store(store, TEMPLATE)
     strict = TeacherConfig(name="template", min_words=240, max_words=250, attempts=1)
-    assert narrate_store(store, strict, 1).rationales == []
+    assert narrate_store(store, strict).rationales == []
     before = lines(store)
-    assert narrate_store(store, TEMPLATE, 1).rationales == first.rationales
+    assert narrate_store(store, TEMPLATE).rationales == first.rationales
     assert lines(store) == before
 
 
 def test_only_one_writer(store):
     with Journal(store.folder / "rationales.jsonl"), pytest.raises(UserError, match="another run"):
-        narrate_store(store, TEMPLATE, 1)
+        narrate_store(store, TEMPLATE)
 
 
 def test_rejected_answers_are_kept_and_set_aside(store):
     cfg = TeacherConfig(name="template", min_words=240, max_words=250, attempts=2)
-    report = narrate_store(store, cfg, 1)
+    report = narrate_store(store, cfg)
     kept = read_rationales(store.folder / "rationales.jsonl")
     assert report.rationales == []
     assert (report.set_aside, report.rejected) == (12, {"too short": 24})
@@ -231,7 +222,7 @@ def config(server, **changes):
 
 def test_served_answers_are_judged_and_faults_cost_no_attempt(store, serve):
     server = serve(503, "cut", 500, "number")
-    report = narrate_store(store, config(server), 1)
+    report = narrate_store(store, config(server))
     assert [r.item_id for r in report.rationales] == [f"item-{k}" for k in range(13) if k != 5]
     assert report.rejected == {"cut off": 1, "number": 1}
     assert report.too_short == 1
@@ -245,11 +236,11 @@ def test_served_answers_are_judged_and_faults_cost_no_attempt(store, serve):
 
 def test_a_killed_served_run_asks_only_for_the_rest(store, serve):
     server = serve()
-    narrate_store(store, config(server), 1)
+    narrate_store(store, config(server))
     whole = lines(store).splitlines(keepends=True)
     (store.folder / "rationales.jsonl").write_bytes(b"".join(whole[:7]) + whole[7][:40])
     server.asked.clear()
-    report = narrate_store(store, config(server), 1)
+    report = narrate_store(store, config(server))
     assert len(server.asked) == len(whole) - 7
     assert len(report.rationales) == 12
 
@@ -257,12 +248,12 @@ def test_a_killed_served_run_asks_only_for_the_rest(store, serve):
 def test_an_unknown_model_is_named_with_those_there(store, serve):
     server = serve(404)
     with pytest.raises(UserError, match=r"teacher\.model=tiny; it has other"):
-        narrate_store(store, config(server, concurrency=1), 1)
+        narrate_store(store, config(server, concurrency=1))
 
 
 def test_a_refused_request_is_told(store, serve):
     with pytest.raises(UserError, match="refused a request"):
-        narrate_store(store, config(serve(400), concurrency=1), 1)
+        narrate_store(store, config(serve(400), concurrency=1))
 
 
 @pytest.mark.parametrize(
@@ -272,15 +263,15 @@ def test_a_refused_request_is_told(store, serve):
 )  # fmt: skip
 def test_a_server_of_another_kind_is_told(store, serve, reply):
     with pytest.raises(UserError, match="does not answer as an OpenAI-compatible server"):
-        narrate_store(store, config(serve(reply), concurrency=1), 1)
+        narrate_store(store, config(serve(reply), concurrency=1))
 
 
 def test_another_models_answers_are_not_taken(store, serve):
     server = serve()
-    narrate_store(store, config(server), 1)
+    narrate_store(store, config(server))
     asked = len(server.asked)
     other = TeacherConfig(name="served", url=server.url, model="other", concurrency=2)
-    narrate_store(store, other, 1)
+    narrate_store(store, other)
     assert len(server.asked) == 2 * asked
 
 
@@ -291,4 +282,4 @@ def test_patience_ends_with_the_url(store, serve):
     server.shutdown()
     server.server_close()
     with pytest.raises(UserError, match=url):
-        narrate_store(store, cfg, 1)
+        narrate_store(store, cfg)
