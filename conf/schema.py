@@ -37,12 +37,14 @@ class SelectionConfig:
     event: dict[str, Quota] = field(default_factory=dict)
     time: dict[str, Quota] = field(default_factory=dict)
     window: dict[str, Quota] = field(default_factory=dict)
+    matched: Quota = field(default_factory=Quota)
+    """Pairs of items that differ in their question's anchor alone, a suite of their own."""
 
     def check(self) -> list[str]:
         problems = _too_small(self, "benchmark.selection.", {"min_displacement": 0})
         for family in ("event", "time", "window"):
             problems += _quota_problems(f"benchmark.selection.{family}", getattr(self, family))
-        return problems
+        return problems + _quota_problems("benchmark.selection", {"matched": self.matched})
 
 
 @dataclass
@@ -483,9 +485,21 @@ class SelectCommand(CommandConfig):
     """Test items at most, spread over the cells; null takes all."""
     seed: int = 0
     """Of the items that `limit` leaves."""
+    suite: str | None = None
+    """matched_anchor for the pairs that differ in their anchor alone; null takes the benchmark's
+    own items."""
+    control: str | None = None
+    """candidate_only hides the prefix, shuffled_prefix shows its frames out of order; null shows
+    it as it is."""
 
     def check(self) -> list[str]:
         problems = super().check() + _too_small(self, "", {"batch": 1, "limit": 1})
+        if self.suite not in (None, "matched_anchor"):
+            problems.append(f"suite={self.suite}: the options are matched_anchor and null")
+        if self.control not in (None, "candidate_only", "shuffled_prefix"):
+            problems.append(
+                f"control={self.control}: the options are candidate_only, shuffled_prefix and null"
+            )
         if sorted(self.modes) not in (["answer"], ["reasoning"], ["answer", "reasoning"]):
             problems.append(f"modes={self.modes}: give reasoning, answer or both, each once")
         return problems

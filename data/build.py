@@ -91,6 +91,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers) -> None:
         save_rows(rows, growing / "database.parquet")
         manifest = {
             "name": cfg.name,
+            "suite": "dynapix",
             "seed": cfg.seed,
             **VERSIONS,
             "config": asdict(cfg),

@@ -27,7 +27,7 @@ from data.records import COLORS, FPS, FRAMES, MATERIALS, SHAPES, Collision, Scen
 if TYPE_CHECKING:
     from pybullet_utils.bullet_client import BulletClient
 
-GENERATOR_VERSION = "1"
+GENERATOR_VERSION = "2"
 """Changes whenever the same seed and index would give another scene."""
 
 SUBSTEPS = 7

@@ -19,6 +19,7 @@ from typing import Any
 
 from conf.schema import BenchmarkConfig, Quota
 from data.bullet import GENERATOR_VERSION
+from data.controls import MATCHED, fill_pairs
 from data.parallel import Workers
 from data.records import RetrievalQuery, Scene, SelectionItem
 from data.retrieval import counterfactual, future
@@ -59,12 +60,12 @@ def make_items_and_queries(
     for name in cells:
         part = json.loads(paths[name].read_bytes())
         track, group, _ = name.split("/")
-        if track == "selection":
-            items += map(SelectionItem.from_row, part["rows"])
-            dropped[f"items dropped, too alike/{group}"] += part["dropped"]
-        else:
+        if track == "retrieval":
             queries += map(RetrievalQuery.from_row, part["rows"])
             dropped["queries dropped, too alike"] += part["dropped"]
+        else:
+            items += map(SelectionItem.from_row, part["rows"])
+            dropped[f"items dropped, too alike/{group}"] += part["dropped"]
     return items, queries, dict(dropped)
 
 
@@ -82,6 +83,7 @@ def _cells(cfg: BenchmarkConfig) -> dict[str, Quota]:
             for family, quotas in family_quotas(cfg).items()
             for subtype, quota in quotas.items()
         },
+        f"controls/{MATCHED}/pairs": cfg.selection.matched,
         **{f"retrieval/future/{b}": _more(quota) for b, quota in cfg.retrieval.builders.items()},
         "retrieval/counterfactual/all": _more(cfg.retrieval.counterfactual),
     }
@@ -126,6 +128,8 @@ def _make_cell(
     if track == "selection":
         draw = partial(FAMILY_BUILDERS[group].draft, cell)
         found, dropped = drafts.fill(cell, draw, scene_ids, scene_of, quota, cfg.seed, least)
+    elif track == "controls":
+        found, dropped = fill_pairs(scene_ids, scene_of, quota, cfg.seed, least)
     else:
         shared = (scene_ids, scene_of, quota, cfg.retrieval.hard_negatives, least, cfg.seed)
         found, dropped = (

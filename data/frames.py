@@ -21,6 +21,7 @@ import numpy as np
 import pyarrow as pa
 from PIL import Image
 
+from data.records import Scene
 from data.render import renderer
 from data.store import Store, cached_scene, scene_path, write_atomically
 
@@ -109,6 +110,7 @@ class Frames:
 
     def __init__(self, store: Store, size: int | None = None) -> None:
         """With `size`, frames come as squares of size x size px, as models are shown them."""
+        self._store = store
         self._cache = FrameCache.of(store)
         self._size = size
         self._kept: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
@@ -131,6 +133,9 @@ class Frames:
         while self._bytes > CACHE_BYTES:
             self._bytes -= self._kept.popitem(last=False)[1].nbytes
         return stack
+
+    def scene(self, scene_id: str) -> Scene:
+        return self._store.scene(scene_id)
 
     def image(self, scene_id: str, frame: int) -> Image.Image:
         return Image.fromarray(self.array(scene_id, frame))

@@ -9,6 +9,7 @@ from collections import defaultdict
 from functools import partial
 from typing import Any
 
+from data.controls import MATCHED
 from data.frames import FrameCache, load_frames, save_frames
 from data.parallel import Workers
 from data.records import FrameRef, shown_frames
@@ -73,7 +74,7 @@ def named_frames(store: Store) -> dict[str, set[int]]:
     """The frames of each scene that items, queries and databases name."""
     named: dict[str, set[int]] = defaultdict(set)
     count = store.manifest["config"]["prefix_frames"]
-    items = store.selection()
+    items = [*store.selection(), *store.selection(suite=MATCHED)]
     queries = [q for pool in ("future", "counterfactual") for q in store.retrieval(pool=pool)]
     for asked in (*items, *queries):
         shown = shown_frames(asked.prefix_start, asked.prefix_stop, count)

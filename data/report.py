@@ -6,6 +6,7 @@ from collections import Counter
 
 from conf.schema import BenchmarkConfig
 from data.cells import family_quotas
+from data.controls import MATCHED
 from data.records import SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from data.store import Store
 
@@ -18,7 +19,7 @@ def count(
 ) -> dict[str, int]:
     """Scenes, items by family, queries by builder and frames by database."""
     tally = Counter({f"scenes/{split}": len(names) for split, names in scene_ids.items()})
-    tally.update(f"selection/{i.family}/{i.split}" for i in items)
+    tally.update(f"{_track(i)}/{i.family}/{i.split}" for i in items)
     tally.update(f"retrieval/{_builder(q)}/{q.split}" for q in queries)
     tally["retrieval/standard test"] = sum(q.standard for q in queries)
     tally.update({f"database/{name}": len(frames) for name, frames in databases.items()})
@@ -32,7 +33,9 @@ def shortfalls(
     databases: dict[str, list[FrameRef]],
 ) -> dict[str, str]:
     """What every cell, builder and database has, where that is less than its quota."""
-    found = Counter((f"{i.family}/{i.subtype}", i.split) for i in items)
+    found = Counter((f"{i.family}/{i.subtype}", i.split) for i in items if i.suite != MATCHED)
+    # A pair is two items.
+    found.update((MATCHED, i.split) for i in items if i.suite == MATCHED and i.family == "time")
     found.update((_builder(q), q.split) for q in queries)
     wanted = {
         **{
@@ -40,6 +43,7 @@ def shortfalls(
             for family, quotas in family_quotas(cfg).items()
             for cell, quota in quotas.items()
         },
+        MATCHED: cfg.selection.matched,
         **{f"builder {b}": quota for b, quota in cfg.retrieval.builders.items()},
         "counterfactual": cfg.retrieval.counterfactual,
     }
@@ -59,6 +63,10 @@ def shortfalls(
         if 0 < len(frames) < sizes[name]:
             short[f"database/{name}"] = f"{len(frames)} of {sizes[name]}"
     return short
+
+
+def _track(item: SelectionItem) -> str:
+    return MATCHED if item.suite == MATCHED else "selection"
 
 
 def _builder(query: RetrievalQuery) -> str:

@@ -174,9 +174,17 @@ class Store:
     def scene(self, scene_id: str) -> Scene:
         return cached_scene(scene_path(self.folder, scene_id))
 
-    def selection(self, split: str | None = None) -> list[SelectionItem]:
+    @property
+    def suite(self) -> str:
+        """The suite of the benchmark's own items."""
+        return self.manifest["suite"]
+
+    def selection(self, split: str | None = None, suite: str | None = None) -> list[SelectionItem]:
+        """Items of a suite, by default the benchmark's own."""
         rows = load_rows(self.folder / "selection.parquet")
-        return [SelectionItem.from_row(r) for r in rows if split in (None, r["split"])]
+        asked = suite or self.suite
+        kept = (r for r in rows if split in (None, r["split"]) and r["suite"] == asked)
+        return [SelectionItem.from_row(r) for r in kept]
 
     def retrieval(self, split: str | None = None, pool: str = "future") -> list[RetrievalQuery]:
         """Queries of a pool, future or counterfactual."""

@@ -44,7 +44,7 @@ def main(cfg: ReportCommand, run: Run) -> None:
     for benchmark in dict.fromkeys(r.benchmark for r in choices):
         rows = [r for r in choices if r.benchmark == benchmark]
         parts.append(f"benchmark {benchmark}\n{selection_table(rows)}")
-        pictures.insert(1, run.folder / f"selection-{benchmark}.png")
+        pictures.insert(1, run.folder / f"selection-{benchmark.replace(', ', '-')}.png")
         selection_figure(rows, pictures[1])
     ranks = [RetrievalRow(**r) for f in retrieved for r in _rows(f)]
     for benchmark in dict.fromkeys(r.benchmark for r in ranks):

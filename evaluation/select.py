@@ -31,9 +31,10 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from evaluation.metrics import accuracy_by, accuracy_table
     from train import backbone
 
-    items = spread(store.selection("test"), cfg.limit, cfg.seed)
+    items = spread(store.selection("test", cfg.suite), cfg.limit, cfg.seed)
     if not items:
-        raise UserError(f"{store.folder} has no test items of the selection track to measure on")
+        suite = cfg.suite or store.suite
+        raise UserError(f"{store.folder} has no test items of the {suite} suite to measure on")
     backbone.keep_big_blocks()
     if folder is not None:
         backbone.check_base(folder, student.model)
@@ -41,20 +42,30 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     else:
         model, processor = backbone.load_base(student, precision, list)
     name = run_title(folder) if folder else f"{student.name} base"
+    asked = ", ".join(filter(None, (store.name, cfg.suite, cfg.control)))
     frames = Frames(store, student.image_size)
     weights = backbone.weights_digest(student.model, folder and folder / "student")
-    measured = f"{weights} on {store.identity}"
+    measured = f"{weights} on {store.identity}, {asked}"
     journal = answers.AnswerLog(run.folder / "answers.jsonl", measured, items)
     rows, subtypes, metrics = [], {}, {}
     for mode in cfg.modes:
         log.info("asking %s in %s mode", name, mode)
         given = answers.ask_all(
-            model, processor, items, mode, frames, student, precision, cfg.batch, journal
+            model,
+            processor,
+            items,
+            mode,
+            frames,
+            student,
+            precision,
+            cfg.batch,
+            journal,
+            cfg.control,
         )
         right = [float(a.right) for a in given]
         accuracy = accuracy_table([i.family for i in items], right)
         parsed = sum(a.letter is not None for a in given) / len(given)
-        rows.append(tables.SelectionRow.of(store.name, name, mode, accuracy, parsed))
+        rows.append(tables.SelectionRow.of(asked, name, mode, accuracy, parsed))
         subtypes[mode] = accuracy_by([f"{i.family}/{i.subtype}" for i in items], right)
         metrics |= {f"{mode}_{f}": found.value for f, found in accuracy.families.items()}
         metrics |= {f"{mode}_macro": accuracy.macro, f"{mode}_micro": accuracy.micro.value}

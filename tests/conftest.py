@@ -29,6 +29,7 @@ def micro_config(**changes: object) -> BenchmarkConfig:
             event=dict.fromkeys(event.CELLS, few),
             time=dict.fromkeys(time.CELLS, few),
             window=dict.fromkeys(window.CELLS, few),
+            matched=few,
         ),
         "retrieval": RetrievalTrackConfig(
             builders={str(k): Quota(train=4, test=2) for k in range(1, 7)},

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from conf.schema import StudentConfig
+from data.controls import observed
 from data.frames import Frames
 from data.records import FPS, FRAMES, LETTERS, SelectionItem, shown_frames
 
@@ -32,24 +33,28 @@ class Sample:
 
     Attributes:
         content: the user message's parts in the chat template's form; media as bare placeholders.
-        video: (T, S, S, 3) uint8 frames of the prefix, whose scene frames are `video_frames`.
+        video: (T, S, S, 3) uint8 frames of the prefix, shown at the times of the scene's frames
+            `video_frames`; None where no prefix is shown.
+        fps, total: the scene's frames a second, and how many it has.
         images: the candidates' (S, S, 3) uint8 pixels in order.
         response: what the assistant should say, or None where it is to be generated.
     """
 
     sample_id: str
     content: list[dict[str, Any]]
-    video: np.ndarray
+    video: np.ndarray | None
     video_frames: list[int]
     images: list[np.ndarray]
     response: str | None = None
+    fps: float = FPS
+    total: int = FRAMES
 
     @property
     def metadata(self) -> dict[str, Any]:
         """The video's true times, so that a processor neither samples again nor assumes a rate."""
         return {
-            "fps": float(FPS),
-            "total_num_frames": FRAMES,
+            "fps": float(self.fps),
+            "total_num_frames": self.total,
             "frames_indices": list(self.video_frames),
         }
 
@@ -64,20 +69,26 @@ def selection_sample(
     frames: Frames,
     cfg: StudentConfig,
     response: str | None = None,
+    control: str | None = None,
 ) -> Sample:
-    """A selection item asked in `mode` ("reasoning" or "answer")."""
-    content: list[dict[str, Any]] = [{"type": "video"}, {"type": "text", "text": item.question}]
+    """A selection item asked in `mode` ("reasoning" or "answer"), its prefix shown as a `control`
+    asks (see `data.controls`)."""
+    shown = observed(item, cfg.frames, control)
+    scene = frames.scene(item.scene_id)
+    content: list[dict[str, Any]] = [{"type": "video"}] if shown else []
+    content.append({"type": "text", "text": item.question})
     for letter in LETTERS:
         content += [{"type": "text", "text": f"\nCandidate {letter}: "}, {"type": "image"}]
     content.append({"type": "text", "text": f"\n{ASK[mode]}"})
-    shown = shown_frames(item.prefix_start, item.prefix_stop, cfg.frames)
     return Sample(
         f"{item.item_id} ({mode})",
         content,
-        frames.stack(item.scene_id, shown),
-        shown,
+        frames.stack(item.scene_id, shown) if shown else None,
+        sorted(shown),
         [frames.array(c.scene_id, c.frame) for c in item.candidates],
         response,
+        scene.fps,
+        scene.frames,
     )
 
 

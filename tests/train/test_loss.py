@@ -134,3 +134,20 @@ def test_the_letters_logits_choose_the_answer(
     chosen, right = LetterChoice(letters).shrink(logits, labels).T
     assert right.tolist() == [i.answer for i in items]
     assert (chosen == right).tolist() == [False] + [True] * 5
+
+
+def test_controls_reach_the_prompt(micro_store, frames, student_cfg, processor) -> None:
+    item = micro_store.selection("test")[0]
+    plain, alone, shuffled = (
+        encode(
+            selection_sample(item, "answer", frames, student_cfg, control=control), processor, 1500
+        )
+        for control in (None, "candidate_only", "shuffled_prefix")
+    )
+    assert "pixel_values_videos" not in alone.media
+    assert len(alone.input_ids) < len(plain.input_ids)
+    # The same times are told of the same frames in another order.
+    assert shuffled.input_ids == plain.input_ids
+    pixels = [e.media["pixel_values_videos"] for e in (plain, shuffled)]
+    assert pixels[0].shape == pixels[1].shape
+    assert not torch.equal(*pixels)
