@@ -58,14 +58,16 @@ def draft(scene: Scene, rng: np.random.Generator, picker: Picker) -> Draft | Non
         moment = found[k]
         later = rng.permutation(np.arange(moment.stop + 1, scene.frames))
         pool = of_scene(scene, later[later != moment.target], "same_time")
-        picked = picker.pick(FrameRef(scene.scene_id, moment.target), pool)
+        prefix = (moment.start, moment.stop)
+        target = FrameRef(scene.scene_id, moment.target)
+        picked = picker.pick(target, pool, drafts.observed(scene, prefix), int(rng.integers(4)))
         if picked is not None:
             return Draft(
                 scene,
                 "time",
                 f"in_{moment.seconds}s",
                 time.question(moment.seconds),
-                (moment.start, moment.stop),
+                prefix,
                 moment.target,
                 *picked,
                 {

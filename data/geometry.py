@@ -207,7 +207,7 @@ def displacements(scene: Scene, about: tuple[int, ...] | None = None) -> np.ndar
         places, shown = places[:, about], shown[:, about]
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
     counts = shown[:, None] | shown[None]
-    return np.minimum(np.where(counts, apart, 0.0).max(axis=-1), DIAGONAL)
+    return np.minimum(np.where(counts, apart, 0.0).max(axis=-1, initial=0.0), DIAGONAL)
 
 
 def displacement_across(scene: Scene, frame: int, other: Scene, other_frame: int) -> float:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from conf.schema import Quota
-from data.geometry import displacement_across, displacements
+from data.geometry import displacement_across, displacements, on_screen
 from data.records import SPLITS, Candidate, FrameRef, Scene, SelectionItem
 
 BUILDERS_VERSION = "4"
@@ -55,19 +55,40 @@ class Picker:
         target: FrameRef,
         pool: Iterable[Candidate],
         about: tuple[int, ...] | None = None,
+        earlier: int | None = None,
     ) -> tuple[tuple[Candidate, ...], float] | None:
         """The first three of `pool` that can be told apart from the target and each other, by one
         of the objects `about` where those are given, and the least displacement between any two of
-        the four; None where there are no such three."""
+        the four; None where there are no such three.
+
+        `earlier` of the three come from before the target and the others from after it, as far as
+        the pool has such: a target that always stands in the midst of its distractors, or before
+        them, could be told without the prefix.
+        """
+        pool = list(pool) if earlier is not None else pool
         chosen: list[FrameRef] = [target]
+        if earlier is not None:
+            room = {True: earlier, False: 3 - earlier}
+            for candidate in pool:
+                side = candidate.frame < target.frame
+                if room[side] and self._tells_apart(candidate, chosen, about):
+                    chosen.append(candidate)
+                    room[side] -= 1
         for candidate in pool:
-            if all(self._apart(candidate, c, about) >= self.least for c in chosen):
-                chosen.append(candidate)
             if len(chosen) == 4:
-                least = min(self._apart(a, b, None) for a, b in combinations(chosen, 2))
-                return tuple(chosen[1:]), least
-        self.dropped += 1
-        return None
+                break
+            if self._tells_apart(candidate, chosen, about):
+                chosen.append(candidate)
+        if len(chosen) < 4:
+            self.dropped += 1
+            return None
+        least = min(self._apart(a, b, None) for a, b in combinations(chosen, 2))
+        return tuple(chosen[1:]), least
+
+    def _tells_apart(
+        self, candidate: FrameRef, chosen: list[FrameRef], about: tuple[int, ...] | None
+    ) -> bool:
+        return all(self._apart(candidate, c, about) >= self.least for c in chosen)
 
     def _apart(self, one: FrameRef, two: FrameRef, about: tuple[int, ...] | None) -> float:
         scene = self.scene_of(one.scene_id)
@@ -86,6 +107,19 @@ class Picker:
 
 Draw = Callable[[Scene, np.random.Generator, Picker], Draft | None]
 """Makes at most one draft of a cell from a scene."""
+
+
+def observed(scene: Scene, prefix: tuple[int, int]) -> tuple[int, ...]:
+    """The objects that show in a prefix. No other can tell candidates apart: nothing is known of
+    where it comes in."""
+    start, stop = prefix
+    return tuple(np.flatnonzero(on_screen(scene)[1][start : stop + 1].any(axis=0)).tolist())
+
+
+def unobserved(frames: Iterable[int], prefix: tuple[int, int]) -> list[int]:
+    """The frames that are not in a prefix. One that was shown is told by comparing."""
+    start, stop = prefix
+    return [int(f) for f in frames if not start <= f <= stop]
 
 
 def of_scene(scene: Scene, frames: Iterable[int], source: str) -> Iterator[Candidate]:

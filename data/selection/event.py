@@ -13,7 +13,7 @@ import numpy as np
 
 from data.geometry import object_match
 from data.records import Candidate, FrameRef, Scene
-from data.selection.drafts import Draft, Picker, of_scene
+from data.selection.drafts import Draft, Picker, observed, of_scene, unobserved
 
 QUESTION = "Which image is closest to the correct future state of the whole scene?"
 PREFIX_STEP = 20
@@ -71,7 +71,13 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) 
     for k in rng.permutation(len(found)):
         moment = found[k]
         pool = wrong_frames(cell, scene, moment, rng, picker)
-        picked = picker.pick(FrameRef(scene.scene_id, moment.target), pool)
+        across = cell.distractors == "cross_scene"
+        picked = picker.pick(
+            FrameRef(scene.scene_id, moment.target),
+            pool,
+            observed(scene, (moment.start, moment.stop)),
+            None if across else int(rng.integers(4)),
+        )
         if picked is None:
             continue
         return Draft(
@@ -98,13 +104,14 @@ def wrong_frames(
     """Distractors of the cell's source, in the order in which they are wanted: the scene at
     offsets on either side, the scene's frames most alike to the target, or other scenes at such a
     moment of their own."""
-    target = moment.target
+    target, prefix = moment.target, (moment.start, moment.stop)
     if cell.distractors == "same_offset":
         pool = [f for o in OFFSETS for f in (target - o, target + o) if 0 <= f < scene.frames]
-        return of_scene(scene, rng.permutation(pool), cell.distractors)
+        return of_scene(scene, rng.permutation(unobserved(pool, prefix)), cell.distractors)
     if cell.distractors == "same_obj_match":
         alike = np.argsort(object_match(scene, target), kind="stable")
-        return of_scene(scene, alike[alike != target], cell.distractors)
+        wrong = unobserved(alike[alike != target], prefix)
+        return of_scene(scene, wrong, cell.distractors)
     return (
         Candidate(other.scene_id, there.target, cell.distractors)
         for other in picker.others(scene, rng, ELSEWHERE)

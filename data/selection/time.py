@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from data.records import SELECTION_SECOND, FrameRef, Scene
-from data.selection.drafts import Draft, Picker, of_scene
+from data.selection.drafts import Draft, Picker, observed, of_scene
 
 CELLS = {"in_1s": 1, "in_2s": 2}
 """Seconds from the observation's end to the target, by subtype."""
@@ -27,7 +27,8 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) 
     target = start + SELECTION_SECOND + SELECTION_SECOND * seconds
     later = rng.permutation(np.arange(stop + 1, scene.frames))
     pool = of_scene(scene, later[later != target], "same_time")
-    picked = picker.pick(FrameRef(scene.scene_id, target), pool)
+    about = observed(scene, (start, stop))
+    picked = picker.pick(FrameRef(scene.scene_id, target), pool, about, int(rng.integers(4)))
     if picked is None:
         return None
     return Draft(

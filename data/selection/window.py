@@ -3,7 +3,8 @@
 A cell is a group by what happens ahead, a family that says what the item is built around (A: the
 whole scene, B: the pair of the next collision, C: the object that moves most), a horizon in frames,
 and a difficulty: hard keeps the frames most alike to the target among those that can still be told
-apart, easy the least alike. Alike and apart go by the objects that the item is built around.
+apart, easy takes any of the less alike half. Alike and apart go by the objects that the item is
+built around.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from data.events import collisions_in, window_group
 from data.geometry import object_match, on_screen
 from data.records import FrameRef, Scene
-from data.selection.drafts import Draft, Picker, of_scene
+from data.selection.drafts import Draft, Picker, observed, of_scene, unobserved
 
 QUESTION = "Which image best matches the next scene state?"
 PREFIX_FRAMES = 16
@@ -52,13 +53,20 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) 
             continue
         target = stop + cell.horizon
         about = built_around(cell, scene, stop, target)
+        seen = observed(scene, (start, stop))
+        about = seen if about is None else tuple(k for k in about if k in seen)
         if about == ():
             continue
-        unlike = np.argsort(object_match(scene, target, about), kind="stable")
-        pool = unlike if cell.difficulty == "hard" else unlike[::-1]
-        source = "same_near" if cell.difficulty == "hard" else "same_far"
-        wrong = of_scene(scene, pool[pool != target], source)
-        picked = picker.pick(FrameRef(scene.scene_id, target), wrong, about)
+        alike = np.argsort(object_match(scene, target, about), kind="stable")
+        alike = np.array(unobserved(alike[alike != target], (start, stop)))
+        if cell.difficulty == "hard":
+            pool, source = alike, "same_near"
+        else:
+            # Any of the far half: the farthest of all are neighbours, which leaves the target odd.
+            pool, source = rng.permutation(alike[len(alike) // 2 :]), "same_far"
+        wrong = of_scene(scene, pool, source)
+        earlier = int(rng.integers(4))
+        picked = picker.pick(FrameRef(scene.scene_id, target), wrong, about, earlier)
         if picked is None:
             continue
         return Draft(

@@ -16,6 +16,7 @@ from data.records import FPS, FrameRef, SelectionItem
 from data.retrieval.counterfactual import consequence
 from data.retrieval.database import Album
 from data.selection import window
+from data.selection.drafts import observed, unobserved
 from data.store import Store
 
 
@@ -83,11 +84,17 @@ def test_event_distractors_are_of_their_source(micro_store, items) -> None:
         if item.distractors == "same_offset":
             assert {abs(c.frame - item.target_frame) for c in wrong} <= {16, 32, 48}
         if item.distractors == "same_obj_match":
-            # No frame that is more alike to the target than the first could be told from it.
-            score, apart = object_match(scene, item.target_frame), displacements(scene)
-            closest = min(score[c.frame] for c in wrong)
-            nearer = np.flatnonzero(score < closest)
-            assert (apart[item.target_frame, nearer] < least).all()
+            # No frame before or after the target that is more alike to it could stand here too.
+            prefix = (item.prefix_start, item.prefix_stop)
+            score = object_match(scene, item.target_frame)
+            apart = displacements(scene, observed(scene, prefix))
+            chosen = [c.frame for c in item.candidates]
+            for early in (True, False):
+                side = [c.frame for c in wrong if (c.frame < item.target_frame) == early]
+                closest = min((score[f] for f in side), default=0)
+                nearer = unobserved(np.flatnonzero(score < closest), prefix)
+                for frame in (f for f in nearer if (f < item.target_frame) == early):
+                    assert frame == item.target_frame or apart[frame, chosen].min() < least
 
 
 def test_time_items_count_26_frames_a_second(items) -> None:
@@ -115,11 +122,13 @@ def test_families_b_and_c_are_told_apart_by_what_they_are_built_around(micro_sto
         scene = micro_store.scene(item.scene_id)
         cell = window.CELLS[item.subtype]
         about = window.built_around(cell, scene, item.prefix_stop, item.target_frame)
+        shown = observed(scene, (item.prefix_start, item.prefix_stop))
         if item.window_family == "B":
             assert item.group in ("G2", "G4")
             pairs = {c.objects for c in scene.collisions
                      if item.prefix_stop < c.frame <= item.target_frame}  # fmt: skip
             assert about in pairs
+            about = tuple(k for k in about if k in shown)
         else:
             assert item.group != "G4"
             assert len(about) == 1
@@ -128,6 +137,33 @@ def test_families_b_and_c_are_told_apart_by_what_they_are_built_around(micro_sto
             assert apart[a.frame, b.frame] >= least
         built[item.window_family] += 1
     assert min(built["B"], built["C"]) > 2
+
+
+def test_distractors_are_no_frames_of_the_prefix(items) -> None:
+    for item in items:
+        for c in item.candidates:
+            assert c.scene_id != item.scene_id or not (
+                item.prefix_start <= c.frame <= item.prefix_stop
+            )
+
+
+def test_candidates_differ_in_an_object_that_was_observed(micro_store, items) -> None:
+    least = micro_store.manifest["config"]["selection"]["min_displacement"]
+    for item in items:
+        scene = micro_store.scene(item.scene_id)
+        seen = observed(scene, (item.prefix_start, item.prefix_stop))
+        apart = displacements(scene, seen)
+        same = [c.frame for c in item.candidates if c.scene_id == item.scene_id]
+        assert all(apart[a, b] >= least for a, b in combinations(same, 2))
+
+
+def test_the_targets_place_in_time_tells_nothing(items) -> None:
+    ranks = Counter(
+        sum(c.frame < i.target_frame for c in i.candidates)
+        for i in items
+        if i.family == "window" or i.family == "time"
+    )
+    assert all(0.12 < ranks[k] / ranks.total() < 0.4 for k in range(4))
 
 
 def test_hard_is_more_alike_than_easy(micro_store, items) -> None:
