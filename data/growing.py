@@ -27,7 +27,7 @@ def growing_folder(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path]:
     growing = folder.with_name(f".{folder.name}.partial")
     growing.mkdir(parents=True, exist_ok=True)
     plan = _plan(cfg)
-    with _held(growing, folder):
+    with held(growing, folder):
         if (growing / PLAN).exists():
             _check_same_plan(json.loads((growing / PLAN).read_text()), plan, growing)
         for leftover in growing.rglob(".*.partial"):
@@ -48,7 +48,12 @@ def _plan(cfg: BenchmarkConfig) -> dict[str, Any]:
 
 
 @contextmanager
-def _held(growing: Path, folder: Path) -> Iterator[None]:
+def held(growing: Path, folder: Path) -> Iterator[None]:
+    """Hold the folder `growing` in which `folder` is made.
+
+    Raises:
+        UserError: another process holds it.
+    """
     handle = os.open(growing, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
