@@ -8,6 +8,7 @@ a user types them.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import date
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -433,6 +434,33 @@ class BuildCommand(CommandConfig):
 @dataclass
 class StatisticsCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
+
+
+@dataclass
+class ExportCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    folder: str = MISSING
+    """Folder of the dataset; must not hold another export."""
+    images: bool = True
+    """Whether frames are written too; without them a row names scenes and frames of the store."""
+    url: str | None = None
+    """Where the dataset will be published, such as https://huggingface.co/datasets/NAME/DATASET."""
+    published: str | None = None
+    """When, as YYYY-MM-DD."""
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        if not self.folder:
+            problems.append("folder= is empty: name a folder, such as folder=exports/tiny")
+        if self.url is not None and not _is_url(self.url):
+            problems.append(
+                f"url={self.url} is no address, such as https://huggingface.co/datasets/NAME/DATASET"
+            )
+        try:
+            date.fromisoformat(self.published or "2026-01-31")
+        except ValueError:
+            problems.append(f"published={self.published} is no date, such as 2026-01-31")
+        return problems
 
 
 @dataclass

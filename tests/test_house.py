@@ -14,6 +14,7 @@ FLOW = ("conf", "data", "teacher", "train", "evaluation")
 COMMANDS = (
     "data.build",
     "data.statistics",
+    "data.export",
     "teacher.narrate",
     "train.sft",
     "train.contrastive",

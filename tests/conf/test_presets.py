@@ -13,6 +13,7 @@ CONF = Path(str(files("conf")))
 SCHEMAS = {
     "data.build": schema.BuildCommand,
     "data.statistics": schema.StatisticsCommand,
+    "data.export": schema.ExportCommand,
     "teacher.narrate": schema.NarrateCommand,
     "train.sft": schema.SftCommand,
     "train.contrastive": schema.ContrastiveCommand,
