@@ -464,6 +464,19 @@ class ExportCommand(CommandConfig):
 
 
 @dataclass
+class GalleryCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    examples: int = 3
+    """Items of a subtype and queries of a builder that are shown; counterfactual pairs and paths
+    are twice as many."""
+    seed: int = 0
+    """Of the choice of examples."""
+
+    def check(self) -> list[str]:
+        return super().check() + _too_small(self, "", {"examples": 1})
+
+
+@dataclass
 class NarrateCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     teacher: TeacherConfig = MISSING

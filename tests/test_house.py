@@ -15,6 +15,7 @@ COMMANDS = (
     "data.build",
     "data.statistics",
     "data.export",
+    "data.gallery",
     "teacher.narrate",
     "train.sft",
     "train.contrastive",

@@ -14,6 +14,7 @@ SCHEMAS = {
     "data.build": schema.BuildCommand,
     "data.statistics": schema.StatisticsCommand,
     "data.export": schema.ExportCommand,
+    "data.gallery": schema.GalleryCommand,
     "teacher.narrate": schema.NarrateCommand,
     "train.sft": schema.SftCommand,
     "train.contrastive": schema.ContrastiveCommand,
