@@ -50,4 +50,4 @@ constraints: setup ## Write constraints.txt from the versions in .venv
 	$(BIN)/uv pip freeze --quiet --python $(BIN)/python --exclude-editable > constraints.txt
 
 clean: ## Remove built benchmarks and runs, not the environment
-	rm -rf store $(filter-out %/README.md %/bases,$(wildcard checkpoints/*))
+	rm -rf store exports $(filter-out %/README.md %/bases,$(wildcard checkpoints/*))

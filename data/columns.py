@@ -6,9 +6,9 @@ Names are those of the records. With images, frames stand beside their reference
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from data.frames import Frames
@@ -19,11 +19,14 @@ if TYPE_CHECKING:
     from datasets import Features
 
 CONFIGURATIONS = ("selection", "retrieval", "database")
+ENCODED = 1_000
+"""Encoded frames that are kept, at up to 100 KB each."""
 MEANING = {
     "item_id": "Name of the item.",
     "query_id": "Name of the query.",
     "split": "train or test. Scenes keep to one split, in every track.",
-    "suite": "Where the scenes come from: dynapix, or the simulator of a transfer suite.",
+    "suite": "dynapix, the simulator of a transfer suite, or matched_anchor: pairs of items that "
+    "differ in their question's anchor alone.",
     "family": "What fixes the target's moment: event, time or window.",
     "subtype": "The construction cell inside the family.",
     "framing": "Event family: future (the prefix ends before the collision) or contact (at it).",
@@ -50,10 +53,12 @@ MEANING = {
     "answer": "Position of the target among the candidates, 0 to 3.",
     "min_displacement": "Least displacement between two candidates, in px at 336 x 336.",
     "removed_object": "Counterfactual pool: noun phrase of the object that is absent.",
+    "standard": "Whether the query belongs to the standard test, over the database test.",
     "target": "The frame that answers.",
     "target_image": "The target.",
     "hard_negatives": "Wrong frames that are easily taken for the target.",
-    "database": "Name of the database: test, or counterfactual.",
+    "database": "Name of the database: test (the standard test's), future (the source of the "
+    "future pool, which holds test) or counterfactual (the source of that pool).",
     "frame": "Index of the frame in its scene, from 0, 25 a second.",
     "source": "target, or where the distractor comes from.",
     "image": "The frame.",
@@ -90,6 +95,7 @@ def features(images: bool) -> dict[str, Features]:
         **prefix,
         **shown,
         "removed_object": text,
+        "standard": Value("bool"),
         "target": frame,
         **({"target_image": Image()} if images else {}),
         "hard_negatives": List(frame),
@@ -103,10 +109,11 @@ class Rows:
     """Turns a store's records into rows, with their frames where `images` is set."""
 
     def __init__(self, store: Store, images: bool) -> None:
-        self._store = store
         self._images = images
         self._frames = Frames(store)
         self._shown = store.manifest["config"]["prefix_frames"]
+        # Questions about one scene share many frames, and encoding takes longer than all else.
+        self._encoded = lru_cache(maxsize=ENCODED)(self._encode)
 
     def images_of(self, configuration: str) -> int:
         """Images a row of a configuration, at most."""
@@ -126,27 +133,15 @@ class Rows:
             return row | {"target_image": self._picture(record.target)}
         return row | {"candidate_images": [self._picture(c) for c in record.candidates]}
 
-    def _picture(self, frame: FrameRef) -> dict[str, Any]:
-        return self._pictures(frame.scene_id, [frame.frame])[0]
-
     def _pictures(self, scene_id: str, frames: Sequence[int]) -> list[dict[str, Any]]:
-        """Encoded frames as `datasets.Image` keeps them; the store's own bytes where it has them,
-        as decoding and encoding anew takes a hundred times as long."""
-        path = self._store.folder / "frames" / f"{scene_id}.zip"
-        stored: dict[int, bytes] = {}
-        if path.exists():
-            with zipfile.ZipFile(path) as archive:
-                there = set(archive.namelist())
-                stored = {f: archive.read(n) for f in frames if (n := f"{f:03d}.png") in there}
-        return [
-            {
-                "bytes": stored[f] if f in stored else self._drawn(scene_id, f),
-                "path": f"{scene_id}-{f:03d}.png",
-            }
-            for f in frames
-        ]
+        """Encoded frames as `datasets.Image` keeps them."""
+        return [self._picture(FrameRef(scene_id, frame)) for frame in frames]
 
-    def _drawn(self, scene_id: str, frame: int) -> bytes:
+    def _picture(self, frame: FrameRef) -> dict[str, Any]:
+        path = f"{frame.scene_id}-{frame.frame:03d}.png"
+        return {"bytes": self._encoded(frame.scene_id, frame.frame), "path": path}
+
+    def _encode(self, scene_id: str, frame: int) -> bytes:
         png = io.BytesIO()
         self._frames.image(scene_id, frame).save(png, "PNG", compress_level=1)
         return png.getvalue()

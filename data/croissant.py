@@ -23,7 +23,7 @@ KEYS = {
     "database": ("database", "scene_id", "frame"),
 }
 """The columns whose values name a row."""
-KINDS = {"string": "sc:Text", "int64": "sc:Integer", "float64": "sc:Float"}
+KINDS = {"string": "sc:Text", "int64": "sc:Integer", "float64": "sc:Float", "bool": "sc:Boolean"}
 
 CONTEXT = {
     "@language": "en",

@@ -28,9 +28,10 @@ from conf.errors import UserError
 from conf.runs import write_text
 from conf.schema import ExportCommand
 from data.columns import Rows, features
+from data.controls import MATCHED
 from data.growing import held
 from data.records import POOLS, SPLITS, FrameRef, RetrievalQuery, SelectionItem
-from data.store import Store, digest, load_rows, sealed, write_atomically
+from data.store import DATABASES, Store, digest, sealed, write_atomically
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -146,12 +147,11 @@ def export(store: Store, folder: Path, plan: dict[str, Any]) -> None:
 
 def parts(store: Store) -> list[Part]:
     """What an export holds: every split of every track and every database that is not empty."""
-    items = {split: store.selection(split) for split in SPLITS}
+    items = {split: [*store.selection(split), *store.selection(split, MATCHED)] for split in SPLITS}
     queries = {
         split: [q for pool in POOLS for q in store.retrieval(split, pool)] for split in SPLITS
     }
-    rows = load_rows(store.folder / "database.parquet")
-    databases = {name: store.database(name) for name in dict.fromkeys(r["database"] for r in rows)}
+    databases = {name: store.database(name) for name in DATABASES}
     found = {"selection": items, "retrieval": queries, "database": databases}
     return [
         Part(configuration, split, records)

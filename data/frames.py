@@ -15,6 +15,7 @@ import zipfile
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -65,8 +66,13 @@ def load_frames(path: Path, wanted: Iterable[int] | None = None) -> dict[int, np
     except FileNotFoundError:
         return {}
     except (zipfile.BadZipFile, ValueError, KeyError, OSError) as error:
-        log.warning("%s is damaged (%s); its frames are drawn again", path, error)
+        _tell_damaged(path, str(error))
         return {}
+
+
+@cache
+def _tell_damaged(path: Path, why: str) -> None:
+    log.warning("%s is damaged (%s); its frames are drawn again", path, why)
 
 
 def _member(frame: int) -> zipfile.ZipInfo:

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from conf.entry import Run, command
 from conf.runs import write_text
 from conf.schema import GalleryCommand
+from data.controls import MATCHED
 from data.frames import Frames
 from data.geometry import displacement_across
 from data.records import (
@@ -89,6 +90,11 @@ def sheets(store: Store, examples: int, seed: int) -> Iterator[Sheet]:
         rows = [look.absence(q) for q in _some(every, 2 * examples, seed, "counterfactual")]
         title = f"the scene as it was, and without an object ({len(every):,} queries)"
         yield Sheet("Retrieval: counterfactual", title, "counterfactual.png", sheet(rows))
+    if every := store.selection(suite=MATCHED):
+        pairs = [every[k : k + 2] for k in range(0, len(every), 2)]
+        rows = [look.item(i) for pair in _some(pairs, examples, seed, MATCHED) for i in pair]
+        title = f"pairs that differ in their anchor alone ({len(pairs):,} pairs)"
+        yield Sheet("Controls", title, f"controls-{MATCHED}.png", sheet(rows))
     names = [name for split in SPLITS for name in store.scene_ids(split)]
     scenes = [store.scene(name) for name in _some(names, 2 * examples, seed, "paths")]
     # Another simulator's camera stands elsewhere.

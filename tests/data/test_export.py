@@ -18,6 +18,7 @@ from huggingface_hub import DatasetCard
 from conf.errors import UserError
 from data import export as exporter
 from data.columns import CONFIGURATIONS, MEANING, Rows, features
+from data.controls import MATCHED
 from data.export import ensure_export
 from data.frames import Frames
 from data.records import POOLS, RetrievalQuery, SelectionItem, shown_frames
@@ -26,7 +27,7 @@ from data.store import Store, digest
 SPLITS = {
     "selection": ("train", "test"),
     "retrieval": ("train", "test"),
-    "database": ("test", "counterfactual"),
+    "database": ("test", "future", "counterfactual"),
 }
 
 
@@ -52,7 +53,7 @@ def test_items_and_queries_come_back_as_they_are(micro_store, loaded) -> None:
         items, queries = loaded["selection"][split], loaded["retrieval"][split]
         kept = [f.name for f in fields(SelectionItem)]
         rows = [SelectionItem.from_row(r) for r in items.select_columns(kept)]
-        assert rows == micro_store.selection(split)
+        assert rows == [*micro_store.selection(split), *micro_store.selection(split, MATCHED)]
         kept = [f.name for f in fields(RetrievalQuery)]
         rows = [RetrievalQuery.from_row(r) for r in queries.select_columns(kept)]
         assert rows == [q for pool in POOLS for q in micro_store.retrieval(split, pool)]
@@ -100,7 +101,7 @@ def test_without_images_a_row_has_the_records_fields(micro_store, tmp_path) -> N
     assert told["selection"] == {f.name for f in fields(SelectionItem)} | {"shown_frames"}
     assert told["retrieval"] == {f.name for f in fields(RetrievalQuery)} | {"shown_frames"}
     shards = ensure_export(micro_store, tmp_path / "out", images=False)
-    assert len(shards) == len({(s.configuration, s.split) for s in shards}) == 6
+    assert len(shards) == len({(s.configuration, s.split) for s in shards}) == 7
     assert sum(s.bytes for s in shards) < 200_000
     for shard in shards:
         assert set(pq.read_schema(tmp_path / "out" / shard.path).names) == told[shard.configuration]
@@ -118,10 +119,11 @@ def test_a_killed_export_leaves_nothing_that_looks_whole_and_goes_on(
     folder = tmp_path / "copy" / "micro"
     shutil.copytree(micro_store.folder, folder)
     hurt = Store(folder, micro_store.manifest)
-    # A test scene's frames: every shard of the training items is written by then.
-    broken = folder / "frames" / f"{hurt.scene_ids('test')[0]}.zip"
+    # A test scene: every shard of the training items is written by then.
+    broken = folder / "scenes" / f"{hurt.scene_ids('test')[0]}.npz"
     whole = broken.read_bytes()
     broken.write_bytes(whole[: len(whole) // 2])
+    shutil.rmtree(folder / "frames")
     out = tmp_path / "out" / "micro"
     arguments = (out, True, "https://example.org/dynapix", "2026-01-31")
     with pytest.raises(Exception, match="not a zip"):
@@ -146,7 +148,7 @@ def test_what_a_killed_export_of_other_settings_left_is_not_taken(micro_store, t
     (partial / "selection").mkdir(parents=True)
     (partial / "selection" / "train-00000-of-00001.parquet").write_bytes(b"of another export")
     ensure_export(micro_store, out, images=False)
-    assert pq.read_metadata(out / "selection" / "train-00000-of-00001.parquet").num_rows == 126
+    assert pq.read_metadata(out / "selection" / "train-00000-of-00001.parquet").num_rows == 126 + 4
 
 
 def test_the_same_export_is_left_as_it_is(micro_store, tmp_path) -> None:
@@ -225,7 +227,9 @@ def test_croissant_keeps_to_its_vocabulary(micro_store, exported) -> None:
         assert [f["name"] for f in records["field"]] == schema.names
         assert {k["@id"] for k in records["key"]} <= set(_ids(records["field"]))
         for leaf in _leaves(records["field"]):
-            assert leaf["dataType"] in {"sc:Text", "sc:Integer", "sc:Float", "sc:ImageObject"}
+            assert leaf["dataType"] in {
+                "sc:Text", "sc:Integer", "sc:Float", "sc:Boolean", "sc:ImageObject"
+            }  # fmt: skip
             assert leaf["source"]["fileSet"]["@id"] in sets
             assert leaf["source"]["extract"]["column"] in schema.names
     leaves = [leaf for records in told["recordSet"] for leaf in _leaves(records["field"])]

@@ -28,7 +28,8 @@ def test_every_cell_and_builder_has_a_sheet(micro_store, drawn) -> None:
     assert len(files) == len(set(files))
     asked = {f"{i.family}-{i.subtype}.png" for i in micro_store.selection()}
     asked |= {f"retrieval-builder-{q.builder}.png" for q in micro_store.retrieval()}
-    assert set(files) == asked | {"counterfactual.png", "paths.png"}
+    others = {"counterfactual.png", "paths.png", "controls-matched_anchor.png"}
+    assert set(files) == asked | others
 
 
 def test_a_seed_gives_the_same_sheets_and_another_seed_others(micro_store, drawn) -> None:
