@@ -35,6 +35,7 @@ class Draft:
     distractors: tuple[Candidate, ...]
     min_displacement: float
     axes: dict[str, Any] = field(default_factory=dict)
+    suite: str = "dynapix"
 
 
 @dataclass
@@ -65,30 +66,55 @@ class Picker:
         the pool has such: a target that always stands in the midst of its distractors, or before
         them, could be told without the prefix.
         """
-        pool = list(pool) if earlier is not None else pool
+        if earlier is None:
+            return self.pick_each(target, (pool, 3), about=about)
+        pool = list(pool)
+        before = [c for c in pool if c.frame < target.frame]
+        after = [c for c in pool if c.frame > target.frame]
+        chosen = self._take([target], before, earlier, about)
+        chosen = self._take(chosen, after, 3 - earlier, about)
+        return self._picked(self._take(chosen, pool, 4 - len(chosen), about))
+
+    def pick_each(
+        self,
+        target: FrameRef,
+        *pools: tuple[Iterable[Candidate], int],
+        about: tuple[int, ...] | None = None,
+    ) -> tuple[tuple[Candidate, ...], float] | None:
+        """As `pick`, so many of each of several pools."""
         chosen: list[FrameRef] = [target]
-        if earlier is not None:
-            room = {True: earlier, False: 3 - earlier}
-            for candidate in pool:
-                side = candidate.frame < target.frame
-                if room[side] and self._tells_apart(candidate, chosen, about):
-                    chosen.append(candidate)
-                    room[side] -= 1
-        for candidate in pool:
-            if len(chosen) == 4:
+        for pool, count in pools:
+            wanted = len(chosen) + count
+            chosen = self._take(chosen, pool, count, about)
+            if len(chosen) < wanted:
                 break
-            if self._tells_apart(candidate, chosen, about):
-                chosen.append(candidate)
+        return self._picked(chosen)
+
+    def _take(
+        self,
+        chosen: list[FrameRef],
+        pool: Iterable[Candidate],
+        count: int,
+        about: tuple[int, ...] | None,
+    ) -> list[FrameRef]:
+        """`chosen` and the first `count` of a pool that can be told apart from it and each other,
+        or as many as there are."""
+        taken = list(chosen)
+        for candidate in pool if count else ():
+            if all(self._apart(candidate, c, about) >= self.least for c in taken):
+                taken.append(candidate)
+                if len(taken) == len(chosen) + count:
+                    break
+        return taken
+
+    def _picked(
+        self, chosen: list[FrameRef]
+    ) -> tuple[tuple[Candidate, ...], float] | None:
         if len(chosen) < 4:
             self.dropped += 1
             return None
         least = min(self._apart(a, b, None) for a, b in combinations(chosen, 2))
         return tuple(chosen[1:]), least
-
-    def _tells_apart(
-        self, candidate: FrameRef, chosen: list[FrameRef], about: tuple[int, ...] | None
-    ) -> bool:
-        return all(self._apart(candidate, c, about) >= self.least for c in chosen)
 
     def _apart(self, one: FrameRef, two: FrameRef, about: tuple[int, ...] | None) -> float:
         scene = self.scene_of(one.scene_id)
@@ -166,7 +192,7 @@ def finish(draft: Draft, position: int, rng: np.random.Generator) -> SelectionIt
     return SelectionItem(
         item_id=f"{draft.family}-{draft.subtype}-{scene.scene_id}-{draft.target}",
         split=scene.split,
-        suite="dynapix",
+        suite=draft.suite,
         family=draft.family,
         subtype=draft.subtype,
         question=draft.question,
