@@ -1,7 +1,9 @@
-"""What happens in a stretch of a scene: collisions, entering and leaving, occlusion changes, and
-the window family's group."""
+"""What happens in a scene: collisions, entering and leaving, occlusion changes and the window
+family's group in a stretch of it, first contacts, and what is set in motion."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -9,6 +11,12 @@ from data.records import Collision, Scene
 
 OCCLUDED = 0.5
 """An object is occluded where less than this share of it is visible."""
+ONSET = 0.01
+"""An object moves once it is farther than this from where it began, simulator units..."""
+ONSET_FRAMES = 3
+"""... and stays so for this many frames..."""
+REST_FRAMES = 10
+"""... where it rested, within half of that distance, for this many frames at the beginning."""
 
 
 def collisions_in(scene: Scene, first: int, last: int) -> list[Collision]:
@@ -45,3 +53,27 @@ def window_group(scene: Scene, start: int, stop: int, horizon: int) -> str:
     if changes or view_changes_in(scene, *seen) or occlusion_changes_in(scene, *seen):
         return "G3"
     return "G1"
+
+
+def first_contacts(touching: Iterable[tuple[int, tuple[int, int]]]) -> tuple[Collision, ...]:
+    """The first contact of every pair, in order of frame, from any number of (frame, objects) at
+    which two objects touch."""
+    first: dict[tuple[int, int], int] = {}
+    for frame, (one, two) in touching:
+        pair = (min(one, two), max(one, two))
+        first[pair] = min(frame, first.get(pair, frame))
+    found = (Collision(frame, pair) for pair, frame in first.items())
+    return tuple(sorted(found, key=lambda c: (c.frame, c.objects)))
+
+
+def onsets(scene: Scene) -> list[tuple[int, int]]:
+    """(frame, object) of every object that is set in motion after a rest from the beginning, in
+    order of frame: the first frame at which it is away from where it began, and stays away."""
+    moved = np.linalg.norm(scene.positions - scene.positions[0], axis=-1)
+    away = moved > ONSET
+    stays = np.logical_and.reduce(
+        [away[k : len(away) - ONSET_FRAMES + 1 + k] for k in range(ONSET_FRAMES)]
+    )
+    rested = (moved[:REST_FRAMES] < ONSET / 2).all(axis=0)
+    set_off = np.flatnonzero(rested & stays.any(axis=0))
+    return sorted((int(stays[:, k].argmax()), int(k)) for k in set_off)
