@@ -1,0 +1,18 @@
+"""Images that tell which frame they are."""
+
+from __future__ import annotations
+
+import io
+
+from PIL import Image
+
+
+def picture(frame: int, size: tuple[int, int] = (48, 32)) -> Image.Image:
+    """An image that tells its frame by how bright it is."""
+    return Image.new("RGB", size, (frame + 60,) * 3)
+
+
+def png(image: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG")
+    return buffer.getvalue()
