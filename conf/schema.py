@@ -23,6 +23,7 @@ class Quota:
     test: int = 0
 
 
+SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
 FRAMES_AHEAD = ("named", "all", "none")
 ENGINES = ("loky", "ray")
 LOOKS = 48
@@ -80,8 +81,15 @@ class RetrievalTrackConfig:
 class BenchmarkConfig:
     name: str = MISSING
     """Name of the folder below `store`."""
+    simulator: str = "bullet"
+    """bullet simulates scenes; clevrer, movi_a and physion read a release of that simulator."""
+    folder: str | None = None
+    """Folder of the release, where one is read."""
+    fps: float = 30.0
+    """Frames a second of Physion's trials, which do not record it."""
     seed: int = 0
     scenes: int = 10_000
+    """Scenes, of a release at most."""
     test_share: float = 0.2
     min_objects: int = 4
     max_objects: int = 6
@@ -97,8 +105,20 @@ class BenchmarkConfig:
         problems = _too_small(
             self, "benchmark.", {"seed": 0, "scenes": 4, "max_collisions": 1, "prefix_frames": 2}
         )
-        if not 0 < self.test_share < 1:
-            problems.append(f"benchmark.test_share={self.test_share} must lie between 0 and 1")
+        if not 0 < self.test_share <= 1:
+            problems.append(f"benchmark.test_share={self.test_share} must be above 0 and at most 1")
+        if self.fps <= 0:
+            problems.append(f"benchmark.fps={self.fps} must be above 0")
+        absent = self.retrieval.counterfactual
+        if self.simulator not in SIMULATORS:
+            problems.append(
+                f"benchmark.simulator={self.simulator}: the options are {', '.join(SIMULATORS)}"
+            )
+        elif self.simulator != "bullet" and absent.train + absent.test > 0:
+            problems.append(
+                f"benchmark.retrieval.counterfactual with benchmark.simulator={self.simulator}: "
+                "scenes of a release cannot be simulated again, set both of its quotas to 0"
+            )
         if not 2 <= self.min_objects <= self.max_objects <= LOOKS:
             problems.append(
                 f"benchmark.min_objects={self.min_objects} and "
@@ -419,6 +439,8 @@ class BuildCommand(CommandConfig):
     others are drawn when they are asked for."""
     frames_gb: float | None = None
     """Disk space that rendered frames may take; null sets no bound."""
+    strict: bool = False
+    """Whether a bad record of a release stops the build; otherwise it is told and left out."""
     parallel: str = "loky"
     """loky spreads the work over this machine's processes, ray over a Ray cluster."""
 

@@ -13,19 +13,19 @@ from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
 from conf.keys import nearest
 from conf.schema import BenchmarkConfig, BuildCommand
-from data.cells import FAMILY_BUILDERS, PARTS, family_quotas, make_items_and_queries
+from data.cells import family_quotas, make_items_and_queries, recipes
 from data.growing import flat, growing_folder
 from data.parallel import Workers
 from data.rendering import RECORD, render_ahead
 from data.report import count, shortfalls, summary
 from data.retrieval import future
 from data.retrieval.database import make_databases
-from data.scenes import simulate, split_scenes
+from data.scenes import make_scenes
 from data.store import (
     FRAMES,
     MANIFEST,
+    PARTS,
     PLAN,
-    VERSIONS,
     Store,
     digests,
     load_scene,
@@ -33,8 +33,10 @@ from data.store import (
     save_rows,
     scene_path,
     sealed,
+    versions,
     write_atomically,
 )
+from data.transfer.recipes import RECIPES as TRANSFER
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +44,7 @@ log = logging.getLogger(__name__)
 @command("data.build", BuildCommand)
 def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
     workers = Workers(cfg.workers, cfg.parallel)
-    store = ensure_items(cfg.benchmark, Path(cfg.store), workers)
+    store = ensure_items(cfg.benchmark, Path(cfg.store), workers, cfg.strict)
     render_ahead(store, cfg.frames, cfg.frames_gb, workers)
     log.info(summary(store))
     return {name: float(count) for name, count in store.manifest["counts"].items()}
@@ -57,7 +59,7 @@ def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
     return store
 
 
-def ensure_items(cfg: BenchmarkConfig, root: Path, workers: Workers) -> Store:
+def ensure_items(cfg: BenchmarkConfig, root: Path, workers: Workers, strict: bool = False) -> Store:
     """The benchmark that `cfg` describes below `root`, built where it is missing, whatever frames
     of it are rendered.
 
@@ -68,19 +70,19 @@ def ensure_items(cfg: BenchmarkConfig, root: Path, workers: Workers) -> Store:
     check_names(cfg)
     folder = root / cfg.name
     if not folder.exists():
-        build(cfg, folder, workers)
+        build(cfg, folder, workers, strict)
     store = open_store(folder)
     _check_same_settings(store, cfg)
     return store
 
 
-def build(cfg: BenchmarkConfig, folder: Path, workers: Workers) -> None:
-    """Build a benchmark without its frames at `folder`, going on with what a killed build left."""
+def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = False) -> None:
+    """Build a benchmark without its frames at `folder`, going on with what a killed build left. A
+    bad record of a release stops it where `strict`."""
     check_names(cfg)
-    scene_ids = split_scenes(cfg)
     log.info("building benchmark %s in %s", cfg.name, folder)
     with growing_folder(cfg, folder) as growing:
-        simulate(cfg, growing, scene_ids, workers)
+        scene_ids, unread = make_scenes(cfg, growing, workers, strict)
         items, queries, dropped = make_items_and_queries(cfg, growing, scene_ids, workers)
         scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(growing, name)))
         queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
@@ -91,11 +93,11 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers) -> None:
         save_rows(rows, growing / "database.parquet")
         manifest = {
             "name": cfg.name,
-            "suite": "dynapix",
+            "suite": cfg.simulator if cfg.simulator in TRANSFER else "dynapix",
             "seed": cfg.seed,
-            **VERSIONS,
+            **versions(cfg.simulator),
             "config": asdict(cfg),
-            "counts": count(scene_ids, items, queries, databases) | dropped | left_out,
+            "counts": count(scene_ids, items, queries, databases) | unread | dropped | left_out,
             "shortfalls": shortfalls(cfg, items, queries, databases),
             "scenes": scene_ids,
             "files": digests(growing),
@@ -109,8 +111,9 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers) -> None:
 def check_names(cfg: BenchmarkConfig) -> None:
     """Raises SettingsError where a quota names a cell or builder that does not exist."""
     named = [
-        (f"benchmark.selection.{family}", quotas, list(FAMILY_BUILDERS[family].CELLS))
+        (f"benchmark.selection.{family}", quotas, list(recipes(cfg)[family].CELLS))
         for family, quotas in family_quotas(cfg).items()
+        if family in recipes(cfg)
     ]
     builders = [str(b) for b in future.BUILDERS]
     named.append(("benchmark.retrieval.builders", cfg.retrieval.builders, builders))
@@ -128,7 +131,7 @@ def check_names(cfg: BenchmarkConfig) -> None:
 def _check_not_empty(cfg: BenchmarkConfig, items: list, queries: list) -> None:
     if not items and not queries:
         raise UserError(
-            f"benchmark {cfg.name} would be empty: none of {cfg.scenes} scenes gave an item with "
+            f"benchmark {cfg.name} would be empty: none of its scenes gave an item with "
             f"benchmark.selection.min_displacement={cfg.selection.min_displacement}; lower it, "
             "or raise benchmark.scenes or the quotas"
         )
@@ -136,7 +139,7 @@ def _check_not_empty(cfg: BenchmarkConfig, items: list, queries: list) -> None:
 
 def _check_same_settings(store: Store, cfg: BenchmarkConfig) -> None:
     built, asked = flat(store.manifest["config"]), flat(asdict(cfg))
-    for key in built | asked:
+    for key in (built | asked).keys() - {"folder"}:
         old, new = built.get(key), asked.get(key)
         if old != new:
             raise UserError(

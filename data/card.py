@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from data.columns import MEANING
 from data.records import FAMILIES, POOLS, SPLITS
-from data.store import VERSIONS, Store
+from data.store import Store, versions
 
 if TYPE_CHECKING:
     from datasets import Features
@@ -149,12 +149,13 @@ def _columns(name: str, kinds: Features) -> str:
 
 
 def _making(store: Store) -> str:
-    versions = ", ".join(f"{name} {version}" for name, version in VERSIONS.items())
+    made_by = versions(store.manifest["config"]["simulator"])
+    told = ", ".join(f"{name} {version}" for name, version in made_by.items())
     config = OmegaConf.to_yaml(OmegaConf.create(store.manifest["config"]))
     return (
         "Scenes are simulated by Bullet and rendered from the simulator's record; items and "
         "queries are drawn from that record alone. Versions of the parts that make it: "
-        f"{versions}. The store that this was exported from is `{store.identity}`. The same "
+        f"{told}. The store that this was exported from is `{store.identity}`. The same "
         "settings and versions give the same scenes, items and frames again:\n\n"
         f"<details><summary>Settings</summary>\n\n```yaml\n{config}```\n\n</details>"
     )

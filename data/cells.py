@@ -12,6 +12,7 @@ import hashlib
 import json
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import lru_cache, partial
 from pathlib import Path
@@ -24,16 +25,15 @@ from data.parallel import Workers
 from data.records import RetrievalQuery, Scene, SelectionItem
 from data.retrieval import counterfactual, future
 from data.selection import drafts, event, time, window
-from data.store import load_scene, scene_path, write_atomically
+from data.store import PARTS, load_scene, scene_path, write_atomically
+from data.transfer import recipes as transfer
 
-FAMILY_BUILDERS = {"event": event, "time": time, "window": window}
+RECIPES = {"event": event, "time": time, "window": window}
 SCENES_KEPT = 20_000
 """Scenes that a worker keeps in memory, at about 50 KB each."""
 RESERVE = 1.3
 """Queries that are made for one that is wanted: some are dropped when databases are made, for their
 target looks like another's."""
-PARTS = "parts"
-"""Folder of the cells that are done; gone from a whole store."""
 
 ScenesOfSplit = dict[str, list[str]]
 
@@ -67,6 +67,11 @@ def make_items_and_queries(
             items += map(SelectionItem.from_row, part["rows"])
             dropped[f"items dropped, too alike/{group}"] += part["dropped"]
     return items, queries, dict(dropped)
+
+
+def recipes(cfg: BenchmarkConfig) -> Mapping[str, Any]:
+    """How the items of a benchmark's suite are made, by family: each has `CELLS` and `draft`."""
+    return transfer.RECIPES.get(cfg.simulator, RECIPES)
 
 
 def family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:
@@ -126,7 +131,7 @@ def _make_cell(
     track, group, cell = name.split("/")
     least = cfg.selection.min_displacement
     if track == "selection":
-        draw = partial(FAMILY_BUILDERS[group].draft, cell)
+        draw = partial(recipes(cfg)[group].draft, cell)
         found, dropped = drafts.fill(cell, draw, scene_ids, scene_of, quota, cfg.seed, least)
     elif track == "controls":
         found, dropped = fill_pairs(scene_ids, scene_of, quota, cfg.seed, least)

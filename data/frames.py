@@ -25,6 +25,7 @@ from PIL import Image
 from data.records import Scene
 from data.render import renderer
 from data.store import Store, cached_scene, scene_path, write_atomically
+from data.transfer.release import RELEASES
 
 log = logging.getLogger(__name__)
 
@@ -93,20 +94,28 @@ class FrameCache:
     folder: Path
     width: int
     height: int
+    simulator: str
+    release: str | None
+    """Folder of another simulator's release, whose frames are its own."""
 
     @classmethod
     def of(cls, store: Store) -> FrameCache:
         config = store.manifest["config"]
-        return cls(store.folder, config["width"], config["height"])
+        keys = ("width", "height", "simulator", "folder")
+        return cls(store.folder, *(config[key] for key in keys))
 
     def path(self, scene_id: str) -> Path:
         return self.folder / "frames" / f"{scene_id}.zip"
 
     def draw(self, scene_id: str, frames: list[int]) -> dict[int, np.ndarray]:
-        """Frames of a scene drawn from its oracle, (height, width, 3) uint8 each."""
+        """Frames of a scene drawn from its oracle or read from its release, (height, width, 3)
+        uint8 each."""
         if not frames:
             return {}
         scene = cached_scene(scene_path(self.folder, scene_id))
+        if scene.footage is not None:
+            images = RELEASES[self.simulator].images(scene, Path(self.release), frames)
+            return {frame: np.asarray(image) for frame, image in images.items()}
         render = renderer(self.width, self.height).render
         return {frame: np.asarray(render(scene, frame)) for frame in frames}
 

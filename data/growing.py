@@ -38,7 +38,15 @@ def growing_folder(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path]:
 
 def _plan(cfg: BenchmarkConfig) -> dict[str, Any]:
     """What the scenes of a build depend on; its other parts are named by what they depend on."""
-    keys = ("seed", "test_share", "min_objects", "max_objects", "max_collisions")
+    keys = (
+        "simulator",
+        "seed",
+        "test_share",
+        "min_objects",
+        "max_objects",
+        "max_collisions",
+        "fps",
+    )
     absent = {split: getattr(cfg.retrieval.counterfactual, split) > 0 for split in SPLITS}
     return {
         "generator": GENERATOR_VERSION,

@@ -44,16 +44,24 @@ MANIFEST = "manifest.json"
 SEAL = "sha256"
 PLAN = "plan.json"
 """What a build in progress is to become; gone from a whole store."""
-VERSIONS = {
-    "generator": GENERATOR_VERSION,
-    "renderer": RENDERER_VERSION,
-    "builders": BUILDERS_VERSION,
-}
-"""What makes the same config give another benchmark: scenes, pixels, items and queries."""
+
+
+def versions(simulator: str) -> dict[str, str]:
+    """What makes the same config give another benchmark: scenes, pixels, items and queries."""
+    rendered = simulator == "bullet"
+    return {
+        "generator": GENERATOR_VERSION,
+        "renderer": RENDERER_VERSION if rendered else f"{simulator}'s own frames",
+        "builders": BUILDERS_VERSION,
+    }
+
+
 DATABASES = ("test", "future", "counterfactual")
 """Frames that retrieval ranks: the standard test's, drawn out of the source of the future-state
 queries, and the source of the counterfactual ones."""
 SCENES, FRAMES = "scenes", "frames"
+PARTS = "parts"
+"""Folder of what a build in progress has done; gone from a whole store."""
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -219,13 +227,14 @@ def open_store(folder: Path) -> Store:
         raise UserError(f"{folder} holds no benchmark: {MANIFEST} is missing; {rebuild}")
     try:
         manifest = json.loads(path.read_text())
-        versions = {key: manifest.get(key) for key in VERSIONS}
+        built = {key: manifest.get(key) for key in versions("bullet")}
+        current = versions(manifest.get("config", {}).get("simulator", "bullet"))
     except (ValueError, AttributeError) as error:
         raise UserError(f"{path} is damaged and cannot be read; {rebuild}") from error
-    for key, current in VERSIONS.items():
-        if versions[key] != current:
+    for key, version in current.items():
+        if built[key] != version:
             raise UserError(
-                f"{folder} was built by {key} version {versions[key]}, this is version {current}; "
+                f"{folder} was built by {key} version {built[key]}, this is version {version}; "
                 f"{rebuild}"
             )
     if manifest != sealed(manifest):

@@ -107,9 +107,7 @@ class Picker:
                     break
         return taken
 
-    def _picked(
-        self, chosen: list[FrameRef]
-    ) -> tuple[tuple[Candidate, ...], float] | None:
+    def _picked(self, chosen: list[FrameRef]) -> tuple[tuple[Candidate, ...], float] | None:
         if len(chosen) < 4:
             self.dropped += 1
             return None

@@ -17,6 +17,7 @@ import pytest
 from conf.errors import SettingsError, UserError
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from data.build import build, ensure_benchmark, ensure_items
+from data.bullet import scene_id
 from data.growing import growing_folder
 from data.parallel import Workers
 from data.scenes import split_scenes
@@ -132,7 +133,8 @@ def test_a_build_is_one_process_own(tmp_path) -> None:
 
 @pytest.mark.parametrize("scenes", [10, 12, 100])
 def test_a_scene_has_one_split_in_every_size(scenes) -> None:
-    some, more = split_scenes(small(scenes=scenes)), split_scenes(small(scenes=500))
+    names = [scene_id(0, k) for k in range(500)]
+    some, more = split_scenes(small(), names[:scenes]), split_scenes(small(), names)
     for split in ("train", "test"):
         assert set(some[split]) <= set(more[split])
         assert sorted(some[split]) == some[split]
@@ -140,8 +142,8 @@ def test_a_scene_has_one_split_in_every_size(scenes) -> None:
 
 
 def test_a_split_without_scenes_is_refused() -> None:
-    with pytest.raises(UserError, match="leaves no scene to test on"):
-        split_scenes(small(scenes=4, test_share=0.01))
+    with pytest.raises(UserError, match=r"test_share=0.01 of 4 scenes leaves none to test on"):
+        split_scenes(small(test_share=0.01), list("abcd"))
 
 
 @pytest.mark.parametrize("part", ["selection.parquet", "scenes"])
