@@ -461,8 +461,11 @@ class StatisticsCommand(CommandConfig):
 @dataclass
 class ExportCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
+    format: str = "huggingface"
+    """huggingface writes items, queries and databases as a dataset; clevrer writes scenes as videos
+    with annotations, as CLEVRER's release has them."""
     folder: str = MISSING
-    """Folder of the dataset; must not hold another export."""
+    """Folder of the export; must not hold another one."""
     images: bool = True
     """Whether frames are written too; without them a row names scenes and frames of the store."""
     url: str | None = None
@@ -472,6 +475,8 @@ class ExportCommand(CommandConfig):
 
     def check(self) -> list[str]:
         problems = super().check()
+        if self.format not in ("huggingface", "clevrer"):
+            problems.append(f"format={self.format}: the options are huggingface and clevrer")
         if not self.folder:
             problems.append("folder= is empty: name a folder, such as folder=exports/tiny")
         if self.url is not None and not _is_url(self.url):

@@ -1,13 +1,14 @@
-"""Write a benchmark as a Hugging Face dataset, which others load without this code.
+"""Write a benchmark as others read it: as a Hugging Face dataset, which loads without this code, or
+its scenes as CLEVRER's release has them (see `data.transfer.export`).
 
-    exports/<name>/
+    exports/<name>/huggingface/
         README.md        the dataset card, by which `datasets.load_dataset` finds what is where
         croissant.json   the same for other tools
         export.json      what was exported, and a SHA-256 for every file
         selection/ retrieval/ database/    <split>-00000-of-00002.parquet
 
-It is written in a folder beside it, one shard after another, and renamed when it is whole, so that
-a killed export goes on with the shards it has.
+The dataset is written in a folder beside it, one shard after another, and renamed when it is whole,
+so that a killed export goes on with the shards it has.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from conf.schema import ExportCommand
 from data.columns import Rows, features
 from data.controls import MATCHED
 from data.growing import held
+from data.parallel import Workers
 from data.records import POOLS, SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from data.store import DATABASES, Store, digest, sealed, write_atomically
 
@@ -76,6 +78,12 @@ def main(cfg: ExportCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    if cfg.format == "clevrer":
+        from data.transfer.export import export_clevrer
+
+        scenes = export_clevrer(store, Path(cfg.folder), Workers(cfg.workers))
+        log.info("%s holds %d scenes as CLEVRER's release has them", cfg.folder, scenes)
+        return {"scenes": float(scenes)}
     shards = ensure_export(store, Path(cfg.folder), cfg.images, cfg.url, cfg.published)
     text = summary(Path(cfg.folder), shards)
     log.info("%s", text)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ import numpy as np
 from PIL import Image
 
 from conf.errors import UserError
+from data.frames import FrameCache, load_frames
+from data.parallel import Workers
 from data.records import FPS, FRAMES, Scene
-from data.store import write_atomically
+from data.store import Store, load_scene, scene_path, write_atomically
 from data.transfer.clevrer import EULER, VECTORS
 
 FIRST_VALIDATION, FIRST_TEST = 10_000, 15_000
@@ -21,6 +24,48 @@ BLOCK = 1_000
 """Scenes that share a folder."""
 QUALITY = "6"
 """x264's constant rate factor: no loss that is seen."""
+
+
+def export_clevrer(store: Store, folder: Path, workers: Workers) -> int:
+    """Write every scene of a benchmark with all its frames as a release of CLEVRER, training scenes
+    as its train part and test scenes as its validation part; scenes that are there stay.
+
+    Returns:
+        How many scenes the release has.
+
+    Raises:
+        UserError: CLEVRER has no room for so many, or no scenes like these.
+    """
+    indices = {
+        name: first + k
+        for split, first in (("train", 0), ("test", FIRST_VALIDATION))
+        for k, name in enumerate(store.scene_ids(split))
+    }
+    cache = FrameCache.of(store)
+    jobs = {
+        name: partial(_export_one, cache, name, folder, index)
+        for name, index in indices.items()
+        if not annotation_path(folder, index).exists()
+    }
+    done = len(indices) - len(jobs)
+    for _ in workers.run(jobs, "exporting scenes", "scene", done):
+        pass
+    return len(indices)
+
+
+def _export_one(cache: FrameCache, scene_id: str, folder: Path, index: int) -> None:
+    scene = load_scene(scene_path(cache.folder, scene_id))
+    pixels = load_frames(cache.path(scene_id))
+    pixels |= cache.draw(scene_id, [f for f in range(scene.frames) if f not in pixels])
+    write_clevrer(scene, {f: Image.fromarray(p) for f, p in pixels.items()}, folder, index)
+
+
+def annotation_path(folder: Path, index: int) -> Path:
+    """Where a release has the annotation of scene `index`."""
+    part = "train" if index < FIRST_VALIDATION else "validation"
+    block = index // BLOCK * BLOCK
+    span = f"{block:05d}-{block + BLOCK:05d}"
+    return folder / f"annotation_{part}/annotation_{span}/annotation_{index:05d}.json"
 
 
 def write_clevrer(
@@ -48,11 +93,10 @@ def write_clevrer(
             f"scene {scene.scene_id} has {scene.frames} frames and {len(images)} images: CLEVRER "
             f"has {FRAMES} of each"
         )
-    part = "train" if index < FIRST_VALIDATION else "validation"
-    block = index // BLOCK * BLOCK
-    span = f"{block:05d}-{block + BLOCK:05d}"
-    annotation = folder / f"annotation_{part}/annotation_{span}/annotation_{index:05d}.json"
-    video = folder / f"video_{part}/video_{span}/video_{index:05d}.mp4"
+    annotation = annotation_path(folder, index)
+    beside = str(annotation.relative_to(folder)).replace("annotation", "video")
+    video = (folder / beside).with_suffix(".mp4")
+    # The annotation last, for where it stands the scene is whole.
     write_atomically(video, _encoded([images[frame] for frame in range(FRAMES)]))
     write_atomically(annotation, json.dumps(_annotation(scene, index, video.name)).encode())
     return annotation, video

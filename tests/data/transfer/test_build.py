@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ import pytest
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from data.build import ensure_benchmark, ensure_items
-from data.frames import Frames
+from data.frames import FrameCache, Frames
 from data.parallel import Workers
+from data.transfer.export import export_clevrer
 from tests.data.transfer.clevrer_files import clevrer_annotation, write_clevrer_scene
 from tests.data.transfer.movi_a_files import movi_example, write_movi_folder
 from tests.data.transfer.pictures import picture
@@ -98,3 +100,35 @@ def test_clevrers_scenes_take_the_benchmarks_own_recipes(tmp_path) -> None:
     assert {i.suite for i in store.selection()} == {"dynapix"}
     assert {q.split for q in store.retrieval()} == {"train", "test"}
     assert len(store.scene_ids("train") + store.scene_ids("test")) == 8
+
+
+@pytest.mark.slow
+def test_an_exported_benchmark_is_read_as_a_release_with_the_same_items(tmp_path) -> None:
+    """Scenes go out as CLEVRER's release has them, and come back as the scenes they were."""
+    few = Quota(train=2, test=1)
+    cfg = BenchmarkConfig(
+        name="ours",
+        scenes=5,
+        width=96,
+        height=64,
+        selection=SelectionConfig(time={"in_1s": few}, event={"contact_offset": few}),
+        retrieval=RetrievalTrackConfig(),
+    )
+    ours = ensure_items(cfg, tmp_path, Workers(2))
+    assert export_clevrer(ours, tmp_path / "release", Workers(2)) == 5
+    release = replace(cfg, name="theirs", simulator="clevrer", folder=str(tmp_path / "release"))
+    theirs = ensure_items(release, tmp_path, Workers(2))
+    names = [*ours.scene_ids("train"), *ours.scene_ids("test")]
+    read = sorted([*theirs.scene_ids("train"), *theirs.scene_ids("test")])
+    for name, other in zip(names, read, strict=True):
+        scene, back = ours.scene(name), theirs.scene(other)
+        assert back.objects == scene.objects
+        assert back.collisions == scene.collisions
+        for array in ("positions", "velocities", "angular_velocities"):
+            np.testing.assert_allclose(getattr(back, array), getattr(scene, array), atol=1e-6)
+        places = [s.image_positions[scene.in_view] for s in (back, scene)]
+        np.testing.assert_allclose(*places, atol=1e-2)
+        np.testing.assert_array_equal(back.in_view, scene.in_view)
+        shown = FrameCache.of(theirs).draw(other, [60])[60].astype(float)
+        drawn = FrameCache.of(ours).draw(name, [60])[60].astype(float)
+        assert np.abs(shown - drawn).mean() < 3
