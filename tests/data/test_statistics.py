@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from data.statistics import (
+    cell_counts,
+    hard_margin,
     item_statistics,
     scene_statistics,
     strategy_accuracy,
@@ -39,7 +41,7 @@ def made(count: int = 24) -> tuple[list, SimpleNamespace]:
 def test_constant_velocity_foresees_what_moves_so() -> None:
     items, store = made()
     found = strategy_accuracy(items, store)["event"]
-    assert found["constant velocity"] == 1
+    assert found["velocity"] == 1
     assert found["items"] == len(items)
 
 
@@ -63,7 +65,8 @@ def test_a_real_benchmark_is_told_whole(micro_store) -> None:
     items = micro_store.selection()
     found = {
         "scenes": scene_statistics(micro_store),
-        "items": item_statistics(items),
+        "cells": cell_counts(items),
+        "items": item_statistics(items, micro_store),
         "strategies": strategy_accuracy(items, micro_store),
     }
     assert sum(found["scenes"]["collisions a scene"].values()) == 10
@@ -71,5 +74,13 @@ def test_a_real_benchmark_is_told_whole(micro_store) -> None:
     by_family = [found["strategies"][f]["items"] for f in ("event", "time", "window")]
     assert sum(by_family) == len(items)
     assert found["strategies"]["event, cross_scene"]["nearest"] == 1
+    assert found["cells"]["window"]["test"] == sum(
+        n["test"] for name, n in found["cells"].items() if name.startswith("window/G1_")
+    ) + sum(found["cells"][f"window/{group}"]["test"] for group in ("G2", "G3", "G4"))
+    # A median over items of distances that are at least the items' least.
+    for group, far in found["items"]["median to the nearest distractor"].items():
+        assert far >= found["items"]["median least displacement"][group] - 1e-3
+    assert hard_margin(found["strategies"]) > 0.3
     told = table(found)
+    assert max(map(len, told.splitlines())) <= 100
     assert all(group in told for group in found["strategies"])
