@@ -45,7 +45,13 @@ def main() -> None:
     scene = simulate_scene(0, 3, "train", BenchmarkConfig(name="reading"))
     shown = [*range(10, 58, 4), 70, 80, 90, 100]
     with tempfile.TemporaryDirectory() as folder:
-        config = {"width": 480, "height": 320, "simulator": "bullet", "folder": None}
+        config = {
+            "width": 480,
+            "height": 320,
+            "renderer": "bullet",
+            "simulator": "bullet",
+            "folder": None,
+        }
         store = SimpleNamespace(folder=Path(folder), manifest={"config": config})
         save_scene(scene, scene_path(store.folder, scene.scene_id))
         cache = FrameCache.of(store)

@@ -23,6 +23,7 @@ class Quota:
     test: int = 0
 
 
+RENDERERS = ("bullet", "egl", "blender")
 SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
 FRAMES_AHEAD = ("named", "all", "none")
 ENGINES = ("loky", "ray")
@@ -94,6 +95,9 @@ class BenchmarkConfig:
     min_objects: int = 4
     max_objects: int = 6
     max_collisions: int = 3
+    renderer: str = "bullet"
+    """bullet draws everywhere, egl through a graphics driver, blender as CLEVRER looks (extra
+    blender)."""
     width: int = 480
     height: int = 320
     prefix_frames: int = 12
@@ -109,6 +113,10 @@ class BenchmarkConfig:
             problems.append(f"benchmark.test_share={self.test_share} must be above 0 and at most 1")
         if self.fps <= 0:
             problems.append(f"benchmark.fps={self.fps} must be above 0")
+        if self.renderer not in RENDERERS:
+            problems.append(
+                f"benchmark.renderer={self.renderer}: the options are {', '.join(RENDERERS)}"
+            )
         absent = self.retrieval.counterfactual
         if self.simulator not in SIMULATORS:
             problems.append(

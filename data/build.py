@@ -95,7 +95,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
             "name": cfg.name,
             "suite": cfg.simulator if cfg.simulator in TRANSFER else "dynapix",
             "seed": cfg.seed,
-            **versions(cfg.simulator),
+            **versions(cfg.simulator, cfg.renderer),
             "config": asdict(cfg),
             "counts": count(scene_ids, items, queries, databases) | unread | dropped | left_out,
             "shortfalls": shortfalls(cfg, items, queries, databases),

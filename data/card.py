@@ -149,9 +149,10 @@ def _columns(name: str, kinds: Features) -> str:
 
 
 def _making(store: Store) -> str:
-    made_by = versions(store.manifest["config"]["simulator"])
+    settings = store.manifest["config"]
+    made_by = versions(settings["simulator"], settings["renderer"])
     told = ", ".join(f"{name} {version}" for name, version in made_by.items())
-    config = OmegaConf.to_yaml(OmegaConf.create(store.manifest["config"]))
+    config = OmegaConf.to_yaml(OmegaConf.create(settings))
     return (
         "Scenes are simulated by Bullet and rendered from the simulator's record; items and "
         "queries are drawn from that record alone. Versions of the parts that make it: "

@@ -23,7 +23,7 @@ import pyarrow as pa
 from PIL import Image
 
 from data.records import Scene
-from data.render import renderer
+from data.renderers import renderer
 from data.store import Store, cached_scene, scene_path, write_atomically
 from data.transfer.release import RELEASES
 
@@ -94,6 +94,7 @@ class FrameCache:
     folder: Path
     width: int
     height: int
+    renderer: str
     simulator: str
     release: str | None
     """Folder of another simulator's release, whose frames are its own."""
@@ -101,7 +102,7 @@ class FrameCache:
     @classmethod
     def of(cls, store: Store) -> FrameCache:
         config = store.manifest["config"]
-        keys = ("width", "height", "simulator", "folder")
+        keys = ("width", "height", "renderer", "simulator", "folder")
         return cls(store.folder, *(config[key] for key in keys))
 
     def path(self, scene_id: str) -> Path:
@@ -116,7 +117,7 @@ class FrameCache:
         if scene.footage is not None:
             images = RELEASES[self.simulator].images(scene, Path(self.release), frames)
             return {frame: np.asarray(image) for frame, image in images.items()}
-        render = renderer(self.width, self.height).render
+        render = renderer(self.renderer, self.width, self.height).render
         return {frame: np.asarray(render(scene, frame)) for frame in frames}
 
 

@@ -56,6 +56,12 @@ class Camera:
         return np.stack([x, y, np.ones_like(x)], axis=-1) @ self.axes
 
 
+def standard_camera(width: int, height: int) -> Camera:
+    """The camera that scenes are watched by, at another resolution."""
+    standard = Camera()
+    return Camera(width, height, standard.focal * width / standard.width)
+
+
 def rotation(quaternion: np.ndarray) -> np.ndarray:
     """(3, 3) matrix of a unit quaternion in x y z w order."""
     x, y, z, w = quaternion

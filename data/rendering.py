@@ -13,6 +13,7 @@ from data.controls import MATCHED
 from data.frames import FrameCache, load_frames, save_frames
 from data.parallel import Workers
 from data.records import FrameRef, shown_frames
+from data.renderers import check
 from data.store import DATABASES, Store, write_atomically
 
 log = logging.getLogger(__name__)
@@ -29,6 +30,9 @@ def render_ahead(store: Store, which: str, bound_gb: float | None, workers: Work
     path = store.folder / "frames" / RECORD
     if path.exists() and asked.items() <= json.loads(path.read_text()).items():
         return
+    config = store.manifest["config"]
+    if which != "none" and config["simulator"] == "bullet":
+        check(config["renderer"])
     wanted = frames_to_render(store, which)
     databases = {name: set(store.database(name)) for name in DATABASES}
     ranked = set().union(*databases.values())

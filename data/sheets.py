@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from data.geometry import RADIUS, Camera
 from data.records import FPS, Scene
-from data.render import RGB
+from data.renderers.looks import RGB
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from conf.errors import UserError
+from data import renderers
 from data.bullet import GENERATOR_VERSION
 from data.records import (
     Collision,
@@ -37,7 +38,6 @@ from data.records import (
     SceneObject,
     SelectionItem,
 )
-from data.render import RENDERER_VERSION
 from data.selection.drafts import BUILDERS_VERSION
 
 MANIFEST = "manifest.json"
@@ -46,12 +46,12 @@ PLAN = "plan.json"
 """What a build in progress is to become; gone from a whole store."""
 
 
-def versions(simulator: str) -> dict[str, str]:
+def versions(simulator: str, renderer: str) -> dict[str, str]:
     """What makes the same config give another benchmark: scenes, pixels, items and queries."""
     rendered = simulator == "bullet"
     return {
         "generator": GENERATOR_VERSION,
-        "renderer": RENDERER_VERSION if rendered else f"{simulator}'s own frames",
+        "renderer": renderers.version(renderer) if rendered else f"{simulator}'s own frames",
         "builders": BUILDERS_VERSION,
     }
 
@@ -227,8 +227,9 @@ def open_store(folder: Path) -> Store:
         raise UserError(f"{folder} holds no benchmark: {MANIFEST} is missing; {rebuild}")
     try:
         manifest = json.loads(path.read_text())
-        built = {key: manifest.get(key) for key in versions("bullet")}
-        current = versions(manifest.get("config", {}).get("simulator", "bullet"))
+        config = manifest.get("config", {})
+        current = versions(config.get("simulator", "bullet"), config.get("renderer", "bullet"))
+        built = {key: manifest.get(key) for key in current}
     except (ValueError, AttributeError) as error:
         raise UserError(f"{path} is damaged and cannot be read; {rebuild}") from error
     for key, version in current.items():

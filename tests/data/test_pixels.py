@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from conf.schema import BenchmarkConfig
 from data.bullet import simulate_scene
 from data.geometry import Camera, displacements, object_match
 from data.records import COLORS, MATERIALS, SHAPES, Scene, SceneObject
-from data.render import RGB, BulletRenderer, renderer
+from data.renderers import renderer
+from data.renderers.bullet import BulletRenderer
+from data.renderers.looks import RGB
 
 LIMITS = BenchmarkConfig(name="pixels")
 
@@ -41,24 +44,23 @@ def test_the_frames_looked_at_show_all_there_is_to_see(scene: Scene) -> None:
 @pytest.mark.parametrize("frame", SEEN_AT)
 def test_visibility_agrees_with_bullets_mask(scene: Scene, frame: int) -> None:
     drawn = BulletRenderer(240, 160)  # twice that inside: the oracle's own 480 x 320
-    drawn.render(scene, frame)
-    bullet, camera = drawn._bullet, drawn._fine
-    take = (camera.width, camera.height, drawn._view, drawn._projection)
-    mask = np.reshape(bullet.getCameraImage(*take, renderer=bullet.ER_TINY_RENDERER)[4], (320, 480))
-    for k in range(len(scene.objects)):
-        seen = int((mask == drawn._handles[k]).sum())
-        for j, handle in enumerate(drawn._handles):
-            if j != k:
-                bullet.resetBasePositionAndOrientation(handle, [0, 0, -50], [0, 0, 0, 1])
-        alone = np.reshape(
-            bullet.getCameraImage(*take, renderer=bullet.ER_TINY_RENDERER)[4], (320, 480)
-        )
-        covers = int((alone == drawn._handles[k]).sum())
-        drawn.render(scene, frame)
+    handles = drawn.pose(scene, frame)
+    _, mask = drawn.photograph()
+    for k, handle in enumerate(handles):
+        seen = int((mask == handle).sum())
+        drawn.pose(alone(scene, k), frame)
+        covers = int((drawn.photograph()[1] >= 0).sum())
         if covers > 8 or covers == 0:
             assert scene.in_view[frame, k] == (covers > 0)
         if covers > 100:
             assert scene.visible_fraction[frame, k] == pytest.approx(seen / covers, abs=0.05)
+
+
+def alone(scene: Scene, k: int) -> Scene:
+    """A scene with only its object k."""
+    arrays = {name: getattr(scene, name)[:, k : k + 1] for name in Scene.ARRAYS}
+    name = f"{scene.scene_id}-only-{k}"
+    return replace(scene, scene_id=name, objects=(scene.objects[k],), collisions=(), **arrays)
 
 
 def test_a_frame_is_no_distance_from_itself(scene: Scene) -> None:
@@ -71,7 +73,7 @@ def test_a_frame_is_no_distance_from_itself(scene: Scene) -> None:
 
 def test_the_same_frame_is_the_same_pixels(scene: Scene) -> None:
     first = BulletRenderer(192, 128).render(scene, 50).tobytes()
-    again = renderer(192, 128)
+    again = renderer("bullet", 192, 128)
     again.render(simulate_scene(0, 1, "train", LIMITS), 3)
     assert again.render(scene, 50).tobytes() == first
 
@@ -82,14 +84,18 @@ def crop(look: SceneObject, place: tuple[float, float], yaw: float) -> np.ndarra
     position = np.array([[[*place, height]]], np.float32)
     turn = np.array([[[0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]]], np.float32)
     none = np.zeros((1, 1, 3), np.float32)
-    seen = np.ones((1, 1), bool)
+    there = np.ones((1, 1), bool)
     one = Scene(
         f"{look}{place}{yaw}", "train", (look,), (), position, turn, none, none,
-        none[..., :2], seen, seen.astype(np.float32),
+        none[..., :2], there, there.astype(np.float32),
     )  # fmt: skip
-    drawn = renderer(192, 128)
-    drawn.render(one, 0)
-    pixels, cover = drawn._draw()
+    drawn = renderer("bullet", 192, 128)
+    drawn.pose(one, 0)
+    pixels, mask = drawn.photograph()
+    seen = (mask >= 0)[..., None]
+    fine = np.dstack([pixels[..., :3] * seen, seen])
+    small = fine.reshape(128, 2, 192, 2, 4).mean(axis=(1, 3))
+    pixels, cover = small[..., :3], small[..., 3]
     rows, columns = np.nonzero(cover > 0.5)
     box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
     return np.dstack([pixels[box], 255 * cover[box]])

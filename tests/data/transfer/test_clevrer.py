@@ -16,7 +16,7 @@ from conf.schema import BenchmarkConfig
 from data.bullet import simulate_scene
 from data.geometry import rotation
 from data.records import Collision
-from data.render import renderer
+from data.renderers import renderer
 from data.transfer import clevrer
 from data.transfer.export import write_clevrer
 from data.transfer.reading import BadRecord
@@ -154,7 +154,7 @@ def test_scenes_come_in_order_and_once(tmp_path: Path) -> None:
 def test_what_is_exported_is_read_back(tmp_path: Path) -> None:
     scene = simulate_scene(0, 0, "train", BenchmarkConfig(name="export"))
     assert not scene.in_view.all()
-    drawn = {f: renderer(192, 128).render(scene, f) for f in range(scene.frames)}
+    drawn = {f: renderer("bullet", 192, 128).render(scene, f) for f in range(scene.frames)}
     annotation, video = write_clevrer(scene, drawn, tmp_path, 10_042)
     block = "validation/{0}_10000-11000/{0}_10042"
     assert annotation == tmp_path / f"annotation_{block.format('annotation')}.json"
