@@ -10,6 +10,7 @@ import logging
 import os
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -79,6 +80,8 @@ class Workers:
                 return_as="generator_unordered",
                 initializer=_end_with_parent,
             )
+        # Loky renews a worker whose memory grows, as that of one does which keeps scenes.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs")
         for some in batched(list(jobs.items()), CHUNK * self.count):
             yield from parallel(delayed(_named)(name, job) for name, job in some)
 
