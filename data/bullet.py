@@ -95,7 +95,7 @@ class Motion:
 
 def connect() -> BulletClient:
     """A Bullet client without a window, its greetings swallowed."""
-    with _silence(1), _silence(2):
+    with silence(1), silence(2):
         import pybullet
         from pybullet_utils.bullet_client import BulletClient
 
@@ -103,7 +103,7 @@ def connect() -> BulletClient:
 
 
 @contextmanager
-def _silence(descriptor: int) -> Iterator[None]:
+def silence(descriptor: int) -> Iterator[None]:
     """Send what C writes to a file descriptor nowhere."""
     sys.stdout.flush()
     sys.stderr.flush()

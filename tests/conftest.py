@@ -14,7 +14,7 @@ from conf.schema import (
 )
 from data.build import ensure_benchmark
 from data.selection import event, time, window
-from data.store import Store
+from data.store import Store, open_store
 
 
 def micro_config(**changes: object) -> BenchmarkConfig:
@@ -47,6 +47,22 @@ def micro_config(**changes: object) -> BenchmarkConfig:
 @pytest.fixture(scope="session")
 def micro() -> BenchmarkConfig:
     return micro_config()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--benchmark",
+        type=Path,
+        help="a built benchmark, such as store/tiny, that the laws of test_tracks.py and "
+        "test_controls.py are held against in place of the small one",
+    )
+
+
+@pytest.fixture(scope="session")
+def benchmark_store(request: pytest.FixtureRequest) -> Store:
+    """The benchmark that the laws of built benchmarks are held against."""
+    folder = request.config.getoption("--benchmark")
+    return open_store(folder) if folder else request.getfixturevalue("micro_store")
 
 
 @pytest.fixture(scope="session")

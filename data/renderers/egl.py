@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from conf.errors import UserError
-from data.bullet import _silence, connect
+from data.bullet import connect, silence
 from data.records import SHAPES, Scene, SceneObject
 from data.renderers.bullet import OVERSAMPLING, BulletRenderer, save_textures
 from data.renderers.looks import mesh
@@ -48,7 +48,7 @@ def _stage() -> tuple[BulletClient, Path]:
     # Kept to the end, for Bullet reads a mesh's file whenever a body is made of it.
     folder = tempfile.TemporaryDirectory(prefix="dynapix-egl-")
     _save_meshes(Path(folder.name))
-    with _silence(1), _silence(2):
+    with silence(1), silence(2):
         bullet = start()
     atexit.register(_end, bullet, folder)
     return bullet, Path(folder.name)
@@ -56,7 +56,7 @@ def _stage() -> tuple[BulletClient, Path]:
 
 def _end(bullet: BulletClient, folder: tempfile.TemporaryDirectory) -> None:
     """Close a client without its farewell on the screen."""
-    with _silence(1):
+    with silence(1):
         bullet.disconnect()
     folder.cleanup()
 
