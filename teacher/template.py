@@ -21,7 +21,7 @@ from teacher.predicates import (
     facts_of,
 )
 
-NARRATOR_VERSION = "4"
+NARRATOR_VERSION = "3"
 ENOUGH = 110
 """Words under which a rationale is told in full: well above the 80 that it needs (paper, Rationale
 construction)."""
@@ -238,9 +238,7 @@ class _Voice:
         told = [f"{_pair(c.objects)} are very close {c.region}" for c in facts.close[:1]]
         ranked = sorted(facts.objects, key=lambda o: _rank(facts, o))
         shown = [o for o in ranked if o.target_sight == "shown"]
-        # A rationale says one thing and then the answer: how many it says would have to be learnt.
-        wanted = 2 if letter is None else 1
-        told += [f"the {o.object} is {o.target_region}" for o in shown[: wanted - len(told)]]
+        told += [f"the {o.object} is {o.target_region}" for o in shown[: 2 - len(told)]]
         if letter is not None:
             told.append(
                 self.pick(
