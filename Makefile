@@ -28,8 +28,9 @@ run: setup ## Train and measure the tiny student and the tiny retriever, and rep
 test: setup ## Run every test
 	$(BIN)/python -m pytest
 
+# What tests/train imports takes longer than all quick tests.
 check: setup lint ## Lint, then run the quick tests
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" --ignore tests/train
 
 lint: setup ## Check format and style
 	$(BIN)/ruff format --check .

@@ -24,6 +24,8 @@ from data.frames import Frames
 from data.records import POOLS, RetrievalQuery, SelectionItem, shown_frames
 from data.store import Store, digest
 
+pytestmark = pytest.mark.slow
+
 SPLITS = {
     "selection": ("train", "test"),
     "retrieval": ("train", "test"),

@@ -17,6 +17,8 @@ from data.records import LETTERS
 from data.sheets import BREAK, CELL, GAP, MARGIN, RADIUS, _seen_floor, paths, sheet
 from data.store import Store
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def drawn(micro_store: Store) -> list:
