@@ -70,7 +70,7 @@ def test_all_unknown_keys_are_told_at_once():
         ("workers=0", "workers=0 must be 1 or more"),
         ("benchmark.height=129", "benchmark.height=129: frames are 3 wide to 2 high"),
         ("train.keep=0", "train.keep=0 must be 1 or more"),
-        ("train.max_steps=0", "train.max_steps=0 and train.epochs=2.0: give one or more steps"),
+        ("train.max_steps=0", "train.max_steps=0 and train.epochs=2.5: give one or more steps"),
         ("+benchmark.selection.event={new: {trian: 3}}", "event.new.trian: no such key"),
     ],
 )

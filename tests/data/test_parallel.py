@@ -37,6 +37,7 @@ def test_a_killed_workers_jobs_are_done_by_others(tmp_path, engine) -> None:
     assert results == {str(k): k * k for k in range(20)}
 
 
+@pytest.mark.slow
 def test_workers_that_keep_dying_are_told() -> None:
     with pytest.raises(UserError, match=r"squaring: workers die .* try workers=1"):
         list(Workers(2).run({"1": partial(die, 1), "2": partial(die, 2)}, "squaring", "number"))

@@ -61,6 +61,7 @@ def test_a_tie_counts_its_share() -> None:
     assert strategy_accuracy(items, store)["event"]["nearest"] == pytest.approx(0.25)
 
 
+@pytest.mark.slow
 def test_a_real_benchmark_is_told_whole(micro_store) -> None:
     items = micro_store.selection()
     found = {

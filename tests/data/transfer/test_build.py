@@ -18,6 +18,8 @@ from tests.data.transfer.clevrer_files import clevrer_annotation, write_clevrer_
 from tests.data.transfer.movi_a_files import movi_example, write_movi_folder
 from tests.data.transfer.pictures import picture
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def movi(tmp_path_factory) -> Path:
@@ -102,7 +104,6 @@ def test_clevrers_scenes_take_the_benchmarks_own_recipes(tmp_path) -> None:
     assert len(store.scene_ids("train") + store.scene_ids("test")) == 8
 
 
-@pytest.mark.slow
 def test_an_exported_benchmark_is_read_as_a_release_with_the_same_items(tmp_path) -> None:
     """Scenes go out as CLEVRER's release has them, and come back as the scenes they were."""
     few = Quota(train=2, test=1)
