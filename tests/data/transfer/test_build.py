@@ -57,7 +57,7 @@ def test_a_release_becomes_a_suite_with_its_own_frames(movi, tmp_path, caplog) -
     assert {i.family for i in items} == {"event", "time"}
     assert {i.suite for i in items} == {"movi_a"}
     assert store.selection("train") == store.retrieval() == store.database() == []
-    # What the store keeps of a frame is what the release shows, also where it is moved away.
+    # What the store keeps of a frame is what the release shows.
     frames = Frames(store)
     for candidate in items[0].candidates:
         shown = np.asarray(picture(candidate.frame, (256, 256)))
