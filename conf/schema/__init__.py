@@ -1,0 +1,55 @@
+"""Every setting of every command: one dataclass a command and a group, with its unit and default.
+
+Defaults here are the paper's values; a preset (`conf/<group>/<name>.yaml`) states what differs.
+`check()` returns one sentence for each combination of values that cannot work, naming the keys as
+a user types them.
+"""
+
+from conf.schema.benchmark import (
+    BenchmarkConfig,
+    Quota,
+    RetrievalTrackConfig,
+    SelectionConfig,
+)
+from conf.schema.commands import (
+    BuildCommand,
+    CommandConfig,
+    ContrastiveCommand,
+    ExportCommand,
+    GalleryCommand,
+    NarrateCommand,
+    ReportCommand,
+    RetrieveCommand,
+    SelectCommand,
+    SftCommand,
+    StatisticsCommand,
+)
+from conf.schema.models import ArchitectureConfig, LoraConfig, RetrieverConfig, StudentConfig
+from conf.schema.teacher import TeacherConfig
+from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainConfig
+
+__all__ = [
+    "ArchitectureConfig",
+    "BenchmarkConfig",
+    "BuildCommand",
+    "CommandConfig",
+    "ContrastiveCommand",
+    "ContrastiveTrainConfig",
+    "ExportCommand",
+    "GalleryCommand",
+    "LoraConfig",
+    "NarrateCommand",
+    "Quota",
+    "ReportCommand",
+    "RetrievalTrackConfig",
+    "RetrieveCommand",
+    "RetrieverConfig",
+    "SelectCommand",
+    "SelectionConfig",
+    "SftCommand",
+    "SftTrainConfig",
+    "StatisticsCommand",
+    "StudentConfig",
+    "TeacherConfig",
+    "TrainConfig",
+]

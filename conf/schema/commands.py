@@ -1,0 +1,197 @@
+"""What each command takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import date
+
+from omegaconf import MISSING
+
+from conf.schema.benchmark import BenchmarkConfig
+from conf.schema.checks import is_url, too_small
+from conf.schema.models import RetrieverConfig, StudentConfig
+from conf.schema.teacher import TeacherConfig
+from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
+
+FRAMES_AHEAD = ("named", "all", "none")
+ENGINES = ("loky", "ray")
+
+
+@dataclass
+class CommandConfig:
+    """What every command takes."""
+
+    run: str | None = None
+    """Folder of the run below checkpoints/<command>/; made from the overrides when null."""
+    store: str = "store"
+    """Folder of the built benchmarks."""
+    checkpoints: str = "checkpoints"
+    """Folder of the runs."""
+    workers: int = 2
+    """Processes that simulate, render and narrate."""
+
+    def check(self) -> list[str]:
+        return too_small(self, "", {"workers": 1, **({"seed": 0} if hasattr(self, "seed") else {})})
+
+
+@dataclass
+class BuildCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    frames: str = "named"
+    """Frames that are rendered ahead: named (by items, queries and databases), all or none. The
+    others are drawn when they are asked for."""
+    frames_gb: float | None = None
+    """Disk space that rendered frames may take; null sets no bound."""
+    strict: bool = False
+    """Whether a bad record of a release stops the build; otherwise it is told and left out."""
+    parallel: str = "loky"
+    """loky spreads the work over this machine's processes, ray over a Ray cluster."""
+
+    def check(self) -> list[str]:
+        problems = super().check() + too_small(self, "", {"frames_gb": 0})
+        for key, options in (("frames", FRAMES_AHEAD), ("parallel", ENGINES)):
+            if getattr(self, key) not in options:
+                listed = f"{', '.join(options[:-1])} and {options[-1]}"
+                problems.append(f"{key}={getattr(self, key)}: the options are {listed}")
+        return problems
+
+
+@dataclass
+class StatisticsCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+
+
+@dataclass
+class ExportCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    format: str = "huggingface"
+    """huggingface writes items, queries and databases as a dataset; clevrer writes scenes as videos
+    with annotations, as CLEVRER's release has them."""
+    folder: str = MISSING
+    """Folder of the export; must not hold another one."""
+    images: bool = True
+    """Whether frames are written too; without them a row names scenes and frames of the store."""
+    url: str | None = None
+    """Where the dataset will be published, such as https://huggingface.co/datasets/NAME/DATASET."""
+    published: str | None = None
+    """When, as YYYY-MM-DD."""
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        if self.format not in ("huggingface", "clevrer"):
+            problems.append(f"format={self.format}: the options are huggingface and clevrer")
+        if not self.folder:
+            problems.append("folder= is empty: name a folder, such as folder=exports/tiny")
+        if self.url is not None and not is_url(self.url):
+            problems.append(
+                f"url={self.url} is no address, such as https://huggingface.co/datasets/NAME/DATASET"
+            )
+        try:
+            date.fromisoformat(self.published or "2026-01-31")
+        except ValueError:
+            problems.append(f"published={self.published} is no date, such as 2026-01-31")
+        return problems
+
+
+@dataclass
+class GalleryCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    examples: int = 3
+    """Items of a subtype and queries of a builder that are shown; counterfactual pairs and paths
+    are twice as many."""
+    seed: int = 0
+    """Of the choice of examples."""
+
+    def check(self) -> list[str]:
+        return super().check() + too_small(self, "", {"examples": 1})
+
+
+@dataclass
+class NarrateCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    teacher: TeacherConfig = MISSING
+
+
+@dataclass
+class SftCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    teacher: TeacherConfig = MISSING
+    student: StudentConfig = MISSING
+    train: SftTrainConfig = field(default_factory=SftTrainConfig)
+    seed: int = 0
+    """Of the order of samples and of new adapters."""
+
+
+@dataclass
+class ContrastiveCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    retriever: RetrieverConfig = MISSING
+    train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
+    seed: int = 0
+    """Of the order of queries and of new adapters."""
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        if self.train.hard_negatives > self.benchmark.retrieval.hard_negatives:
+            problems.append(
+                f"train.hard_negatives={self.train.hard_negatives} is more than "
+                f"benchmark.retrieval.hard_negatives={self.benchmark.retrieval.hard_negatives}"
+            )
+        return problems
+
+
+@dataclass
+class SelectCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    student: StudentConfig = MISSING
+    train: SftTrainConfig = field(default_factory=SftTrainConfig)
+    """The preset's recipe; a measurement takes its precision alone."""
+    model: str | None = None
+    """A run folder of train.sft, with its own student and recipe; null takes the student's base."""
+    modes: list[str] = field(default_factory=lambda: ["reasoning", "answer"])
+    """reasoning (rationale, then answer) and answer (at once), each measured by itself."""
+    batch: int = 16
+    """Items that pass the model at once."""
+    limit: int | None = None
+    """Test items at most, spread over the cells; null takes all."""
+    seed: int = 0
+    """Of the items that `limit` leaves."""
+    suite: str | None = None
+    """matched_anchor for the pairs that differ in their anchor alone; null takes the benchmark's
+    own items."""
+    control: str | None = None
+    """candidate_only hides the prefix, shuffled_prefix shows its frames out of order; null shows
+    it as it is."""
+
+    def check(self) -> list[str]:
+        problems = super().check() + too_small(self, "", {"batch": 1, "limit": 1})
+        if self.suite not in (None, "matched_anchor"):
+            problems.append(f"suite={self.suite}: the options are matched_anchor and null")
+        if self.control not in (None, "candidate_only", "shuffled_prefix"):
+            problems.append(
+                f"control={self.control}: the options are candidate_only, shuffled_prefix and null"
+            )
+        if sorted(self.modes) not in (["answer"], ["reasoning"], ["answer", "reasoning"]):
+            problems.append(f"modes={self.modes}: give reasoning, answer or both, each once")
+        return problems
+
+
+@dataclass
+class RetrieveCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    retriever: RetrieverConfig = MISSING
+    train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
+    """The preset's recipe; a measurement takes its precision alone."""
+    model: str | None = None
+    """A run folder of train.contrastive, with its own retriever and recipe; null takes the
+    retriever's base."""
+    batch: int = 64
+    """Queries or frames that pass the model at once."""
+
+    def check(self) -> list[str]:
+        return super().check() + too_small(self, "", {"batch": 1})
+
+
+@dataclass
+class ReportCommand(CommandConfig):
+    pass

@@ -1,0 +1,119 @@
+"""Students and retrievers: the base, its quantisation and adapters, and what it is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from omegaconf import MISSING
+
+from conf.schema.checks import too_small
+
+
+@dataclass
+class ArchitectureConfig:
+    """Sizes of a Qwen3-VL built offline from a seed, with its tokenizer and processor."""
+
+    seed: int = 0
+    vocabulary: int = 1024
+    hidden: int = 192
+    layers: int = 4
+    heads: int = 6
+    kv_heads: int = 6
+    head: int = 32
+    """Size of one attention head; half of it is split over time, height and width."""
+    feed_forward: int = 512
+    vision_hidden: int = 128
+    vision_layers: int = 3
+    vision_heads: int = 4
+    vision_feed_forward: int = 384
+
+
+@dataclass
+class LoraConfig:
+    rank: int = 16
+    """0 adds no adapters and trains the whole model."""
+    alpha: int = 32
+    dropout: float = 0.0
+    targets: str = (
+        r"(model\.)*language_model\.layers\.\d+\."
+        r"(self_attn\.[qkvo]_proj|mlp\.(gate|up|down)_proj)"
+    )
+    """Anchored pattern over module names: the language tower's projections only."""
+
+
+@dataclass
+class StudentConfig:
+    name: str = MISSING
+    model: str | None = None
+    """A folder, or a hub name that is in the local cache; null builds `architecture`."""
+    revision: str | None = None
+    trust_remote_code: bool = False
+    """Whether code that a model ships may run."""
+    architecture: ArchitectureConfig | None = None
+    quantization: str = "nf4"
+    """nf4 or none."""
+    lora: LoraConfig = field(default_factory=LoraConfig)
+    image_size: int = 336
+    """Frames reach the model at image_size x image_size px, before the processor's grid."""
+    frames: int = 12
+    """Frames a prefix, evenly spread."""
+    max_length: int = 3072
+    """Tokens a sample; a longer one is refused, never cut."""
+    max_new_tokens: int = 512
+
+    def check(self) -> list[str]:
+        return _backbone_problems("student", self) + too_small(
+            self, "student.", {"max_new_tokens": 1}
+        )
+
+
+@dataclass
+class RetrieverConfig:
+    name: str = MISSING
+    model: str | None = None
+    revision: str | None = None
+    trust_remote_code: bool = False
+    architecture: ArchitectureConfig | None = None
+    quantization: str = "nf4"
+    lora: LoraConfig = field(default_factory=LoraConfig)
+    image_size: int = 336
+    frames: int = 12
+    max_length: int = 3072
+    widths: list[int] = field(default_factory=lambda: [4096, 2048, 1024, 512, 256, 128, 64])
+    """Matryoshka widths, widest first."""
+    query_instruction: str = "Retrieve images or text relevant to the user's query."
+    frame_instruction: str = "Represent the user's input."
+
+    def check(self) -> list[str]:
+        problems = _backbone_problems("retriever", self)
+        falling = sorted(set(self.widths), reverse=True) == list(self.widths)
+        if not self.widths or not falling or self.widths[-1] < 1:
+            problems.append(
+                f"retriever.widths={self.widths} must be one or more widths that fall strictly, "
+                "widest first"
+            )
+        return problems
+
+
+def _backbone_problems(group: str, cfg: StudentConfig | RetrieverConfig) -> list[str]:
+    problems = too_small(cfg, f"{group}.", {"image_size": 32, "frames": 2, "max_length": 1})
+    problems += too_small(cfg.lora, f"{group}.lora.", {"rank": 0, "dropout": 0})
+    if (cfg.model is None) == (cfg.architecture is None):
+        problems.append(
+            f"{group}.model and {group}.architecture: give exactly one, a model to load or sizes "
+            "to build"
+        )
+    if cfg.quantization not in ("nf4", "none"):
+        problems.append(f"{group}.quantization={cfg.quantization}: the options are nf4 and none")
+    if cfg.quantization == "nf4" and cfg.lora.rank == 0:
+        problems.append(
+            f"{group}.quantization=nf4 with {group}.lora.rank=0: 4-bit weights cannot be trained "
+            f"whole, set {group}.quantization=none or raise {group}.lora.rank"
+        )
+    if cfg.architecture is not None and (cfg.quantization == "nf4" or cfg.lora.rank > 0):
+        problems.append(
+            f"{group}.quantization={cfg.quantization} and {group}.lora.rank={cfg.lora.rank} with "
+            f"{group}.architecture: a model built from a seed is trained whole, set "
+            f"{group}.quantization=none and {group}.lora.rank=0"
+        )
+    return problems

@@ -1,0 +1,119 @@
+"""How students and retrievers are trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from conf.schema.checks import too_small
+
+
+@dataclass
+class TrainConfig:
+    """Settings that both trainers share."""
+
+    lr: float = 2e-5
+    schedule: str = "cosine"
+    """cosine, linear or constant, after the warm-up."""
+    warmup: float = 0.03
+    """Share of the steps."""
+    weight_decay: float = 0.0
+    max_grad_norm: float = 1.0
+    epochs: float = 3.0
+    max_steps: int = -1
+    """Optimizer steps; -1 leaves it to `epochs`."""
+    micro_batch: int = 1
+    accumulation: int = 16
+    precision: str = "bf16"
+    """bf16 or fp32: what the passes compute in; adapters and optimizer stay fp32."""
+    gradient_checkpointing: bool = True
+    evaluations: int = 10
+    """Evaluations, evenly spread over the run, each followed by a checkpoint."""
+    keep: int = 2
+    """Checkpoints kept."""
+    workers: int = 0
+    """Processes that prepare batches."""
+    report_to: list[str] = field(default_factory=list)
+    """Trackers of transformers' Trainer, such as tensorboard, wandb or trackio."""
+
+    def check(self) -> list[str]:
+        problems = too_small(
+            self,
+            "train.",
+            {
+                "warmup": 0,
+                "weight_decay": 0,
+                "max_grad_norm": 0,
+                "micro_batch": 1,
+                "accumulation": 1,
+                "evaluations": 1,
+                "keep": 1,
+                "workers": 0,
+            },
+        )
+        if self.lr <= 0:
+            problems.append(f"train.lr={self.lr} must be above 0")
+        if self.schedule not in ("cosine", "linear", "constant"):
+            problems.append(
+                f"train.schedule={self.schedule}: the options are cosine, linear and constant"
+            )
+        if self.precision not in ("bf16", "fp32"):
+            problems.append(f"train.precision={self.precision}: the options are bf16 and fp32")
+        if self.max_steps < 1 and (self.max_steps != -1 or self.epochs <= 0):
+            problems.append(
+                f"train.max_steps={self.max_steps} and train.epochs={self.epochs}: give one or "
+                "more steps, or -1 and epochs above 0"
+            )
+        return problems
+
+
+@dataclass
+class SftTrainConfig(TrainConfig):
+    regime: str = "cot"
+    """cot (rationale and answer), answer_only, or describe (the recipe of the tiny base)."""
+    validation_items: int = 64
+    """Training-split items of held-out training scenes that measure the run."""
+
+    def check(self) -> list[str]:
+        problems = super().check() + too_small(self, "train.", {"validation_items": 1})
+        if self.regime not in ("cot", "answer_only", "describe"):
+            problems.append(
+                f"train.regime={self.regime}: the options are cot, answer_only and describe"
+            )
+        return problems
+
+
+@dataclass
+class ContrastiveTrainConfig(TrainConfig):
+    batch: int = 512
+    """Queries a step; each is contrasted with every target and hard negative of the batch."""
+    mini_batch: int = 8
+    """Samples that pass the model at once in the cached loss; moves memory, not the gradient."""
+    hard_negatives: int = 1
+    """Same-scene wrong-time frames a query."""
+    scale: float = 50.0
+    """Inverse temperature of the cosine similarities."""
+    validation_queries: int = 128
+    """Queries of held-out training scenes that measure the run."""
+
+    def check(self) -> list[str]:
+        problems = super().check() + too_small(
+            self, "train.", {"hard_negatives": 0, "validation_queries": 1}
+        )
+        if self.accumulation != 1:
+            problems.append(
+                f"train.accumulation={self.accumulation}: the cached loss already splits "
+                "train.batch into train.mini_batch, leave train.accumulation=1"
+            )
+        if self.micro_batch != 1:
+            problems.append(
+                f"train.micro_batch={self.micro_batch}: a retriever's step is train.batch queries, "
+                "of which train.mini_batch pass the model at once; leave train.micro_batch=1"
+            )
+        if self.scale <= 0:
+            problems.append(f"train.scale={self.scale} must be above 0")
+        if not 1 <= self.mini_batch <= self.batch:
+            problems.append(
+                f"train.mini_batch={self.mini_batch} must lie between 1 and "
+                f"train.batch={self.batch}"
+            )
+        return problems
