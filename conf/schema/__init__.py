@@ -21,6 +21,7 @@ from conf.schema.commands import (
     ReportCommand,
     RetrieveCommand,
     SelectCommand,
+    ServeCommand,
     SftCommand,
     StatisticsCommand,
 )
@@ -46,6 +47,7 @@ __all__ = [
     "RetrieverConfig",
     "SelectCommand",
     "SelectionConfig",
+    "ServeCommand",
     "SftCommand",
     "SftTrainConfig",
     "StatisticsCommand",

@@ -16,6 +16,7 @@ SCHEMAS = {
     "data.export": schema.ExportCommand,
     "data.gallery": schema.GalleryCommand,
     "teacher.narrate": schema.NarrateCommand,
+    "teacher.serve": schema.ServeCommand,
     "train.sft": schema.SftCommand,
     "train.contrastive": schema.ContrastiveCommand,
     "evaluation.select": schema.SelectCommand,
