@@ -121,11 +121,13 @@ def save_accepted(rationales: list[Rationale], path: Path) -> None:
 
 
 def _schema() -> pa.Schema:
-    """Of every field, for some are null in all rows."""
+    """Of every field but the claims' counts, for some are null in all rows."""
     import pyarrow as pa
 
-    types = {"accepted": pa.bool_(), "reasons": pa.list_(pa.string())}
+    types = {"accepted": pa.bool_(), "fallback": pa.bool_(), "finished": pa.float64()}
+    types["reasons"] = pa.list_(pa.string())
     types["sections"] = pa.struct([(name, pa.string()) for name in SECTIONS])
     whole = ("attempt", "seed", "prompt_tokens", "completion_tokens")
     types |= dict.fromkeys(whole, pa.int64())
-    return pa.schema([(f.name, types.get(f.name, pa.string())) for f in fields(Rationale)])
+    names = [f.name for f in fields(Rationale) if f.name != "claims"]
+    return pa.schema([(name, types.get(name, pa.string())) for name in names])

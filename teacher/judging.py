@@ -58,6 +58,7 @@ class Judge:
             prompt_tokens=reply.prompt_tokens,
             completion_tokens=reply.completion_tokens,
             grammar=self.grammar,
+            finished=reply.finished,
         )
 
     def _settings(self) -> str:

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import Counter, defaultdict
-from dataclasses import dataclass
-from itertools import chain
+from collections import defaultdict
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from conf.entry import Run, command
+from conf.runs import write_json, write_text
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
 from teacher.journal import Journal, save_accepted
@@ -22,8 +24,8 @@ from teacher.judging import Judge, signature
 from teacher.predicates import predicates_of
 from teacher.progress import Progress
 from teacher.replies import Reply
+from teacher.report.summary import Summary, accepted_of, summarise
 from teacher.template import narrate
-from teacher.validate import word_count
 
 if TYPE_CHECKING:
     from data.store import Store
@@ -36,26 +38,22 @@ BATCH = 200
 
 
 @dataclass(frozen=True)
-class Report:
-    """What a teacher's answers amount to: `rationales` are the accepted ones in item order,
-    `rejected` counts answers by reason."""
+class Narration:
+    """A teacher's answers for a store: the accepted rationales in item order, the figures about
+    all of them, and whether any was asked for just now."""
 
     rationales: list[Rationale]
-    rejected: Counter[str]
-    set_aside: int
-    too_short: int
-
-    @property
-    def mean_words(self) -> float:
-        words = [word_count(r.text) for r in self.rationales]
-        return sum(words) / max(1, len(words))
+    summary: Summary
+    asked: bool
 
     def __str__(self) -> str:
-        reasons = ", ".join(f"{n} {reason}" for reason, n in self.rejected.most_common())
-        words = f" ({self.mean_words:.0f} words on average)" if self.rationales else ""
+        told = self.summary
+        reasons = ", ".join(f"{count} {kind}" for kind, count in told.rejected.items())
+        words = f" ({np.mean(told.lengths):.0f} words on average)" if told.lengths else ""
+        instead = f", {told.fallback} by the built-in narrator instead" if told.fallback else ""
         return (
-            f"rationales: {len(self.rationales)} accepted{words}, {self.set_aside} items set "
-            f"aside, {self.too_short} with too short a prefix; answers were rejected for: "
+            f"rationales: {told.accepted} accepted{words}{instead}, {told.set_aside} items set "
+            f"aside, {told.too_short} with too short a prefix; answers were rejected for: "
             f"{reasons or 'nothing'}"
         )
 
@@ -65,28 +63,37 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
-    report = narrate_store(store, cfg.teacher)
-    log.info(report)
+    narration = narrate_store(store, cfg.teacher)
+    log.info(narration)
+    summary = narration.summary
+    if narration.asked or not (run.folder / "report.html").exists():
+        from teacher.report.page import write_page
+
+        write_json(run.folder / "report.json", summary.to_dict())
+        write_text(run.folder / "report.txt", summary.text() + "\n")
+        shown = (cfg.shown, cfg.teacher.seed)
+        write_page(store, narration.rationales, summary.text(), *shown, run.folder)
+    log.info("report: %s", run.folder / "report.html")
     return {
-        "accepted": float(len(report.rationales)),
-        "reasons_to_reject": float(report.rejected.total()),
-        "set_aside": float(report.set_aside),
-        "too_short": float(report.too_short),
-        "mean_words": report.mean_words,
+        "accepted": float(summary.accepted),
+        "answers": float(sum(summary.asked)),
+        "set_aside": float(summary.set_aside),
+        "too_short": float(summary.too_short),
+        "mean_words": float(np.mean(summary.lengths)) if summary.lengths else 0.0,
     }
 
 
 def ensure_rationales(store: Store, cfg: TeacherConfig) -> list[Rationale]:
     """The accepted rationale of each training item that has one, in item order; asks for those
     that are still to come."""
-    report = narrate_store(store, cfg)
-    log.info(report)
-    return report.rationales
+    narration = narrate_store(store, cfg)
+    log.info(narration)
+    return narration.rationales
 
 
-def narrate_store(store: Store, cfg: TeacherConfig) -> Report:
-    """Ask a teacher for what is missing, and report on all of its answers. The accepted ones are
-    put into the store's rationales.parquet too.
+def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
+    """Ask a teacher for what is missing, and sum up all of its answers. The accepted ones are put
+    into the store's rationales.parquet too.
 
     Raises:
         UserError: rationales.jsonl is damaged or in use, or the servers fail for good.
@@ -96,7 +103,8 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Report:
     with Journal(store.folder / "rationales.jsonl") as journal:
         answers = defaultdict(list)
         for rationale in journal.rationales:
-            if signature(rationale) == judge.signature:
+            wanted = cfg.fallback or not rationale.fallback
+            if wanted and signature(rationale) == judge.signature:
                 answers[rationale.item_id].append(rationale)
         # Settled items are left out here, so that none takes a place among the requests in flight.
         jobs = [(i, len(answers[i.item_id])) for i in items if _open(answers[i.item_id], cfg)]
@@ -114,28 +122,36 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Report:
                 from teacher.asking import Asking
 
                 too_short = asyncio.run(Asking(store, cfg, judge, keep, progress).run(jobs))
-        report = _report(items, answers, cfg, too_short)
-        save_accepted(report.rationales, store.folder / "rationales.parquet")
-    return report
-
-
-def _report(
-    items: list[SelectionItem],
-    answers: dict[str, list[Rationale]],
-    cfg: TeacherConfig,
-    too_short: int,
-) -> Report:
-    told = [answers[item.item_id] for item in items]
-    accepted = [r for given in told for r in [r for r in given if r.accepted][:1]]
-    reasons = Counter(reason.split(":")[0] for r in chain(*told) for reason in r.reasons)
-    set_aside = sum(
-        len(given) >= cfg.attempts and not any(r.accepted for r in given) for given in told
-    )
-    return Report(accepted, reasons, set_aside, too_short)
+        if cfg.fallback:
+            aside = [item for item in items if _set_aside(answers[item.item_id], cfg)]
+            keep([r for item in aside for r in _stand_in(item, store, judge)])
+        rationales = accepted_of(items, answers)
+        save_accepted(rationales, store.folder / "rationales.parquet")
+    summary = summarise(items, answers, cfg.attempts, too_short)
+    return Narration(rationales, summary, asked=bool(jobs))
 
 
 def _open(given: list[Rationale], cfg: TeacherConfig) -> bool:
     return len(given) < cfg.attempts and not any(r.accepted for r in given)
+
+
+def _set_aside(given: list[Rationale], cfg: TeacherConfig) -> bool:
+    return len(given) >= cfg.attempts and not any(r.accepted for r in given)
+
+
+def _stand_in(item: SelectionItem, store: Store, judge: Judge) -> list[Rationale]:
+    """The built-in narrator's rationale for an item that was set aside, marked as such; none where
+    it does not stand before the validator either."""
+    predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
+    cfg = judge.cfg
+    if predicates is None:
+        return []
+    for attempt in range(cfg.attempts):
+        reply = Reply(narrate(predicates, item, cfg.seed, attempt))
+        rationale = judge.judge(reply, predicates, item, cfg.attempts + attempt)
+        if rationale.accepted:
+            return [replace(rationale, fallback=True)]
+    return []
 
 
 def _narrate_all(

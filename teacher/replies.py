@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ class Reply:
     flaw: str | None = None
     prompt_tokens: int | None = None
     completion_tokens: int | None = None
+    finished: float | None = None
 
 
 def replies(completion: Any, n: int) -> list[Reply]:
@@ -28,7 +30,7 @@ def replies(completion: Any, n: int) -> list[Reply]:
         prompt = None if read is None else read * (k == 0)
         # A teacher may answer with half of a surrogate pair, which no file can hold.
         text = (choice.message.content or "").encode("utf-8", "replace").decode().strip()
-        given.append(Reply(text, _flaw(text, choice), prompt, share))
+        given.append(Reply(text, _flaw(text, choice), prompt, share, time.time()))
     return given
 
 

@@ -111,6 +111,11 @@ class GalleryCommand(CommandConfig):
 class NarrateCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     teacher: TeacherConfig = MISSING
+    shown: int = 20
+    """Rationales on the report's page, beside their frames; chosen by `teacher.seed`."""
+
+    def check(self) -> list[str]:
+        return super().check() + too_small(self, "", {"shown": 0})
 
 
 @dataclass

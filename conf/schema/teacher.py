@@ -25,6 +25,8 @@ class TeacherConfig:
     max_words: int = 250
     attempts: int = 4
     """Answers asked for at most for an item before it is set aside."""
+    fallback: bool = False
+    """Whether the built-in narrator tells the items that are set aside, marked as its own."""
     samples: int = 3
     """Answers that one request asks for, for an item whose answer before was rejected."""
     temperature: float = 0.7
@@ -78,6 +80,8 @@ class TeacherConfig:
                 )
         if self.grammar and self.url is None:
             problems.append("teacher.grammar=true needs a server: give teacher.url=...")
+        if self.fallback and self.url is None:
+            problems.append("teacher.fallback=true needs a server, for whose items it stands in")
         if not 0 < self.top_p <= 1:
             problems.append(f"teacher.top_p={self.top_p} must be above 0 and at most 1")
         return problems

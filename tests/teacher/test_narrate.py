@@ -17,11 +17,15 @@ def lines(store):
 
 
 def test_template_narrates_every_training_item_but_short_ones(store):
-    report = narrate_store(store, TEMPLATE)
-    assert [r.item_id for r in report.rationales] == [f"item-{k}" for k in range(13) if k != 5]
-    assert (report.too_short, report.set_aside, report.rejected.total()) == (1, 0, 0)
+    narration = narrate_store(store, TEMPLATE)
+    assert [r.item_id for r in narration.rationales] == [f"item-{k}" for k in range(13) if k != 5]
+    assert (
+        narration.summary.too_short,
+        narration.summary.set_aside,
+        sum(narration.summary.rejected.values()),
+    ) == (1, 0, 0)
     before = lines(store)
-    assert ensure_rationales(store, TEMPLATE) == report.rationales
+    assert ensure_rationales(store, TEMPLATE) == narration.rationales
     assert lines(store) == before
 
 
@@ -68,10 +72,10 @@ def test_only_one_writer(store):
 
 def test_rejected_answers_are_kept_and_set_aside(store):
     cfg = TeacherConfig(name="template", min_words=240, max_words=250, attempts=2)
-    report = narrate_store(store, cfg)
+    narration = narrate_store(store, cfg)
     kept = read_rationales(store.folder / "rationales.jsonl")
-    assert report.rationales == []
-    assert (report.set_aside, report.rejected) == (12, {"too short": 24})
+    assert narration.rationales == []
+    assert (narration.summary.set_aside, narration.summary.rejected) == (12, {"too short": 24})
     assert [r.attempt for r in kept[:4]] == [0, 1, 0, 1]
 
 
@@ -86,9 +90,9 @@ def told(store):
 
 def test_the_accepted_are_a_parquet_file_too(store, odd):
     path = store.folder / "rationales.parquet"
-    report = narrate_store(store, config(odd("number")))
+    narration = narrate_store(store, config(odd("number")))
     rows = pq.read_table(path).to_pylist()
-    assert [Rationale.from_row(row) for row in rows] == report.rationales
+    assert [Rationale.from_row(row) for row in rows] == narration.rationales
     assert len(rows) == 12
     narrate_store(store, TeacherConfig(name="template", min_words=249))
     assert pq.read_table(path).num_rows == 0
@@ -96,10 +100,10 @@ def test_the_accepted_are_a_parquet_file_too(store, odd):
 
 def test_served_answers_are_judged_and_faults_cost_no_attempt(store, odd):
     server = odd(503, "cut", 500, "number")
-    report = narrate_store(store, config(server, samples=1))
-    assert [r.item_id for r in report.rationales] == [f"item-{k}" for k in range(13) if k != 5]
-    assert report.rejected == {"cut off": 1, "number": 1}
-    assert report.too_short == 1
+    narration = narrate_store(store, config(server, samples=1))
+    assert [r.item_id for r in narration.rationales] == [f"item-{k}" for k in range(13) if k != 5]
+    assert narration.summary.rejected == {"cut off": 1, "number": 1}
+    assert narration.summary.too_short == 1
     assert len(server.asked) == 12 + 4
     asked = server.asked[0]
     assert asked["chat_template_kwargs"] == {"enable_thinking": False}
@@ -110,18 +114,18 @@ def test_served_answers_are_judged_and_faults_cost_no_attempt(store, odd):
 
 def test_more_answers_are_asked_for_only_after_a_failure(store, odd):
     server = odd("number")
-    report = narrate_store(store, config(server, concurrency=1, samples=2))
+    narration = narrate_store(store, config(server, concurrency=1, samples=2))
     assert [request["n"] for request in server.asked] == [1, 2] + [1] * 11
-    first = [r for r in told(store) if r.item_id == report.rationales[0].item_id]
+    first = [r for r in told(store) if r.item_id == narration.rationales[0].item_id]
     assert [(r.attempt, r.accepted) for r in first] == [(0, False), (1, True), (2, True)]
-    assert report.rationales[0].attempt == 1
+    assert narration.rationales[0].attempt == 1
 
 
 def test_no_more_answers_are_asked_for_than_attempts(store, odd):
     server = odd()
     server.always["*"] = "number"
-    report = narrate_store(store, config(server, attempts=4, samples=2))
-    assert report.set_aside == 12
+    narration = narrate_store(store, config(server, attempts=4, samples=2))
+    assert narration.summary.set_aside == 12
     assert sorted(r.attempt for r in told(store)) == sorted([0, 1, 2, 3] * 12)
     assert sum(request["n"] for request in server.asked) == 48
 
@@ -139,9 +143,9 @@ def test_the_cost_of_a_request_is_that_of_its_answers(store, odd):
     [("cut", "cut off"), ("empty", "empty"), ("thinking", "thinking"), ("long", "too long")],
 )
 def test_an_answer_that_is_none_is_rejected_with_its_reason(store, odd, fault, reason):
-    report = narrate_store(store, config(odd(fault)))
-    assert report.rejected == {reason: 1}
-    assert len(report.rationales) == 12
+    narration = narrate_store(store, config(odd(fault)))
+    assert narration.summary.rejected == {reason: 1}
+    assert len(narration.rationales) == 12
     assert all(len(r.text) <= 20_000 for r in told(store))
 
 
@@ -156,9 +160,9 @@ def test_half_of_a_surrogate_pair_is_no_trouble(store, odd):
 )
 def test_a_request_that_fails_is_asked_again(store, odd, fault):
     server = odd(fault)
-    report = narrate_store(store, config(server))
-    assert report.rejected == {}
-    assert len(report.rationales) == 12
+    narration = narrate_store(store, config(server))
+    assert narration.summary.rejected == {}
+    assert len(narration.rationales) == 12
     assert len(server.asked) == 13
 
 
@@ -166,10 +170,10 @@ def test_an_item_that_no_server_answers_is_set_aside(store, odd):
     server = odd()
     said = next(iter(server.texts))
     server.always[said] = 500
-    report = narrate_store(store, config(server, concurrency=1, attempts=2))
-    assert len(report.rationales) == 11
-    assert report.rejected == {"unanswered": 2}
-    assert report.set_aside == 1
+    narration = narrate_store(store, config(server, concurrency=1, attempts=2))
+    assert len(narration.rationales) == 11
+    assert narration.summary.rejected == {"unanswered": 2}
+    assert narration.summary.set_aside == 1
 
 
 def test_a_killed_served_run_asks_only_for_the_rest(store, odd):
@@ -178,9 +182,9 @@ def test_a_killed_served_run_asks_only_for_the_rest(store, odd):
     whole = lines(store).splitlines(keepends=True)
     (store.folder / "rationales.jsonl").write_bytes(b"".join(whole[:7]) + whole[7][:40])
     server.asked.clear()
-    report = narrate_store(store, config(server))
+    narration = narrate_store(store, config(server))
     assert len(server.asked) == len(whole) - 7
-    assert len(report.rationales) == 12
+    assert len(narration.rationales) == 12
 
 
 def test_an_unknown_model_is_named_with_those_there(store, odd):

@@ -92,17 +92,17 @@ def test_servers_share_the_work_by_how_busy_they_are(odd):
 def test_a_server_that_is_down_does_not_stop_the_others(store, odd):
     down, up = odd(), odd()
     down.stop()
-    report = narrate_store(store, config(down, up))
-    assert len(report.rationales) == 12
-    assert report.rejected == {}
+    narration = narrate_store(store, config(down, up))
+    assert len(narration.rationales) == 12
+    assert narration.summary.rejected == {}
 
 
 def test_a_server_that_goes_down_midway_does_not_stop_the_others(store, odd):
     up, broken = odd(), odd()
     broken.always["*"] = 500
-    report = narrate_store(store, config(up, broken))
-    assert len(report.rationales) == 12
-    assert report.rejected == {}
+    narration = narrate_store(store, config(up, broken))
+    assert len(narration.rationales) == 12
+    assert narration.summary.rejected == {}
 
 
 def test_a_restarting_server_is_waited_for_without_attempts(store, odd):
@@ -120,11 +120,11 @@ def test_a_restarting_server_is_waited_for_without_attempts(store, odd):
 
     thread = threading.Thread(target=restart)
     thread.start()
-    report = narrate_store(store, config(server))
+    narration = narrate_store(store, config(server))
     thread.join()
     back[0].stop()
-    assert len(report.rationales) == 12
-    assert report.rejected == {}
+    assert len(narration.rationales) == 12
+    assert narration.summary.rejected == {}
     assert back[0].asked
 
 
