@@ -70,15 +70,19 @@ class Prose:
         """A word in lower case; empty outside the text."""
         return self.words[index].casefold() if 0 <= index < len(self.words) else ""
 
-    def near(self, index: int, by: int) -> str:
-        """The word `by` words away if only space or a hyphen parts each from the next, or ""."""
-        other = index + by
-        if not 0 <= other < len(self.words):
-            return ""
-        for gap in self.gaps[min(index, other) + 1 : max(index, other) + 1]:
-            if gap != " " and gap != "-" and not gap.isspace():
+    def before(self, index: int, by: int = 1) -> str:
+        """The word `by` words before, in lower case; "" unless space or hyphens part them all."""
+        for k in range(index, index - by, -1):
+            if k < 1 or not _joins(self.gaps[k]):
                 return ""
-        return self.words[other].casefold()
+        return self.words[index - by].casefold()
+
+    def after(self, index: int, by: int = 1) -> str:
+        """The word `by` words after, in lower case; "" unless space or hyphens part them all."""
+        for k in range(index + 1, index + 1 + by):
+            if k >= len(self.words) or not _joins(self.gaps[k]):
+                return ""
+        return self.words[index + by].casefold()
 
     def opens_clause(self, index: int) -> bool:
         return index == 0 or bool(CLAUSE.search(self.gaps[index][-8:]))
@@ -93,6 +97,10 @@ class Prose:
 
     def span(self, first: int, last: int) -> tuple[int, int]:
         return self.bounds[2 * first + 1], self.bounds[2 * last + 2]
+
+
+def _joins(gap: str) -> bool:
+    return gap in (" ", "-") or gap.isspace()
 
 
 def find_numbers(text: str) -> list[tuple[int, int]]:
@@ -212,10 +220,10 @@ def _one(prose: Prose, index: int) -> tuple[int, int] | None:
 
 def _is_pronoun(prose: Prose, index: int) -> bool:
     """Whether "one" stands for a thing, and so counts nothing."""
-    previous, following = prose.near(index, -1), prose.near(index, 1)
+    previous, following = prose.before(index), prose.after(index)
     if following in ("another", "side", "sided") or previous == "no":
         return True
-    if prose.word(index + 1) == "s" and prose.gaps[index + 1] in ("'", "’"):
+    if prose.gaps[index + 1] in ("'", "’") and prose.word(index + 1) == "s":
         return True
     if following in COUNTABLE or rule_of(previous[:LONGEST]) is _itself:
         return False
@@ -223,7 +231,7 @@ def _is_pronoun(prose: Prose, index: int) -> bool:
         return True
     if previous in lexicon.NOT_ADJECTIVES or previous in COUNTABLE:
         return False
-    return prose.near(index, -2) in ("the", "a", "an", "each", "every", "its", "their")
+    return prose.before(index, 2) in ("the", "a", "an", "each", "every", "its", "their")
 
 
 def _describes(word: str) -> bool:
@@ -234,17 +242,17 @@ def _describes(word: str) -> bool:
 
 def _first(prose: Prose, index: int) -> tuple[int, int] | None:
     """No number where it opens a sentence before a comma, or in "at first" and "first of all"."""
-    if prose.near(index, -1) == "at":
+    if prose.before(index) == "at":
         return None
     aside = prose.gaps[index + 1].lstrip()[:1] in (",", ":", "—", "–")
-    aside = aside or (prose.near(index, 1) == "of" and prose.near(index, 2) == "all")
-    opening = index - (prose.near(index, -1) in ("but", "and", "so"))
+    aside = aside or (prose.after(index) == "of" and prose.after(index, 2) == "all")
+    opening = index - (prose.before(index) in ("but", "and", "so"))
     return None if aside and prose.opens_clause(opening) else (index, index)
 
 
 def _once(prose: Prose, index: int) -> tuple[int, int] | None:
     """A number where it counts events; none in "once struck", where it is a conjunction."""
-    previous, following = prose.near(index, -1), prose.near(index, 1)
+    previous, following = prose.before(index), prose.after(index)
     if previous == "at" or following in ("more", "again"):
         return None
     if previous in lexicon.EXACTLY or following in ("or", "per", "every", "each"):
@@ -252,53 +260,59 @@ def _once(prose: Prose, index: int) -> tuple[int, int] | None:
     if not previous or prose.opens_clause(index):
         counts = prose.ends_clause(index)
     elif following:
-        counts = following not in lexicon.CLAUSE_OPENERS and not following.endswith(("ed", "ing"))
+        opens = following in lexicon.CLAUSE_OPENERS or following.endswith(("ed", "ing"))
+        counts = not opens and not _starts_number(prose, index + 1)
     else:
-        counts = True
+        counts = not FIGURES.search(prose.gaps[index + 1])
     return (index, index) if counts else None
+
+
+def _starts_number(prose: Prose, index: int) -> bool:
+    rule = rule_of(prose.words[index][:LONGEST])
+    return rule is _once or (rule is not None and rule(prose, index) is not None)
 
 
 def _unit(prose: Prose, index: int) -> tuple[int, int] | None:
     """ "A few frames", "a frame later", "within a frame", "a pixel"."""
     back = 1
-    while back <= 3 and prose.near(index, -back) in lexicon.FILLERS:
+    while back <= 3 and prose.before(index, back) in lexicon.FILLERS:
         back += 1
     plural = prose.word(index) in lexicon.PLURAL_UNITS or prose.gaps[index] == "-"
-    if plural and prose.near(index, -back) in lexicon.VAGUE:
+    if plural and prose.before(index, back) in lexicon.VAGUE:
         return index - back, index
-    if prose.word(index) not in lexicon.UNITS or prose.near(index, -1) not in ("a", "an"):
+    if prose.word(index) not in lexicon.UNITS or prose.before(index) not in ("a", "an"):
         return None
     if prose.word(index) in lexicon.LENGTHS:
         return index - 1, index
     if prose.word(index) in ("moment", "instant"):
         return None
-    if prose.near(index, 1) in ("later", "earlier", "ago", "before", "after"):
+    if prose.after(index) in ("later", "earlier", "ago", "before", "after"):
         return index - 1, index + 1
-    within = prose.near(index, -2) in ("within", "after", "in")
+    within = prose.before(index, 2) in ("within", "after", "in")
     return (index - 2, index) if within else None
 
 
 def _minute(prose: Prose, index: int) -> tuple[int, int] | None:
     """A number where it measures time; none where it means tiny."""
-    previous, following = prose.near(index, -1), prose.near(index, 1)
+    previous, following = prose.before(index), prose.after(index)
     if previous in lexicon.BEFORE_MINUTE:
         return index - 1, index
     if previous not in ("a", "the", "this"):
         return None
     if following in lexicon.AFTER_MINUTE:
         return index - 1, index + 1
-    timed = not following and prose.near(index, -2) in lexicon.TIME_PREPOSITIONS
+    timed = not following and prose.before(index, 2) in lexicon.TIME_PREPOSITIONS
     return (index - 1, index) if timed or prose.ends_sentence(index) else None
 
 
 def _score(prose: Prose, index: int) -> tuple[int, int] | None:
-    a_score_of = prose.near(index, -1) == "a" and prose.near(index, 1) == "of"
+    a_score_of = prose.before(index) == "a" and prose.after(index) == "of"
     return (index - 1, index + 1) if a_score_of else None
 
 
 def _secondary(prose: Prose, index: int) -> tuple[int, int] | None:
     """A number where it is an event's place in a series."""
-    return (index, index + 1) if prose.near(index, 1) in lexicon.EVENTS else None
+    return (index, index + 1) if prose.after(index) in lexicon.EVENTS else None
 
 
 def _letter(prose: Prose, index: int) -> tuple[int, int] | None:
@@ -317,19 +331,19 @@ def _letter(prose: Prose, index: int) -> tuple[int, int] | None:
 
 def _italian(prose: Prose, index: int) -> tuple[int, int] | None:
     """ "Due" and "metà" are Italian beside Italian words."""
-    if prose.near(index, 1) in lexicon.ITALIAN:
+    if prose.after(index) in lexicon.ITALIAN:
         return index, index + 1
-    return (index - 1, index) if prose.near(index, -1) in lexicon.ITALIAN else None
+    return (index - 1, index) if prose.before(index) in lexicon.ITALIAN else None
 
 
 def _secondo(prose: Prose, index: int) -> tuple[int, int] | None:
     """The Italian "second", or "according to" before an article."""
-    return None if prose.near(index, 1) in ("la", "il", "le", "i", "lo", "gli") else (index, index)
+    return None if prose.after(index) in ("la", "il", "le", "i", "lo", "gli") else (index, index)
 
 
 def _ek(prose: Prose, index: int) -> tuple[int, int] | None:
     """The Hindi "one", or half of "each other"."""
-    return None if prose.near(index, 1) == fold_word("दूसरे") else (index, index)
+    return None if prose.after(index) == fold_word("दूसरे") else (index, index)
 
 
 RULES: dict[str, Rule] = {

@@ -124,15 +124,13 @@ def test_spans_of_any_text_are_lawful():
     rng = random.Random(0)
     words = " ".join((*POSITIVE, *NEGATIVE)).split(" ")
     letters = [*"aonetwIVXi <>&;#*_`~|!@$-.,'()\n0123", "\u200b", "\u0301", "\ud800", "\U0001f1e6"]
-    for _ in range(1500):
+    for _ in range(800):
         pieces = [
             rng.choice((rng.choice(letters), rng.choice(words), chr(rng.randrange(0x110000)), " "))
             for _ in range(rng.randrange(60))
         ]
-        last = 0
-        for start, stop in find_numbers("".join(pieces)):
-            assert last <= start < stop <= len("".join(pieces))
-            last = stop
+        assert_lawful("".join(pieces))
+        assert_lawful(" ".join(rng.choices(words, k=20)))
 
 
 def test_mutated_sentences_do_not_raise():
