@@ -9,6 +9,7 @@ grow from column to column is linear time. The best of three runs, one core, pro
 
 from __future__ import annotations
 
+import random
 import time
 
 import numpy as np
@@ -21,6 +22,7 @@ from tests.teacher import synthetic
 
 SIZES = (4 << 10, 64 << 10, 1 << 20)
 RATIONALES = 200
+MIXTURES = 300
 PIECES = (
     *("<", ">", "&", "&#", "&a", "&lt;", "&amp;", "&#51;", "<a", "<b>", "</", "*", "`", "~", "_"),
     *("**a", "a*", "é*", "é<b>", "!a", "a!", "$a", "|a|", "-", "a-", "t-", "t-w-", "one-", "tw-"),
@@ -80,6 +82,10 @@ def main() -> None:
     for piece, row in sorted(rows, key=lambda row: -max(row[1]))[:20]:
         print(f"{piece!a:27}" + "".join(f"{ms:9.3f}" for ms in row))
     print(f"the slowest of {len(rows)} at 1 MB: {max(row[-1] for _, row in rows):.3f}")
+    rng = random.Random(0)
+    mixed = ["".join(rng.choices(PIECES, k=rng.choice((2, 3)))) for _ in range(MIXTURES)]
+    slowest = max((ms_per_kilobyte([hostile(piece, SIZES[1])]), ascii(piece)) for piece in mixed)
+    print(f"the slowest of {MIXTURES} mixtures of these at 64 KB: {slowest[0]:.3f}, {slowest[1]}")
 
 
 if __name__ == "__main__":

@@ -112,7 +112,7 @@ def fold(text: str) -> list[Reading]:
 
 def _unescaped(reading: Reading) -> Reading:
     text, starts, stops = reading.text, reading.starts, reading.stops
-    entities = list(ENTITY.finditer(text))
+    entities = [m for m in ENTITY.finditer(text) if _meaning(m[0]) != m[0]]
     if not entities:
         return reading
     pieces: list[str] = []

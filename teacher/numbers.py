@@ -55,6 +55,7 @@ CLAUSE = re.compile(r"[.!?:;\n•–—*#>(\"“]|\s-\s")
 COUNTABLE = lexicon.NOUNS | lexicon.EVENTS | lexicon.UNITS
 """What "one" counts even after "the" or an adjective."""
 ADJECTIVAL = ("er", "est", "ing", "ed", "most")
+JOINS = frozenset(" -")
 CLOSERS = frozenset(".,;:!?)…—–")
 
 
@@ -72,17 +73,21 @@ class Prose:
 
     def before(self, index: int, by: int = 1) -> str:
         """The word `by` words before, in lower case; "" unless space or hyphens part them all."""
-        for k in range(index, index - by, -1):
-            if k < 1 or not _joins(self.gaps[k]):
-                return ""
-        return self.words[index - by].casefold()
+        while index > 0 and _joins(self.gaps[index]):
+            index -= 1
+            by -= 1
+            if not by:
+                return self.words[index].casefold()
+        return ""
 
     def after(self, index: int, by: int = 1) -> str:
         """The word `by` words after, in lower case; "" unless space or hyphens part them all."""
-        for k in range(index + 1, index + 1 + by):
-            if k >= len(self.words) or not _joins(self.gaps[k]):
-                return ""
-        return self.words[index + by].casefold()
+        while index + 1 < len(self.words) and _joins(self.gaps[index + 1]):
+            index += 1
+            by -= 1
+            if not by:
+                return self.words[index].casefold()
+        return ""
 
     def opens_clause(self, index: int) -> bool:
         return index == 0 or bool(CLAUSE.search(self.gaps[index][-8:]))
@@ -100,7 +105,8 @@ class Prose:
 
 
 def _joins(gap: str) -> bool:
-    return gap in (" ", "-") or gap.isspace()
+    # The usual gaps first, for this is asked of most words that have a rule.
+    return gap in JOINS or gap.isspace()
 
 
 def find_numbers(text: str) -> list[tuple[int, int]]:
@@ -112,16 +118,19 @@ def find_numbers(text: str) -> list[tuple[int, int]]:
 
 
 def _merged(spans: Spans, text: str) -> Spans:
+    spans.sort()
     merged: Spans = []
-    for start, stop in sorted(spans):
+    first, last = spans[0]
+    for start, stop in spans:
         # Marks that fold to nothing belong to the character that they stand on.
-        while stop < len(text) and not FOLDS[text[stop]]:
+        while stop < len(text) and text[stop] > "\x7f" and not FOLDS[text[stop]]:
             stop += 1
-        if merged and (start <= merged[-1][1] or text[merged[-1][1] : start] in ("-", " ")):
-            merged[-1] = (merged[-1][0], max(stop, merged[-1][1]))
+        if start <= last or (start == last + 1 and text[last] in "- "):
+            last = stop if stop > last else last
         else:
-            merged.append((start, stop))
-    return merged
+            merged.append((first, last))
+            first, last = start, stop
+    return [*merged, (first, last)]
 
 
 def _scan(text: str) -> Spans:
@@ -220,18 +229,26 @@ def _one(prose: Prose, index: int) -> tuple[int, int] | None:
 
 def _is_pronoun(prose: Prose, index: int) -> bool:
     """Whether "one" stands for a thing, and so counts nothing."""
-    previous, following = prose.before(index), prose.after(index)
-    if following in ("another", "side", "sided") or previous == "no":
-        return True
     if prose.gaps[index + 1] in ("'", "’") and prose.word(index + 1) == "s":
+        return True
+    pronoun = _is_pronoun_between(prose.before(index), prose.after(index))
+    if pronoun is None:
+        return prose.before(index, 2) in ("the", "a", "an", "each", "every", "its", "their")
+    return pronoun
+
+
+@lru_cache(maxsize=1 << 12)
+def _is_pronoun_between(previous: str, following: str) -> bool | None:
+    """None where an article before the word before would make it one: "the opaque one"."""
+    if following in ("another", "side", "sided") or previous == "no":
         return True
     if following in COUNTABLE or rule_of(previous[:LONGEST]) is _itself:
         return False
     if following in lexicon.MODALS or _describes(previous):
         return True
-    if previous in lexicon.NOT_ADJECTIVES or previous in COUNTABLE:
+    if not previous or previous in lexicon.NOT_ADJECTIVES or previous in COUNTABLE:
         return False
-    return prose.before(index, 2) in ("the", "a", "an", "each", "every", "its", "their")
+    return None
 
 
 def _describes(word: str) -> bool:
