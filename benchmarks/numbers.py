@@ -2,9 +2,9 @@
 
     python -m benchmarks.numbers
 
-The prose is the built-in narrator's: rationales of the items of a benchmark of one's own making
-would read alike. Hostile texts repeat a piece to 4 KB, 64 KB and 1 MB, where a figure that does not
-grow from column to column is linear time. The best of three runs, one core, processor time.
+The prose is what the built-in narrator tells of random scenes. Hostile texts repeat a piece to
+4 KB, 64 KB and 1 MB: a figure that does not grow from column to column is linear time. Each is the
+best of three runs, in processor time.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import chain, repeat
+from itertools import chain, compress, repeat
 
 from teacher.lexicon import IDEOGRAPHS, IDIOMS, PICTOGRAPHS
 
@@ -155,14 +155,12 @@ def _folded(reading: Reading) -> Reading:
 
 def _without_seams(reading: Reading) -> Reading | None:
     """The reading with nothing between the letters that seams part; None if it has no seams."""
-    kept, starts, stops, at = [], [], [], 0
+    keeps = bytearray(b"\1") * len(reading.text)
     for match in SEAM.finditer(reading.text):
-        first, last = match.span()
-        kept.append(reading.text[at:first])
-        starts += reading.starts[at:first]
-        stops += reading.stops[at:first]
-        at = last
-    if not at:
+        keeps[match.start() : match.end()] = bytes(match.end() - match.start())
+    if all(keeps):
         return None
-    text = "".join([*kept, reading.text[at:]]).replace("_", " ")
-    return Reading(text, [*starts, *reading.starts[at:]], [*stops, *reading.stops[at:]])
+    text = "".join(compress(reading.text, keeps)).replace("_", " ")
+    return Reading(
+        text, list(compress(reading.starts, keeps)), list(compress(reading.stops, keeps))
+    )

@@ -6,6 +6,7 @@ import random
 import re
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -16,9 +17,11 @@ from teacher.template import describe, narrate
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import cases
 
+FOLDER = Path(__file__).parent / "sentences"
+
 
 def sentences(kind: str) -> list[str]:
-    path = Path(__file__).parent / "sentences" / f"{kind}.txt"
+    path = FOLDER / f"{kind}.txt"
     # Not splitlines, for some sentences hold other line separators.
     return path.read_text(encoding="utf-8").removesuffix("\n").split("\n")
 
@@ -39,8 +42,15 @@ a [trio]|a [single] cube|[percent]|for some [seconds]|a [minute] later|a [few fr
 """What states a number, the part that must be found in brackets."""
 
 
-def rationales(count: int) -> list[str]:
+@cache
+def told(count: int) -> list[str]:
+    """Rationales of the built-in narrator."""
     return [narrate(predicates, item, seed=5) for item, predicates in cases(count)]
+
+
+def free() -> list[str]:
+    """Rationales in free prose."""
+    return (FOLDER / "rationales.txt").read_text().strip().split("\n\n")
 
 
 def spots(text: str) -> Iterator[int]:
@@ -100,7 +110,7 @@ def test_a_number_put_anywhere_is_found(phrase):
     parts = [m.span(1) for m in re.finditer(r"\[(.*?)\]", phrase)]
     # A bracket before a part shifts it by one, and so does each of the brackets of earlier parts.
     parts = [(start - 2 * k - 1, stop - 2 * k - 1) for k, (start, stop) in enumerate(parts)]
-    for text in rationales(2):
+    for text in (told(2)[-1], random.Random(phrase).choice(free())):
         for spot in spots(text):
             whole = f"{text[:spot]} {plain}{text[spot:]}"
             spans = find_numbers(whole)
@@ -111,7 +121,7 @@ def test_a_number_put_anywhere_is_found(phrase):
 
 def test_clean_prose_has_none():
     described = describe(synthetic.scene([(0, 0), (1, 1)], [(1, 0), (0, 0)]), 0, 20, 70, 0)
-    for text in (*rationales(40), described):
+    for text in (*told(40), *free(), described):
         assert found(text) == []
 
 
