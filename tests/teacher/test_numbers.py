@@ -72,6 +72,16 @@ def assert_lawful(text: str) -> None:
         last = stop
 
 
+def test_of_sentences_that_the_rules_never_saw_nearly_all_are_judged_rightly() -> None:
+    """Written by another hand to the same policy, and read only after the rules were done."""
+    positive, negative = sentences("unseen_positive"), sentences("unseen_negative")
+    right = sum(bool(find_numbers(sentence)) for sentence in positive)
+    wrong = sum(bool(find_numbers(sentence)) for sentence in negative)
+    assert min(len(positive), len(negative)) >= 150
+    assert right / len(positive) >= 0.99
+    assert right / (right + wrong) >= 0.99
+
+
 def test_every_positive_is_found():
     assert len(POSITIVE) >= 150
     assert [text for text in POSITIVE if not find_numbers(text)] == []
