@@ -1,6 +1,7 @@
 """Undoes the disguises of prose: entities, markup, styled and look-alike letters.
 
-Folded text is paired with the span of the original that each of its characters came from.
+A reading is a folded text with the span of the original that each of its characters came from.
+In a reading, every numeral of any script is an ASCII digit.
 """
 
 from __future__ import annotations
@@ -8,102 +9,158 @@ from __future__ import annotations
 import html
 import re
 import unicodedata
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain, compress, repeat
 
-from teacher.lexicon import IDEOGRAPHS, PICTOGRAPHS
+from teacher.lexicon import IDEOGRAPHS, IDIOMS, PICTOGRAPHS
 
 Spans = list[tuple[int, int]]
 
 LOOKALIKES = {
-    **dict(zip("аеорсухіјѕԁԛԝвмтнкһѵʋɑɡı", "aeopcyxijsdqwbmthkhvvagi", strict=True)),
+    **dict(zip("аеорсухіјѕԁԛԝвмтнкһѵʋɑɡıгпөш", "aeopcyxijsdqwbmthkhvvagirnow", strict=True)),
     **dict(zip("АВЕКМНОРСТУХІЈЅԚԜѴ", "ABEKMHOPCTYXIJSQWV", strict=True)),
-    **dict(zip("οντωειυακχρ", "ovtweiuakxp", strict=True)),
+    **dict(zip("οντωειυακχρη", "ovtweiuakxpn", strict=True)),
     **dict(zip("ΑΒΕΖΗΙΚΜΝΟΡΤΥΧ", "ABEZHIKMNOPTYX", strict=True)),
+    **dict(zip("օոհսցⲟ", "onhugo", strict=True)),
     **dict(zip("ᴀʙᴄᴅᴇꜰɢʜɪᴊᴋʟᴍɴᴏᴘʀꜱᴛᴜᴠᴡʏᴢ", "abcdefghijklmnoprstuvwyz", strict=True)),
-    **dict(zip("łøđħ", "lodh", strict=True)),
+    **dict(zip("łøđħŧƒɛəʰ", "lodhtfeeh", strict=True)),
     **{
         chr(base + i): chr(65 + i)
         for base in (0x1F130, 0x1F150, 0x1F170, 0x1F1E6)
         for i in range(26)
     },
 }
+LONGEST_FOLD = 6
+"""A character that reads as more letters than this is a phrase in itself (U+FDFA), and left so."""
 ENTITY = re.compile(r"&(?:#\d{1,7}|#[xX][0-9a-fA-F]{1,6}|[A-Za-z]\w{1,31});?")
-TAG = re.compile(r"</?[A-Za-z][^<>]{0,60}>")
+DISGUISE = re.compile(r"[&*`~_<$|@]|[A-Za-z]![A-Za-z]")
+TAG = r"</?[A-Za-z][^<>]{0,60}>"
+IDIOM = re.compile("|".join(IDIOMS))
+SEAM = re.compile(rf"[*`~\u200b]+|{TAG}")
+"""What may stand within a word unseen: emphasis, zero-width characters (all folded to U+200B)."""
+PARTED = str.maketrans("*`~\u200b_", "     ")
 LEET = re.compile(r"(?<=[A-Za-z])[!|@](?=[A-Za-z])|\$(?=[A-Za-z])")
 LEET_LETTERS = {"!": "i", "|": "i", "@": "a", "$": "s"}
 
 
-@lru_cache(maxsize=4096)
-def fold_character(c: str) -> tuple[str, bool]:
-    """What a character reads as, and whether it states a number by itself."""
+@dataclass(frozen=True)
+class Reading:
+    """Folded text; its character k came from the original's [starts[k], stops[k])."""
+
+    text: str
+    starts: Sequence[int]
+    stops: Sequence[int]
+
+    def original(self, spans: Spans) -> Spans:
+        """Where spans of the reading lie in the original."""
+        return [(self.starts[start], self.stops[stop - 1]) for start, stop in spans]
+
+
+class _Folds(dict[str, str]):
+    """What each character reads as; filled as characters are met, emptied when it grows large."""
+
+    def __missing__(self, c: str) -> str:
+        if len(self) >= 1 << 16:
+            self.clear()
+        self[c] = folded = _fold_character(c)
+        return folded
+
+
+def _fold_character(c: str) -> str:
     plain = unicodedata.normalize("NFKC", c)
-    number = c in IDEOGRAPHS or c in PICTOGRAPHS or any(map(_is_numeral, (c, *plain)))
+    if c in IDEOGRAPHS or c in PICTOGRAPHS or any(map(_is_numeral, (c, *plain))):
+        digits = "".join(p for p in plain if p in "0123456789")
+        return digits[:LONGEST_FOLD] or "1"
     letters = []
     for part in unicodedata.normalize("NFKD", plain):
-        if unicodedata.category(part) not in ("Mn", "Me", "Cf"):
+        category = unicodedata.category(part)
+        if category == "Cf":
+            letters.append("\u200b")
+        elif category not in ("Mn", "Me"):
             letters.append(LOOKALIKES.get(part, part))
-    return "".join(letters), number
+    return c if len(letters) > LONGEST_FOLD else "".join(letters)
 
 
 def _is_numeral(c: str) -> bool:
     return unicodedata.category(c)[0] == "N" or unicodedata.numeric(c, None) is not None
 
 
+FOLDS = _Folds()
+
+
 def fold_word(word: str) -> str:
     """A lexicon entry as it looks in folded text."""
-    return "".join(fold_character(c)[0] for c in word).casefold()
+    return "".join(map(FOLDS.__getitem__, word)).casefold()
 
 
-def fold(text: str) -> tuple[list[tuple[str, Spans]], Spans]:
-    """Readings of a text, each with the original span of every character, and the spans of the
-    characters that state a number by themselves. There is a further reading where markup stands
-    between letters, for it may join a word or part two."""
-    if text.isascii() and not any(c in text for c in "&<*`~!|@$_"):
-        spans = [(i, i + 1) for i in range(len(text))]
-        return [(text, spans)], [(i, i + 1) for i, c in enumerate(text) if c.isdigit()]
-    text, spans = _unescape(text, [(i, i + 1) for i in range(len(text))])
-    numerals, letters, where = [], [], []
-    for c, span in zip(text, spans, strict=True):
-        folded, number = fold_character(c)
-        if number:
-            numerals.append(span)
-        letters.extend(folded)
-        where.extend([span] * len(folded))
-    folded = "".join(letters).replace("_", " ")
-    readings = [_without(folded, where, TAG)]
-    if any(c in folded for c in "*`~"):
-        parted = folded.translate(str.maketrans("*`~", "   "))
-        readings = [
-            _without(readings[0][0], readings[0][1], re.compile(r"[*`~]+")),
-            _without(parted, where, TAG),
-        ]
+def fold(text: str) -> list[Reading]:
+    """The readings of a text. There are two where markup or an unseen character stands between
+    letters, for it may join a word or part two."""
+    reading = Reading(text, range(len(text)), range(1, len(text) + 1))
+    if text.isascii() and not DISGUISE.search(text):
+        return [reading]
+    reading = _folded(_unescaped(_unescaped(reading)))  # for an entity may itself be escaped
+    joined = _without_seams(reading)
+    parted = Reading(reading.text.translate(PARTED), reading.starts, reading.stops)
     return [
-        (LEET.sub(lambda m: LEET_LETTERS[m[0]], reading), spans) for reading, spans in readings
-    ], numerals
+        Reading(LEET.sub(lambda m: LEET_LETTERS[m[0]], r.text), r.starts, r.stops)
+        for r in ([parted, joined] if joined else [parted])
+    ]
 
 
-def _without(text: str, spans: Spans, pattern: re.Pattern[str]) -> tuple[str, Spans]:
-    if not pattern.search(text):
-        return text, spans
-    kept, where, at = [], [], 0
-    for match in pattern.finditer(text):
-        kept.append(text[at : match.start()])
-        where += spans[at : match.start()]
-        at = match.end()
-    return "".join([*kept, text[at:]]), where + spans[at:]
+def _unescaped(reading: Reading) -> Reading:
+    text, starts, stops = reading.text, reading.starts, reading.stops
+    entities = [m for m in ENTITY.finditer(text) if _meaning(m[0]) != m[0]]
+    if not entities:
+        return reading
+    pieces: list[str] = []
+    new_starts: list[int] = []
+    new_stops: list[int] = []
+    at = 0
+    for match in entities:
+        first, last = match.span()
+        meant = _meaning(match[0])
+        pieces += (text[at:first], meant)
+        new_starts += starts[at:first]
+        new_starts += [starts[first]] * len(meant)
+        new_stops += stops[at:first]
+        new_stops += [stops[last - 1]] * len(meant)
+        at = last
+    pieces.append(text[at:])
+    return Reading("".join(pieces), [*new_starts, *starts[at:]], [*new_stops, *stops[at:]])
 
 
-def _unescape(text: str, spans: Spans) -> tuple[str, Spans]:
-    # Twice, for an entity may itself have been escaped.
-    for _ in range(2):
-        if "&" not in text:
-            break
-        pieces, where, at = [], [], 0
-        for match in ENTITY.finditer(text):
-            meant = html.unescape(match[0])
-            pieces += [text[at : match.start()], meant]
-            whole = (spans[match.start()][0], spans[match.end() - 1][1])
-            where += [*spans[at : match.start()], *[whole] * len(meant)]
-            at = match.end()
-        text, spans = "".join([*pieces, text[at:]]), where + spans[at:]
-    return text, spans
+@lru_cache(maxsize=4096)
+def _meaning(entity: str) -> str:
+    # What stands for no character is read as it is written.
+    return html.unescape(entity) or entity
+
+
+def _folded(reading: Reading) -> Reading:
+    if reading.text.isascii():
+        return reading
+    text = IDIOM.sub(lambda m: "人" * len(m[0]), reading.text)
+    folded = list(map(FOLDS.__getitem__, text))
+    lengths = list(map(len, folded))
+    if lengths.count(1) == len(lengths):
+        return Reading("".join(folded), reading.starts, reading.stops)
+    return Reading(
+        "".join(folded),
+        list(chain.from_iterable(map(repeat, reading.starts, lengths))),
+        list(chain.from_iterable(map(repeat, reading.stops, lengths))),
+    )
+
+
+def _without_seams(reading: Reading) -> Reading | None:
+    """The reading with nothing between the letters that seams part; None if it has no seams."""
+    keeps = bytearray(b"\1") * len(reading.text)
+    for match in SEAM.finditer(reading.text):
+        keeps[match.start() : match.end()] = bytes(match.end() - match.start())
+    if all(keeps):
+        return None
+    text = "".join(compress(reading.text, keeps)).replace("_", " ")
+    return Reading(
+        text, list(compress(reading.starts, keeps)), list(compress(reading.stops, keeps))
+    )

@@ -3,132 +3,174 @@
 The policy: counts, ordinals that count, fractions, multiples, quantities and measured time are
 numbers. "First," opening a sentence, "both", "pair", "one another", "the other one", "once
 struck", "no one" and "one side" are not.
+
+A text is folded (see `folding`) and cut into words. Most words mean nothing here; each other word
+has a rule, which looks at the words about it and names the span of words that states a number.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from functools import lru_cache
+from itertools import accumulate
 
 from teacher import lexicon
-from teacher.folding import Spans, fold, fold_word
+from teacher.folding import FOLDS, Spans, fold, fold_word
+
+Rule = Callable[["Prose", int], "tuple[int, int] | None"]
 
 _any = "|".join
-WORDS = {
-    fold_word(word)
-    for group in (
-        lexicon.CARDINALS,
-        lexicon.ORDINALS,
-        lexicon.QUANTITIES,
-        lexicon.TIMES,
-        lexicon.FOREIGN,
-    )
-    for word in group
+ENGLISH = {
+    *("one", "first", *lexicon.CARDINALS, *lexicon.ORDINALS, *lexicon.QUANTITIES, *lexicon.TIMES)
 }
-PLAIN = {w for w in WORDS if w.isascii() and len(w) > 2} | {"one"}
+WORDS = {fold_word(w) for w in (*ENGLISH, *lexicon.MISSPELT, *lexicon.FOREIGN)} - {"one", "first"}
+PIECED = {w for w in ENGLISH if len(w) > 2}
 """Words that are looked for in spaced, split and stretched spellings."""
+PREFIXES = {word[:k] for word in PIECED for k in range(1, len(word) + 1)}
+_scene = _any(sorted(lexicon.SCENE, key=len, reverse=True))
+_count = _any(sorted((*lexicon.CARDINALS, *lexicon.ORDINALS), key=len, reverse=True))
 GLUED = re.compile(
-    rf"(?:one)?(?:{_any(sorted(lexicon.CARDINALS, key=len, reverse=True))})"
-    rf"(?:and|one|{_any(sorted((*lexicon.CARDINALS, *lexicon.ORDINALS), key=len, reverse=True))})*"
-    rf"(?:{_any(lexicon.SUFFIXES)})?"
+    rf"(?:{_scene})*(?:one)?(?:{_count})(?:and|one|{_count})*"
+    rf"(?:{_any(lexicon.SUFFIXES)}|(?:{_scene})+)?"
+    rf"|(?:one|first|twice|half|double|single|triple)(?:{_scene})+"
     r"|(?:twent|thirt|fort|fift|sixt|sevent|eight|ninet)ies|one(?:fold|time|x)"
     rf"|(?:{_any(lexicon.SCALES)})s?fold|half(?:ed|th|s)"
 )
+ARABIC = re.compile(
+    fold_word(lexicon.ARABIC_PREFIXES) + rf"(?:{_any(w for w in WORDS if '؀' <= w[0] <= 'ۿ')})"
+)
+UNSPACED = re.compile(_any(map(fold_word, lexicon.UNSPACED)))
 LONGEST = 60
+"""Letters of a word that are looked at."""
+ASCII_WORD = re.compile(r"([A-Za-z]+)")
 # Indic vowel signs are no letters to `re`, but belong to their words.
-TOKEN = re.compile(r"(?:[^\W\d_]|[\u0900-\u0dff])+")
-CAMEL = re.compile(r"[A-Z]?[a-z]+|[A-Z]+")
-SPACED = re.compile(r"(?<![^\W\d_])[^\W\d_](?:[\W_]{1,2}[^\W\d_]){2,}(?![^\W\d_])")
-CHAIN = re.compile(r"(?<![^\W\d_])[^\W\d_]+(?:-[^\W\d_]+)+")
+WORD = re.compile(r"((?:[^\W\d_]+|[\u0900-\u0dff]+)+)")
+FIGURES = re.compile(r"[0-9%‰‱]+(?:[.,:/][0-9]+)*(?:st|nd|rd|th)?")
+CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 STRETCH = re.compile(r"(.)\1+")
 UPPER_ROMAN = re.compile(r"M{0,3}(?:CM|CD|D?C{0,3})(?:XC|XL|L?X{0,3})(?:IX|IV|V?I{0,3})")
-SPACED_WORDS = re.compile(_any(sorted(PLAIN, key=len, reverse=True)))
-SYMBOLS = re.compile("[%‰‱]")
+CLAUSE = re.compile(r"[.!?:;\n•–—*#>(\"“]|\s-\s")
+"""What in a gap ends a clause, so that the next word opens another."""
+COUNTABLE = lexicon.NOUNS | lexicon.EVENTS | lexicon.UNITS
+"""What "one" counts even after "the" or an adjective."""
+ADJECTIVAL = ("er", "est", "ing", "ed", "most")
+JOINS = frozenset(" -")
+CLOSERS = frozenset(".,;:!?)…—–")
 
-PHRASES = [
-    re.compile(pattern, re.IGNORECASE)
-    for pattern in (
-        rf"\b(?:{_any(lexicon.VAGUE)})(?:\s+(?:of|more|the|further|additional|short|brief|video))"
-        rf"{{0,3}}\s+(?:{_any(lexicon.COUNTED)})\b",
-        r"\ban?\s+(?:frame|moment|step|instant|beat)\s+(?:later|earlier|ago|before|after)\b",
-        r"\b(?:within|after|in)\s+an?\s+(?:frame|step|beat)\b|\ba\s+pixel\b|\ba\s+score\s+of\b",
-        r"\b(?:a|per|each|every|the|within|this|next|last)\s+minute\s*"
-        r"(?=[.,;:!?)]|$|(?:later|ago|or|of|after|before|passes|passed|has|long|in|and)\b)",
-        r"\bper\s+(?:mille|cent|second|minute)\b",
-        r"\((?:i|v|x)\)",
-        rf"\b(?:{_any(lexicon.ENUMERATED)})\s+(?-i:[IVX])\b(?!')",
-        r"\bonce\b(?=\s*(?:[.,;:!?)]|$|(?:or|and|per|every|each|in|a|only|during|before"
-        r"|with|off|against|near|into|on|by)\b))",
-        r"\b(?:only|just|exactly|than|least|most)\s+once\b",
-    )
-]
-CLAUSES = re.compile(r"(?:\A|[.!?:;\n•\-–—*#>(\"“])\s*\Z")
+
+class Prose:
+    """Text cut into words and the gaps about them: word k lies between gaps k and k + 1."""
+
+    def __init__(self, text: str) -> None:
+        pieces = (ASCII_WORD if text.isascii() else WORD).split(text)
+        self.words, self.gaps = pieces[1::2], pieces[::2]
+        self.bounds = [0, *accumulate(map(len, pieces))]
+
+    def word(self, index: int) -> str:
+        """A word in lower case; empty outside the text."""
+        return self.words[index].casefold() if 0 <= index < len(self.words) else ""
+
+    def before(self, index: int, by: int = 1) -> str:
+        """The word `by` words before, in lower case; "" unless space or hyphens part them all."""
+        while index > 0 and _joins(self.gaps[index]):
+            index -= 1
+            by -= 1
+            if not by:
+                return self.words[index].casefold()
+        return ""
+
+    def after(self, index: int, by: int = 1) -> str:
+        """The word `by` words after, in lower case; "" unless space or hyphens part them all."""
+        while index + 1 < len(self.words) and _joins(self.gaps[index + 1]):
+            index += 1
+            by -= 1
+            if not by:
+                return self.words[index].casefold()
+        return ""
+
+    def opens_clause(self, index: int) -> bool:
+        return index == 0 or bool(CLAUSE.search(self.gaps[index][-8:]))
+
+    def ends_clause(self, index: int) -> bool:
+        gap = self.gaps[index + 1].lstrip()
+        return gap[:1] in CLOSERS if gap else index + 1 == len(self.words)
+
+    def ends_sentence(self, index: int) -> bool:
+        gap = self.gaps[index + 1].lstrip()
+        return gap[:1] in (".", ";", "!", "?", ")") if gap else index + 1 == len(self.words)
+
+    def span(self, first: int, last: int) -> tuple[int, int]:
+        return self.bounds[2 * first + 1], self.bounds[2 * last + 2]
+
+
+def _joins(gap: str) -> bool:
+    # The usual gaps first, for this is asked of most words that have a rule.
+    return gap in JOINS or gap.isspace()
 
 
 def find_numbers(text: str) -> list[tuple[int, int]]:
     """Spans of `text` that state a number, in order and without overlap; never raises."""
-    readings, spans = fold(text)
-    for reading, where in readings:
-        spans += [
-            (where[start][0], where[stop - 1][1]) for start, stop in _scan(reading) if start < stop
-        ]
-    return _merged(spans, text)
+    spans: Spans = []
+    for reading in fold(text):
+        spans += reading.original(_scan(reading.text))
+    return _merged(spans, text) if spans else []
 
 
 def _merged(spans: Spans, text: str) -> Spans:
+    spans.sort()
     merged: Spans = []
-    for start, stop in sorted(spans):
-        if merged and (start <= merged[-1][1] or text[merged[-1][1] : start] in ("-", " ")):
-            merged[-1] = (merged[-1][0], max(stop, merged[-1][1]))
+    first, last = spans[0]
+    for start, stop in spans:
+        # Marks that fold to nothing belong to the character that they stand on.
+        while stop < len(text) and text[stop] > "\x7f" and not FOLDS[text[stop]]:
+            stop += 1
+        if start <= last or (start == last + 1 and text[last] in "- "):
+            last = stop if stop > last else last
         else:
-            merged.append((start, stop))
-    return merged
+            merged.append((first, last))
+            first, last = start, stop
+    return [*merged, (first, last)]
 
 
 def _scan(text: str) -> Spans:
-    spans = [m.span() for m in SYMBOLS.finditer(text)]
-    tokens = [(m[0], m.start(), m.end()) for m in TOKEN.finditer(text)]
-    lower = [token.casefold() for token, _, _ in tokens]
-    for index, (token, start, stop) in enumerate(tokens):
-        word = lower[index]
-        if word == "one":
-            stated = not _is_pronoun(text, tokens, lower, index)
-        elif word == "first":
-            stated = not _is_adverb(text, tokens, lower, index)
-        else:
-            stated = _is_number(word) or _is_roman(token, word) or _is_camel(token)
-        if stated:
-            spans.append((start, stop))
-        elif index + 1 < len(tokens) and text[stop : tokens[index + 1][1]] in (" ", "\n", "\t"):
-            following = tokens[index + 1][0]
-            # A lone letter that is no word of its own belongs to its neighbour: "tw o".
-            lone = 1 in (len(token), len(following)) and text[start - 1 : start] not in ("'", "’")
-            if lone and not {token, following} & set("aAiIBCD"):
-                joined = word + lower[index + 1]
-                if joined in PLAIN and joined != "one":
-                    spans.append((start, tokens[index + 1][2]))
-    for match in SPACED.finditer(text):
-        joined = "".join(c for c in match[0] if c.isalpha()).casefold()
-        if SPACED_WORDS.search(joined):
-            spans.append(match.span())
-    for match in CHAIN.finditer(text):
-        joined = match[0].replace("-", "").casefold()
-        if joined in PLAIN:
-            spans.append(match.span())
-    for pattern in PHRASES:
-        spans += [m.span() for m in pattern.finditer(text)]
-    return [s for s in spans if not _is_idiom(text, s)]
+    spans = [m.span() for m in FIGURES.finditer(text)]
+    if not text.isascii():
+        spans += [m.span() for m in UNSPACED.finditer(text)]
+    prose = Prose(text)
+    words = prose.words
+    if max(map(len, words), default=0) > LONGEST:
+        words = [word[:LONGEST] for word in words]
+    for index, rule in enumerate(map(rule_of, words)):
+        if rule is not None:
+            stated = rule(prose, index)
+            if stated is not None:
+                spans.append(prose.span(*stated))
+    return spans
+
+
+@lru_cache(maxsize=1 << 16)
+def rule_of(token: str) -> Rule | None:
+    """The rule for a word as it is written; None for the words that mean nothing here."""
+    word = token.casefold()
+    if word in RULES:
+        return RULES[word]
+    if token.istitle() and word in lexicon.NAMES:
+        return None
+    if _is_number(word) or _is_roman(token, word) or _is_camel(token):
+        return _itself
+    return _assembled if word in PREFIXES else None
 
 
 def _is_number(word: str) -> bool:
-    # Longer words are cut, for backtracking over them would not be linear.
-    if word in WORDS or GLUED.fullmatch(word[:LONGEST]):
+    if word in WORDS or GLUED.fullmatch(word) or ARABIC.fullmatch(word):
         return True
-    if not STRETCH.search(word):
-        return False
-    # "twooo" and "threeeee", but not "too" or "bee": only a letter thrice in a row is a stretch.
-    if not re.search(r"(.)\1\1", word):
-        return False
-    return any(STRETCH.sub(kept, word) in PLAIN for kept in (r"\1", r"\1\1"))
+    # "twooo" and "threeeee"; "onne", but not "on".
+    stretched = STRETCH.search(word) and STRETCHED.get(STRETCH.sub(r"\1", word))
+    return bool(stretched) and word not in (stretched, "too", "teen")
+
+
+STRETCHED = {STRETCH.sub(r"\1", word): word for word in PIECED}
 
 
 def _is_roman(token: str, word: str) -> bool:
@@ -139,6 +181,7 @@ def _is_roman(token: str, word: str) -> bool:
         and token.isupper()
         and bool(set(token) & set("IVX"))
         and set(token) <= set("IVXLCDM")
+        and word not in lexicon.NOT_ROMAN
         and bool(UPPER_ROMAN.fullmatch(token))
     )
 
@@ -146,44 +189,191 @@ def _is_roman(token: str, word: str) -> bool:
 def _is_camel(token: str) -> bool:
     if token.islower() or token.isupper() or token.istitle():
         return False
-    return any(part.casefold() in PLAIN for part in CAMEL.findall(token))
+    return any(part.casefold() in PIECED for part in CAMEL.findall(token))
 
 
-def _is_idiom(text: str, span: tuple[int, int]) -> bool:
-    before = text[max(0, span[0] - 4) : span[0]].casefold()
-    return text[slice(*span)].casefold().startswith("once") and before.endswith("at ")
+def _itself(prose: Prose, index: int) -> tuple[int, int] | None:
+    return index, index
 
 
-def _is_adverb(text: str, tokens: list[tuple[str, int, int]], lower: list[str], index: int) -> bool:
-    """Whether "first" opens a sentence before a comma, or stands in "at first"."""
-    _, start, stop = tokens[index]
-    if index and lower[index - 1] == "at" and text[tokens[index - 1][2] : start] == " ":
+def _assembled(prose: Prose, index: int) -> tuple[int, int] | None:
+    """A number word whose letters are spaced ("t w o") or that is split ("tw-o", "th ree")."""
+    joined, last = prose.word(index), index
+    while joined in PREFIXES and last + 1 < len(prose.words):
+        last += 1
+        if len(prose.gaps[last]) > 3:
+            return None
+        joined += prose.word(last)
+        if joined in PIECED and _is_split(prose, index, last):
+            return index, last
+    return None
+
+
+def _is_split(prose: Prose, first: int, last: int) -> bool:
+    pieces = [prose.word(k) for k in range(first, last + 1)]
+    gaps = prose.gaps[first + 1 : last + 1]
+    if len(pieces) > 2 and all(len(piece) == 1 for piece in pieces):
         return True
-    return text[stop : stop + 1] == "," and bool(CLAUSES.search(text[max(0, start - 8) : start]))
+    if all(gap.strip() and (len(gap) == 1 or gap == "-\n") for gap in gaps):
+        return not set(gaps) & set(',;:()"“”')
+    if not all(len(gap) <= 2 and gap.isspace() for gap in gaps):
+        return False
+    # What follows an apostrophe is the end of a word.
+    possessive = prose.gaps[first][-1:] in ("'", "’")
+    return not possessive and not all(piece in lexicon.PIECES for piece in pieces)
 
 
-def _is_pronoun(
-    text: str, tokens: list[tuple[str, int, int]], lower: list[str], index: int
-) -> bool:
+def _one(prose: Prose, index: int) -> tuple[int, int] | None:
+    return None if _is_pronoun(prose, index) else (index, index)
+
+
+def _is_pronoun(prose: Prose, index: int) -> bool:
     """Whether "one" stands for a thing, and so counts nothing."""
-    _, start, stop = tokens[index]
-    previous = lower[index - 1] if index else ""
-    beside = index > 0 and text[tokens[index - 1][2] : start].isspace()
-    following = lower[index + 1] if index + 1 < len(tokens) else ""
-    gap = text[stop : tokens[index + 1][1]] if following else ""
-    if following in ("another", "side", "sided", "s") and gap in (" ", "-", "'", "’", "\n"):
+    if prose.gaps[index + 1] in ("'", "’") and prose.word(index + 1) == "s":
         return True
-    if beside and previous == "no":
+    pronoun = _is_pronoun_between(prose.before(index), prose.after(index))
+    if pronoun is None:
+        return prose.before(index, 2) in ("the", "a", "an", "each", "every", "its", "their")
+    return pronoun
+
+
+@lru_cache(maxsize=1 << 12)
+def _is_pronoun_between(previous: str, following: str) -> bool | None:
+    """None where an article before the word before would make it one: "the opaque one"."""
+    if following in ("another", "side", "sided") or previous == "no":
         return True
-    adjacent = gap.isspace() or gap == "-"
-    if following in lexicon.NOUNS and adjacent:
+    if following in COUNTABLE or rule_of(previous[:LONGEST]) is _itself:
         return False
-    if following in lexicon.MODALS and adjacent:
+    if following in lexicon.MODALS or _describes(previous):
         return True
-    if not beside:
+    if not previous or previous in lexicon.NOT_ADJECTIVES or previous in COUNTABLE:
         return False
-    return previous in lexicon.ADJECTIVES or (
-        len(previous) > 4
-        and previous.endswith(("er", "est", "ing", "ed", "most"))
-        and previous not in ("almost", "after", "under", "over", "either", "during", "being")
-    )
+    return None
+
+
+def _describes(word: str) -> bool:
+    if word in lexicon.ADJECTIVES:
+        return True
+    return len(word) > 4 and word.endswith(ADJECTIVAL) and word not in lexicon.NOT_ADJECTIVES
+
+
+def _first(prose: Prose, index: int) -> tuple[int, int] | None:
+    """No number where it opens a sentence before a comma, or in "at first" and "first of all"."""
+    if prose.before(index) == "at":
+        return None
+    aside = prose.gaps[index + 1].lstrip()[:1] in (",", ":", "—", "–")
+    aside = aside or (prose.after(index) == "of" and prose.after(index, 2) == "all")
+    opening = index - (prose.before(index) in ("but", "and", "so"))
+    return None if aside and prose.opens_clause(opening) else (index, index)
+
+
+def _once(prose: Prose, index: int) -> tuple[int, int] | None:
+    """A number where it counts events; none in "once struck", where it is a conjunction."""
+    previous, following = prose.before(index), prose.after(index)
+    if previous == "at" or following in ("more", "again"):
+        return None
+    if previous in lexicon.EXACTLY or following in ("or", "per", "every", "each"):
+        return index, index
+    if not previous or prose.opens_clause(index):
+        counts = prose.ends_clause(index)
+    elif following:
+        opens = following in lexicon.CLAUSE_OPENERS or following.endswith(("ed", "ing"))
+        counts = not opens and not _starts_number(prose, index + 1)
+    else:
+        counts = not FIGURES.search(prose.gaps[index + 1])
+    return (index, index) if counts else None
+
+
+def _starts_number(prose: Prose, index: int) -> bool:
+    rule = rule_of(prose.words[index][:LONGEST])
+    return rule is _once or (rule is not None and rule(prose, index) is not None)
+
+
+def _unit(prose: Prose, index: int) -> tuple[int, int] | None:
+    """ "A few frames", "a frame later", "within a frame", "a pixel"."""
+    back = 1
+    while back <= 3 and prose.before(index, back) in lexicon.FILLERS:
+        back += 1
+    plural = prose.word(index) in lexicon.PLURAL_UNITS or prose.gaps[index] == "-"
+    if plural and prose.before(index, back) in lexicon.VAGUE:
+        return index - back, index
+    if prose.word(index) not in lexicon.UNITS or prose.before(index) not in ("a", "an"):
+        return None
+    if prose.word(index) in lexicon.LENGTHS:
+        return index - 1, index
+    if prose.word(index) in ("moment", "instant"):
+        return None
+    if prose.after(index) in ("later", "earlier", "ago", "before", "after"):
+        return index - 1, index + 1
+    within = prose.before(index, 2) in ("within", "after", "in")
+    return (index - 2, index) if within else None
+
+
+def _minute(prose: Prose, index: int) -> tuple[int, int] | None:
+    """A number where it measures time; none where it means tiny."""
+    previous, following = prose.before(index), prose.after(index)
+    if previous in lexicon.BEFORE_MINUTE:
+        return index - 1, index
+    if previous not in ("a", "the", "this"):
+        return None
+    if following in lexicon.AFTER_MINUTE:
+        return index - 1, index + 1
+    timed = not following and prose.before(index, 2) in lexicon.TIME_PREPOSITIONS
+    return (index - 1, index) if timed or prose.ends_sentence(index) else None
+
+
+def _score(prose: Prose, index: int) -> tuple[int, int] | None:
+    a_score_of = prose.before(index) == "a" and prose.after(index) == "of"
+    return (index - 1, index + 1) if a_score_of else None
+
+
+def _secondary(prose: Prose, index: int) -> tuple[int, int] | None:
+    """A number where it is an event's place in a series."""
+    return (index, index + 1) if prose.after(index) in lexicon.EVENTS else None
+
+
+def _letter(prose: Prose, index: int) -> tuple[int, int] | None:
+    """A lone I, V or X that is a numeral: "phase I", "(i)", "No. V", "I." before an entry."""
+    before, after = prose.gaps[index], prose.gaps[index + 1]
+    if after[:1] in ("'", "’") or prose.word(index + 1) == "e":
+        return None
+    entry = after == ". " and (before[-1:] == "\n" or index == 0)
+    if entry or after[:1] == ")" or len(prose.words) == 1:
+        return index, index
+    if prose.words[index] == "i" and not prose.ends_clause(index):
+        return None
+    enumerated = before.strip(" .-\n") == "" and prose.word(index - 1) in lexicon.ENUMERATED
+    return (index - 1, index) if enumerated else None
+
+
+def _italian(prose: Prose, index: int) -> tuple[int, int] | None:
+    """ "Due" and "metà" are Italian beside Italian words."""
+    if prose.after(index) in lexicon.ITALIAN:
+        return index, index + 1
+    return (index - 1, index) if prose.before(index) in lexicon.ITALIAN else None
+
+
+def _secondo(prose: Prose, index: int) -> tuple[int, int] | None:
+    """The Italian "second", or "according to" before an article."""
+    return None if prose.after(index) in ("la", "il", "le", "i", "lo", "gli") else (index, index)
+
+
+def _ek(prose: Prose, index: int) -> tuple[int, int] | None:
+    """The Hindi "one", or half of "each other"."""
+    return None if prose.after(index) == fold_word("दूसरे") else (index, index)
+
+
+RULES: dict[str, Rule] = {
+    **dict.fromkeys((*lexicon.UNITS, *lexicon.PLURAL_UNITS), _unit),
+    "one": _one,
+    "first": _first,
+    "once": _once,
+    "minute": _minute,
+    "score": _score,
+    "secondary": _secondary,
+    **dict.fromkeys(map(fold_word, lexicon.FOREIGN_FIRSTS), _first),
+    **dict.fromkeys(("due", "meta"), _italian),
+    "secondo": _secondo,
+    fold_word("एक"): _ek,
+    **dict.fromkeys("ivx", _letter),
+}
