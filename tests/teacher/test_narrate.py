@@ -183,6 +183,16 @@ def test_a_killed_served_run_asks_only_for_the_rest(store, odd):
     assert len(report.rationales) == 12
 
 
+def test_a_finished_served_run_needs_no_server(store, odd):
+    store.items = [item for item in store.items if item.item_id != "item-5"]
+    server = odd()
+    report = narrate_store(store, config(server))
+    server.stop()
+    before = lines(store)
+    assert narrate_store(store, config(server)) == report
+    assert lines(store) == before
+
+
 def test_an_unknown_model_is_named_with_those_there(store, odd):
     with pytest.raises(UserError, match=r"teacher\.model=tiny; it has other"):
         narrate_store(store, config(odd(404), concurrency=1))
