@@ -6,6 +6,7 @@ import pytest
 from conf.errors import UserError
 from conf.schema import TeacherConfig
 from data.records import Rationale
+from teacher.grammar import GRAMMAR_VERSION, grammar
 from teacher.journal import Journal, read_rationales
 from teacher.narrate import ensure_rationales, narrate_store
 
@@ -106,6 +107,18 @@ def test_served_answers_are_judged_and_faults_cost_no_attempt(store, odd):
     assert (asked["temperature"], asked["top_p"], asked["top_k"]) == (0.7, 0.8, 20)
     assert "seed" not in asked
     assert "structured_outputs" not in asked
+
+
+def test_an_answer_under_the_grammar_is_another_answer(store, odd):
+    server = odd()
+    free, held = config(server), config(server, grammar=True)
+    narrate_store(store, free)
+    asked = len(server.asked)
+    report = narrate_store(store, held)
+    assert len(server.asked) == 2 * asked
+    assert server.asked[-1]["structured_outputs"] == {"grammar": grammar(held)}
+    assert {r.grammar for r in report.rationales} == {GRAMMAR_VERSION}
+    assert {r.grammar for r in narrate_store(store, free).rationales} == {None}
 
 
 def test_more_answers_are_asked_for_only_after_a_failure(store, odd):
