@@ -10,7 +10,7 @@ import pytest
 
 from conf.errors import UserError
 from conf.schema import TeacherConfig
-from teacher.client import Client
+from teacher.client import Client, jitter
 from teacher.narrate import narrate_store
 from tests.teacher.odd import OddServer, completion
 
@@ -29,6 +29,13 @@ def ask(cfg, times=1, constraint=None):
             return await asyncio.gather(*(client.ask(CHAT) for _ in range(times)))
 
     return asyncio.run(main())
+
+
+def test_pauses_grow_to_the_longest_and_are_anything_below():
+    for times, most in ((1, 1.0), (2, 2.0), (3, 4.0), (5, 10.0), (50, 10.0)):
+        pauses = [jitter(times) for _ in range(1000)]
+        assert 0 <= min(pauses) < 0.1 * most
+        assert 0.9 * most < max(pauses) <= most
 
 
 def test_no_more_requests_are_in_flight_than_asked_for(store, odd):
