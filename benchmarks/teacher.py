@@ -5,12 +5,12 @@
 
 `full` narrates the training items of a benchmark through the client, journal and validator
 included, one answer an item, and gives the same chats to vLLM's own benchmark client and to bare
-requests, in turns, each at the same number in flight and with the same longest answer; medians of
-the rounds, after one for warmth. A model that stops early by itself makes the answers differ in
-length: tokens a second say more then.
+requests, in turns, each at the same number in flight and with the same longest answer: medians of
+the rounds after the first, and of the client's tokens a second over the other's in each round. A
+model that stops early by itself makes the answers differ in length: tokens a second say more then.
 
-`resume` is a whole run, from start to end of the process, of `teacher.narrate` on a benchmark whose
-10,000 items are narrated, and the part of it that reads the journal.
+`resume` finds that nothing is left of a narration of 10,000 items, and times the part of it that
+reads the journal, and what Python takes to start and import.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import cycle, islice
 from pathlib import Path
@@ -93,35 +94,37 @@ def measure_full(args: argparse.Namespace) -> None:
         max_tokens=args.max_tokens,
         concurrency=args.in_flight,
     )
-    rates: dict[str, list[tuple[float, float]]] = {"client": [], "vllm": [], "bare": []}
-    for k in range(args.rounds + 1):
-        rates["client"].append(by_client(store, items, cfg))
-        for name, found in by_limit(store, items, cfg, args.environment).items():
-            rates[name].append(tuple(found))
-        print(f"round {k}: " + ", ".join(f"{n} {r[-1][0]:.2f}/s" for n, r in rates.items()))
+    rates: dict[str, list[list[float]]] = {"client": [], "vllm": [], "bare": []}
+    with limit(store, items, cfg, args.environment) as by_limit:
+        for k in range(args.rounds + 1):
+            rates["client"].append(by_client(store, items, cfg))
+            for name, found in by_limit().items():
+                rates[name].append(found)
+            told = ", ".join(f"{name} {found[-1][0]:.2f}" for name, found in rates.items())
+            print(f"round {k}, answers/s: {told}", flush=True)
     print(f"{len(items)} items, {args.in_flight} in flight, at most {args.max_tokens} tokens")
-    medians = {
-        name: [statistics.median(column) for column in zip(*told[1:], strict=True)]
-        for name, told in rates.items()
-    }
-    for name, (answers, tokens) in medians.items():
-        ratio = medians["client"][1] / tokens
+    for name, (_, *found) in rates.items():
+        answers, tokens = (statistics.median(column) for column in zip(*found, strict=True))
+        pairs = zip(rates["client"][1:], found, strict=True)
+        ratio = statistics.median(own[1] / other[1] for own, other in pairs)
         print(f"{name:8} {answers:8.2f} answers/s {tokens:10,.0f} tokens/s   client: {ratio:.3f}")
 
 
-def by_client(store: Store, items: list[SelectionItem], cfg: TeacherConfig) -> tuple[float, float]:
+def by_client(store: Store, items: list[SelectionItem], cfg: TeacherConfig) -> list[float]:
     with tempfile.TemporaryDirectory() as folder:
         since = time.perf_counter()
         narrate_store(Part(store, items, Path(folder)), cfg)
         took = time.perf_counter() - since
         answers = read_rationales(Path(folder) / "rationales.jsonl")
     assert len(answers) == len(items)
-    return len(answers) / took, sum(r.completion_tokens for r in answers) / took
+    return [len(answers) / took, sum(r.completion_tokens for r in answers) / took]
 
 
-def by_limit(
+@contextmanager
+def limit(
     store: Store, items: list[SelectionItem], cfg: TeacherConfig, environment: Path
-) -> dict[str, list[float]]:
+) -> Iterator[Callable[[], dict[str, list[float]]]]:
+    """A function that asks for the same by vLLM's client and by bare requests."""
     chats = [
         messages(predicates_of(i, store.scene(i.scene_id), store.scene), i, cfg) for i in items
     ]
@@ -130,10 +133,15 @@ def by_limit(
         file.flush()
         asked = [file.name, cfg.url, cfg.model, str(cfg.concurrency), str(cfg.max_tokens)]
         python = environment.absolute() / "bin" / "python"
-        done = subprocess.run(
-            [python, "-P", LIMIT, *asked], stdout=subprocess.PIPE, text=True, check=True
-        )
-    return json.loads(done.stdout.splitlines()[-1])
+        with subprocess.Popen(
+            [python, "-P", LIMIT, *asked], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as process:
+
+            def once() -> dict[str, list[float]]:
+                print(file=process.stdin, flush=True)
+                return json.loads(process.stdout.readline())
+
+            yield once
 
 
 def measure_resume(args: argparse.Namespace) -> None:

@@ -2,9 +2,9 @@
 
     .venv-vllm/bin/python -P benchmarks/vllm_limit.py CHATS URL MODEL IN_FLIGHT MAX_TOKENS
 
-CHATS is a JSON list of chats, sent all at once but for IN_FLIGHT at a time. Prints a JSON object:
-answers and tokens a second by vLLM's client, which streams, and by bare requests, which do not, as
-the teacher's client asks.
+CHATS is a JSON list of chats, sent all at once but for IN_FLIGHT at a time. For each line on its
+input it prints a JSON object: answers and tokens a second by vLLM's client, which streams, and by
+bare requests, which do not, as the teacher's client asks.
 """
 
 from __future__ import annotations
@@ -82,9 +82,10 @@ async def by_bare_requests(
 if __name__ == "__main__":
     path, url, model, *numbers = sys.argv[1:]
     chats = json.loads(Path(path).read_text())
-    with redirect_stdout(sys.stderr):
-        found = {
-            name: asyncio.run(run(chats, url, model, *map(int, numbers)))
-            for name, run in (("vllm", by_vllm), ("bare", by_bare_requests))
-        }
-    print(json.dumps(found))
+    for _ in sys.stdin:
+        with redirect_stdout(sys.stderr):
+            found = {
+                name: asyncio.run(run(chats, url, model, *map(int, numbers)))
+                for name, run in (("vllm", by_vllm), ("bare", by_bare_requests))
+            }
+        print(json.dumps(found), flush=True)

@@ -115,7 +115,9 @@ def save_accepted(rationales: list[Rationale], path: Path) -> None:
     import pyarrow.parquet as pq
 
     sink = io.BytesIO()
-    table = pa.Table.from_pylist([r.to_row() for r in rationales], schema=_schema())
+    schema = _schema()
+    columns = {name: [getattr(r, name) for r in rationales] for name in schema.names}
+    table = pa.Table.from_pydict(columns, schema=schema)
     pq.write_table(table, sink, compression="zstd")
     write_atomically(path, sink.getvalue())
 

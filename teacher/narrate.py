@@ -114,11 +114,11 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
             for rationale in new:
                 answers[rationale.item_id].append(rationale)
 
-        progress = Progress(len(items), len(items) - len(jobs))
+        progress, too_short = Progress(len(items), len(items) - len(jobs)), 0
         with progress.bar:
             if cfg.url is None:
                 too_short = _narrate_all(jobs, store, judge, keep, progress)
-            else:
+            elif jobs:
                 from teacher.asking import Asking
 
                 too_short = asyncio.run(Asking(store, cfg, judge, keep, progress).run(jobs))

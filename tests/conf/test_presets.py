@@ -61,6 +61,15 @@ def test_a_student_brings_its_recipe():
     )
 
 
+def test_a_teacher_may_be_on_several_servers():
+    command = "python -m teacher.narrate teacher=qwen3_32b"
+    one = settings(command).teacher
+    several = settings(f"{command} teacher.url=[http://a:8000/v1,https://b/v1]").teacher
+    assert one.urls == ["http://127.0.0.1:8000/v1"]
+    assert several.urls == ["http://a:8000/v1", "https://b/v1"]
+    assert settings("python -m teacher.narrate").teacher.urls == []
+
+
 def test_a_typed_value_and_an_overlay_win_over_a_recipe():
     assert settings("python -m train.sft student=qwen3_vl_8b train.lr=3e-4").train.lr == 3e-4
     base = settings("python -m train.sft +exp=base")

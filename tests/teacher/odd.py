@@ -60,6 +60,9 @@ class OddServer(ThreadingHTTPServer):
     def url(self) -> str:
         return f"http://127.0.0.1:{self.server_port}/v1"
 
+    def handle_error(self, *_: object) -> None:
+        """A client that hangs up is nothing to tell."""
+
     def stop(self) -> None:
         self.shutdown()
         self.server_close()

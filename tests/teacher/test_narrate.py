@@ -6,6 +6,7 @@ import pytest
 from conf.errors import UserError
 from conf.schema import TeacherConfig
 from data.records import Rationale
+from teacher.grammar import GRAMMAR_VERSION, grammar
 from teacher.journal import Journal, read_rationales
 from teacher.narrate import ensure_rationales, narrate_store
 
@@ -112,6 +113,18 @@ def test_served_answers_are_judged_and_faults_cost_no_attempt(store, odd):
     assert "structured_outputs" not in asked
 
 
+def test_an_answer_under_the_grammar_is_another_answer(store, odd):
+    server = odd()
+    free, held = config(server), config(server, grammar=True)
+    narrate_store(store, free)
+    asked = len(server.asked)
+    report = narrate_store(store, held)
+    assert len(server.asked) == 2 * asked
+    assert server.asked[-1]["structured_outputs"] == {"grammar": grammar(held)}
+    assert {r.grammar for r in report.rationales} == {GRAMMAR_VERSION}
+    assert {r.grammar for r in narrate_store(store, free).rationales} == {None}
+
+
 def test_more_answers_are_asked_for_only_after_a_failure(store, odd):
     server = odd("number")
     narration = narrate_store(store, config(server, concurrency=1, samples=2))
@@ -185,6 +198,16 @@ def test_a_killed_served_run_asks_only_for_the_rest(store, odd):
     narration = narrate_store(store, config(server))
     assert len(server.asked) == len(whole) - 7
     assert len(narration.rationales) == 12
+
+
+def test_a_finished_served_run_needs_no_server(store, odd):
+    store.items = [item for item in store.items if item.item_id != "item-5"]
+    server = odd()
+    report = narrate_store(store, config(server))
+    server.stop()
+    before = lines(store)
+    assert narrate_store(store, config(server)) == report
+    assert lines(store) == before
 
 
 def test_an_unknown_model_is_named_with_those_there(store, odd):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import signal
 import socket
 import subprocess
@@ -19,7 +20,9 @@ from conf.errors import UserError
 from conf.schema import ServeCommand, TeacherConfig
 from teacher import serve
 from teacher.client import Client
+from teacher.grammar import GRAMMAR_VERSION
 from teacher.journal import read_rationales
+from teacher.narrate import narrate_store
 from teacher.serve import Machine
 from tests.teacher.made import corpus, made_store
 from tests.teacher.serving import ROOT, Serving, free_port
@@ -209,6 +212,17 @@ def test_the_server_holds_answers_to_a_constraint(server, constraint):
     replies = ask(server, constraint, n=4)
     assert {reply.text for reply in replies} <= {"east", "west"}
     assert [reply.flaw for reply in replies] == [None] * 4
+
+
+@pytest.mark.slow
+def test_the_server_holds_rationales_to_the_grammar(server, tmp_path):
+    cfg = TeacherConfig(
+        name="tiny", url=server.url, model="tiny", attempts=1, max_tokens=32, grammar=True
+    )
+    narrate_store(made_store(tmp_path, 5), cfg)
+    answers = read_rationales(tmp_path / "rationales.jsonl")
+    assert [r.grammar for r in answers] == [GRAMMAR_VERSION] * 4
+    assert all(re.fullmatch(r"Scene parse:[A-Za-z' ,.;-]*", r.text) for r in answers)
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """The client against real servers that are down, busy, slow, or several."""
 
 import asyncio
+import json
 import threading
 import time
 from email.utils import formatdate
@@ -9,9 +10,9 @@ import pytest
 
 from conf.errors import UserError
 from conf.schema import TeacherConfig
-from teacher.client import Client
+from teacher.client import Client, jitter
 from teacher.narrate import narrate_store
-from tests.teacher.odd import OddServer
+from tests.teacher.odd import OddServer, completion
 
 CHAT = [{"role": "user", "content": "Are you there?"}]
 
@@ -22,12 +23,19 @@ def config(*servers, **changes):
     return TeacherConfig(name="served", url=url, model="tiny", **settings)
 
 
-def ask(cfg, times=1):
+def ask(cfg, times=1, constraint=None):
     async def main():
-        async with Client(cfg) as client:
+        async with Client(cfg, constraint) as client:
             return await asyncio.gather(*(client.ask(CHAT) for _ in range(times)))
 
     return asyncio.run(main())
+
+
+def test_pauses_grow_to_the_longest_and_are_anything_below():
+    for times, most in ((1, 1.0), (2, 2.0), (3, 4.0), (5, 10.0), (50, 10.0)):
+        pauses = [jitter(times) for _ in range(1000)]
+        assert 0 <= min(pauses) < 0.1 * most
+        assert 0.9 * most < max(pauses) <= most
 
 
 def test_no_more_requests_are_in_flight_than_asked_for(store, odd):
@@ -35,6 +43,23 @@ def test_no_more_requests_are_in_flight_than_asked_for(store, odd):
     server.delay = 0.05
     narrate_store(store, config(server, concurrency=3))
     assert server.most == 3
+
+
+def test_a_constraint_is_sent_as_vllm_takes_it(odd):
+    server = odd()
+    ask(config(server), constraint={"choice": ["east", "west"]})
+    assert server.asked[0]["structured_outputs"] == {"choice": ["east", "west"]}
+
+
+def test_fewer_answers_than_asked_for_are_taken(odd):
+    server = odd(json.dumps(completion("Hello.", "stop", 2)).encode())
+
+    async def main():
+        async with Client(config(server)) as client:
+            return await client.ask(CHAT, 4)
+
+    assert len(asyncio.run(main())) == 2
+    assert server.asked[0]["n"] == 4
 
 
 def test_a_rate_limit_is_waited_for_and_costs_no_attempt(odd):

@@ -38,6 +38,9 @@ def save_tiny_qwen3(folder: Path, texts: Iterable[str], vocabulary: int = 1024) 
         dtype="bfloat16",
     )
     model = Qwen3ForCausalLM(config).to(torch.bfloat16)
+    with torch.no_grad():
+        # It never ends by itself, so that every answer has the length that was asked for.
+        model.model.embed_tokens.weight[config.eos_token_id] = 0
     model.save_pretrained(folder)
     tokenizer.save_pretrained(folder)
     return folder
