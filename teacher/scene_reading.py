@@ -1,0 +1,536 @@
+"""Reads sentences about the scene: where its objects are, how they move, and what meets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from teacher.grounding import BETWEEN, CUT, EITHER, TARGET, Ground
+from teacher.phrases import COARSE
+from teacher.reading import BOUNDARIES, END, Reader
+from teacher.tagging import Tag
+
+Names = list[str | None]
+VERBS = {"be", "moves", "stays", "rest", "future", "across", "leaves", "enters", "still", "past"}
+OPENING = {"region", "direction", "speed", "moving", "still", "word", "by", "be", "comma", "also"}
+OPENING |= {"into", "toward", "slight", "rest", "out", "hidden", "pronoun", "future", "expected"}
+INVERTED = {"be", "still", "rest", "future", "expected", "word"}
+SAID = {"region", "direction", "speed", "still", "moving", "rest", "out", "hidden"}
+RELATIONS = {"course", "meet", "contact", "passed", "close"}
+
+
+@dataclass
+class Relation:
+    """A pair that is being told of: who takes part, and when, as far as it has been read."""
+
+    kind: str
+    tag: Tag
+    value: str
+    affirmed: bool
+    subjects: Names
+    nobody: bool
+    partners: Names = field(default_factory=list)
+    between: bool = False
+
+
+class SceneReader(Reader):
+    """Follows the subject through a sentence, and holds what is said of it."""
+
+    def __init__(self, text: str, ground: Ground, moment: str) -> None:
+        super().__init__(text, ground)
+        self.moment = moment
+        self.subjects: Names = []
+        self.met: tuple[str | None, ...] = ()
+
+    def begin(self) -> None:
+        self.before = self.subjects
+        self.subjects = []
+        self.group_start = 0
+        self.pending: list[tuple[str, str, bool, str, Tag]] = []
+        self.relation: Relation | None = None
+        self.time: tuple[str, Tag] | None = None
+        self.finite = self.blocked = self.crossed = self.moved = self.complement = False
+        self.nobody = False
+        self.last: Names = []
+        self.met = ()
+        self.companions: Names = []
+        self._boundary()
+
+    def end(self) -> None:
+        self._flush()
+        self.claims = self.distributed(self.claims)
+
+    def _boundary(self) -> None:
+        self.negated = self.maybe = self.staying = self.future = self.past = self.slight = False
+        self.crossed = True
+
+    # Boundaries.
+
+    def on_comma(self, tag: Tag) -> None:
+        if not self._incomplete():
+            self._flush()
+            self._boundary()
+
+    def on_semicolon(self, tag: Tag) -> None:
+        self._flush()
+        self._boundary()
+        self.finite = bool(self.subjects)
+        self._open()
+
+    on_break = on_semicolon
+
+    def on_and(self, tag: Tag) -> None:
+        if not self._incomplete():
+            self._flush()
+            self.negated = self.slight = False
+            self.crossed = True
+            self._open()
+
+    def _open(self) -> None:
+        """Forget the subject where a clause opens with what is said of the next: "and near the
+        top is the A", "while moving slowly, the A"."""
+        step = 1
+        while self.near(step).tag in OPENING:
+            step += 1
+        if step > 1 and self.near(step - 1).tag not in ("by", "with"):
+            said = any(self.near(k).tag in SAID for k in range(1, step))
+            if said and self.near(step).tag == "object":
+                self.subjects, self.finite, self.blocked, self.nobody = [], False, False, False
+
+    def _incomplete(self) -> bool:
+        return bool(self.relation and self.relation.between and len(self.relation.partners) < 2)
+
+    # Words that steer.
+
+    def on_not(self, tag: Tag) -> None:
+        self.negated = True
+
+    def on_maybe(self, tag: Tag) -> None:
+        self.maybe = True
+
+    def on_future(self, tag: Tag) -> None:
+        self.future = True
+        self._verb()
+
+    on_expected = on_future
+
+    def on_past(self, tag: Tag) -> None:
+        self.past = True
+
+    def on_lack(self, tag: Tag) -> None:
+        if self.word(tag).startswith("without"):
+            self.negated = True
+
+    def on_word(self, tag: Tag) -> None:
+        if self.near(-1).tag == "object":
+            # A verb that is not in the vocabulary, if it is one, may be of motion.
+            self._verb()
+            self.moved |= str(tag.value).endswith("s")
+
+    def on_be(self, tag: Tag) -> None:
+        self._verb()
+
+    on_show = on_be
+
+    def on_stays(self, tag: Tag) -> None:
+        self.staying = True
+        self._verb()
+
+    def _verb(self) -> None:
+        if self.crossed:
+            self.blocked = False
+        if self.subjects or self.nobody:
+            self.finite = True
+
+    # Who is spoken of.
+
+    def on_object(self, tag: Tag) -> None:
+        previous = self.near(-1)
+        relation = self.relation
+        if relation and relation.between and len(relation.partners) < 2:
+            names, _ = self.group(2)
+            relation.partners += names
+            self.last = names[-1:]
+            return
+        if self._is_complement(previous):
+            self._complement()
+            return
+        fresh = self.finite or not self.subjects or self.nobody
+        # "Near the top is the A, and the B ..." places the A alone.
+        names, _ = self.group(1 if self.pending and self._parted() else 9)
+        self.subjects = names if fresh else [*self.subjects, *names]
+        self.group_start = 0 if fresh else len(self.subjects) - len(names)
+        self.last = names[-1:]
+        inverted = bool(self.pending) and previous.tag in INVERTED
+        self.finite, self.blocked, self.nobody, self.complement = inverted, False, False, False
+        if relation and not relation.subjects:
+            relation.subjects = self.subjects
+        # "Near the top, the A and the B are close" places the pair, not its objects.
+        together = any(t.tag == "close" for t in self.sentence)
+        for pending in self.pending:
+            if pending[0] != "region" or not together:
+                self._tell(*pending, subjects=self.subjects)
+        self.pending = []
+
+    def _parted(self) -> bool:
+        return self.near(1).tag == "comma" and self.near(2).tag == "and"
+
+    def _is_complement(self, previous: Tag) -> bool:
+        if previous.tag == "with":
+            # "With the A near the top, ..." tells of the A.
+            return self.near(-2) is not END and self.near(-2).tag not in BOUNDARIES
+        return previous.tag in (
+            "by",
+            "close",
+            "meet",
+            "passed",
+            "contact",
+            "between",
+            "course",
+            "show",
+        )
+
+    def _complement(self) -> None:
+        start = self.at
+        names, _ = self.group()
+        if len(names) > 1 and self.near(1).tag in VERBS | {"not", "word", "show", "speed"}:
+            # "meets the A and the B stays": the B is a subject of its own.
+            self.at = start
+            names, _ = self.group(1)
+        if self.relation and not self.relation.partners:
+            self.relation.partners = names
+        elif self.near(-1).tag == "with" or self.sentence[start - 1].tag == "with":
+            self.companions = names
+        self.last = names[-1:]
+        self.blocked, self.crossed, self.complement = True, False, True
+
+    def on_which(self, tag: Tag) -> None:
+        if self.near(-1).tag == "object" or self.near(-2).tag == "object":
+            self._flush()
+            several = len(self.subjects) - self.group_start > 1 and not self.complement
+            self.subjects = [None] if several else self.last
+            self.finite = self.blocked = False
+            self.group_start = 0
+
+    def on_pronoun(self, tag: Tag) -> None:
+        previous = self.near(-1)
+        if previous.tag in ("by", "with", "close", "meet", "passed", "between", "course"):
+            self._refer(previous, tag)
+            return
+        possessive = self.word(tag) in ("its", "their")
+        if previous.tag == "object" or possessive or (previous.tag in VERBS and self.subjects):
+            return
+        self.subjects = self._antecedent(str(tag.value))
+        self.group_start = 0
+        self.finite = self.blocked = self.nobody = False
+        for pending in self.pending:
+            if pending[0] != "region":
+                self._tell(*pending, subjects=self.subjects)
+        self.pending = []
+
+    def _antecedent(self, pronoun: str) -> Names:
+        """Whom a pronoun stands for where that is safe to say, else None."""
+        subjects = self.subjects or self.before
+        if pronoun == "it":
+            return list(subjects) if len(subjects) == 1 and not self.complement else [None]
+        if pronoun in ("former", "latter"):
+            pair = self._both()
+            return [pair[pronoun == "latter"]] if len(pair) == 2 else [None]
+        return self._both()
+
+    def _both(self) -> Names:
+        named = list(dict.fromkeys(self.mentioned)) or list(self.before)
+        return named if len(named) == 2 and None not in named else [None]
+
+    def _refer(self, previous: Tag, tag: Tag) -> None:
+        """A pronoun that is no subject."""
+        relation = self.relation
+        self.complement = True
+        if relation and not relation.partners:
+            relation.partners = [None]
+            if previous.tag == "between":
+                pair = self._both()
+                relation.partners = pair if len(pair) == 2 else [None, None]
+
+    def on_rest_of(self, tag: Tag) -> None:
+        if self._is_complement(self.near(-1)):
+            if self.relation:
+                self.relation.partners = [None]
+            return
+        self.subjects, self.group_start = [None], 0
+        self.finite = self.blocked = self.nobody = False
+
+    on_all = on_rest_of
+    on_no_other = on_rest_of
+
+    def on_none(self, tag: Tag) -> None:
+        if self.near(-1).tag in RELATIONS | {"by", "with"}:
+            self.relation = None
+            return
+        self.subjects, self.nobody, self.finite = [], True, False
+
+    def on_candidate(self, tag: Tag) -> None:
+        self.subjects = [None]
+
+    # What is said of one object.
+
+    def on_region(self, tag: Tag, when: str = "") -> None:
+        relation = self.relation
+        if relation:
+            if relation.kind == "close":
+                self._close_region(relation, tag)
+            return
+        if self.negated and self.near(-1).tag not in ("not", "be", "future"):
+            return
+        ahead = self.near(1).tag
+        if self.near(-1).tag in ("semicolon", "break") and ahead in ("pronoun", "object"):
+            if ahead == "object":
+                self.pending.append(("region", str(tag.value), True, when or self.moment, tag))
+            return
+        if not when:
+            when = TARGET if self.future else CUT if self.past else self.moment
+            if self.near(-1).tag == "object" and self.moment == TARGET:
+                # "The A near the top will be near the left."
+                when = EITHER
+        self._tell("region", str(tag.value), not self.negated, when, tag)
+
+    def on_into(self, tag: Tag) -> None:
+        self.on_region(tag, CUT if self.moment == CUT and not self.moved else TARGET)
+
+    def on_from(self, tag: Tag) -> None:
+        self.on_region(tag, CUT)
+
+    def on_direction(self, tag: Tag) -> None:
+        if self.word(self.near(-1)) == "from" or self.word(self.near(1)) in ("of", "from"):
+            return
+        if self.relation:
+            return
+        if self.negated and self.near(-1).tag not in ("not", "be", "moves", "moving"):
+            return
+        when = self.moment
+        if when != CUT:
+            # "Toward the east, the A shifts slightly" tells the way from cut to target.
+            ahead = not self.subjects and any(t.tag in ("slight", "across") for t in self.sentence)
+            when = BETWEEN if self.slight or ahead else EITHER
+        self._tell("direction", str(tag.value), not self.negated, when, tag)
+
+    def on_speed(self, tag: Tag) -> None:
+        following = self.near(1).tag
+        moving = self.moved or following in ("moves", "moving", "across")
+        if not moving or self.relation or following in RELATIONS:
+            return
+        self._tell("speed", str(tag.value), not self.negated, CUT, tag)
+
+    def on_still(self, tag: Tag) -> None:
+        self._verb()
+        when = self.moment
+        if self.staying or (self.future and when != CUT):
+            when = BETWEEN
+        elif when == TARGET:
+            when = EITHER
+        self._tell("still", "", not self.negated, when, tag)
+
+    def on_rest(self, tag: Tag) -> None:
+        if self.near(-1).tag == "object" or self.near(-1).tag == "and":
+            self.on_still(tag)
+
+    def on_moves(self, tag: Tag) -> None:
+        self.moved = True
+        self._verb()
+        self.on_moving(tag)
+
+    def on_moving(self, tag: Tag) -> None:
+        self.moved = True
+        self.slight |= self.word(tag) in ("moved", "traveled", "travelled", "rolled")
+        if self.negated and self.near(1).tag in BOUNDARIES:
+            when = CUT if self.moment == CUT else EITHER
+            self._tell("still", "", True, when, tag)
+
+    on_off = on_moving
+
+    def on_slight(self, tag: Tag) -> None:
+        if self.moved or self.near(1).tag in ("moves", "moving", "off"):
+            self.slight = True
+            self._tell("extent", "shifts slightly", not self.negated, BETWEEN, tag)
+
+    def on_across(self, tag: Tag) -> None:
+        self.moved = self.slight = True
+        self._verb()
+        self._tell("extent", "moves across", not self.negated, BETWEEN, tag)
+
+    def on_put(self, tag: Tag) -> None:
+        clause = self.word(tag).split()[0] in ("where", "in", "as", "nearly", "almost", "roughly")
+        if not clause or self.staying:
+            self._verb()
+            value = COARSE if tag.value == COARSE else "stays"
+            self._tell("extent", value, not self.negated, BETWEEN, tag)
+
+    def on_leaves(self, tag: Tag) -> None:
+        self._verb()
+        bare = len(self.word(tag).split()) == 1
+        if not bare or self.near(1).tag in BOUNDARIES:
+            self._tell("leaves", "", not self.negated, BETWEEN, tag)
+        else:
+            # "Leaves the area near the top."
+            self.maybe = True
+
+    def on_enters(self, tag: Tag) -> None:
+        self._verb()
+        bare = len(self.word(tag).split()) == 1
+        if not bare or self.near(1).tag in (*BOUNDARIES, "region"):
+            self._tell("enters", "", not self.negated, BETWEEN, tag)
+
+    def on_out(self, tag: Tag) -> None:
+        self._sight("out of view", tag)
+
+    def on_hidden(self, tag: Tag) -> None:
+        self._sight("hidden", tag)
+
+    def on_unseen(self, tag: Tag) -> None:
+        if self.word(tag).startswith("cannot"):
+            self._verb()
+        self._sight("unseen", tag)
+
+    def _sight(self, value: str, tag: Tag) -> None:
+        when = TARGET if self.future else self.moment
+        if self.past or self.near(-1).tag == "by":
+            when = EITHER
+        self._tell("sight", value, not self.negated, when, tag)
+
+    def _tell(
+        self,
+        kind: str,
+        value: str,
+        affirmed: bool,
+        when: str,
+        tag: Tag,
+        subjects: Names | None = None,
+    ) -> None:
+        if self.maybe or self.blocked:
+            return
+        if subjects is None:
+            if not self.subjects:
+                if not self.nobody:
+                    self.pending.append((kind, value, affirmed, when, tag))
+                return
+            # Before the verb, "the A and the B near the top" may speak of the B alone.
+            apart = not self.finite and self.near(-1).tag == "object"
+            subjects = self.subjects[-1:] if apart else self.subjects
+            if not self.finite and not apart:
+                subjects = self.subjects[self.group_start :]
+        for name in subjects:
+            self.claims.append(self.claim(kind, (name,), value, affirmed, when, tag))
+        if len(subjects) > 1 and affirmed:
+            self.shared.append((kind, value, tuple(subjects), tag))
+
+    # What is said of pairs.
+
+    def on_course(self, tag: Tag) -> None:
+        self._relate("course", tag, str(tag.value), not self.negated)
+
+    def on_meet(self, tag: Tag) -> None:
+        self._relate("meeting", tag, "", not self.negated)
+
+    def on_passed(self, tag: Tag) -> None:
+        self._relate("meeting", tag, "", self.negated)
+
+    def on_contact(self, tag: Tag) -> None:
+        following = self.near(1)
+        if following.tag in ("between", "with", "object"):
+            self._relate("meeting", tag, "", not self.negated)
+        elif self.relation is None and self.near(-1).tag not in ("by", "past"):
+            pair = self.met or tuple(self._both())
+            if len(pair) == 2:
+                self._relate("meeting", tag, "", not self.negated)
+                if self.relation:
+                    self.relation.partners, self.relation.between = list(pair), True
+
+    def on_close(self, tag: Tag) -> None:
+        if self.relation and not self.relation.partners and self.relation.kind != "close":
+            return
+        self._relate("close", tag, str(tag.value), not self.negated)
+
+    def on_between(self, tag: Tag) -> None:
+        if self.relation and not self.relation.partners:
+            self.relation.between = True
+
+    def on_when(self, tag: Tag) -> None:
+        opening = self.near(-1) is END or self.near(-1).tag in BOUNDARIES
+        if self.time is None and not (opening and tag.value == "later"):
+            self.time = (str(tag.value), tag)
+
+    def _relate(self, kind: str, tag: Tag, value: str, affirmed: bool) -> None:
+        time = self.time
+        self._flush(keep=self.relation is None)
+        if self.relation is None and time:
+            self.time = time
+        self.relation = Relation(
+            kind, tag, value, affirmed and not self.maybe, list(self.subjects), self.nobody
+        )
+        if self.companions and self.near(1).tag not in ("object", "by", "with"):
+            # "Its course with the B ends without contact."
+            self.relation.partners, self.companions = self.companions, []
+        if self.maybe:
+            self.relation = None
+        elif tag.tag != "contact":
+            self._verb()
+
+    def _close_region(self, relation: Relation, tag: Tag) -> None:
+        """The region of a pair that is close, said right after it."""
+        pair = self._pairs(relation)
+        if len(pair) != 1 or self.maybe or self.negated:
+            return
+        exact = not relation.partners and self.near(-1).tag in ("close", "ignore")
+        kind = "close region" if exact or relation.partners else ""
+        if kind:
+            when = TARGET if self.moment == TARGET or self.future else EITHER
+            self.claims.append(self.claim(kind, pair[0], str(tag.value), True, when, tag))
+
+    def _pairs(self, relation: Relation) -> list[tuple[str | None, ...]]:
+        if relation.between:
+            return [tuple(relation.partners)] if len(relation.partners) == 2 else []
+        if relation.partners:
+            if relation.nobody:
+                return [(name,) for name in relation.partners]
+            return [(a, b) for a in relation.subjects for b in relation.partners]
+        if len(relation.subjects) <= 2:
+            return [tuple(relation.subjects)] if relation.subjects else []
+        return []
+
+    def _flush(self, keep: bool = False) -> None:
+        """End the relation that is being told of, and hold it as claims."""
+        relation, time = self.relation, self.time
+        self.relation = None
+        if not keep:
+            self.time = None
+        if relation is None or self.maybe:
+            return
+        affirmed = relation.affirmed and not relation.nobody
+        when = CUT if self.moment == CUT else TARGET if relation.kind == "close" else BETWEEN
+        if relation.kind == "close" and self.moment == EITHER and not self.future:
+            when = EITHER
+        pairs = self._pairs(relation)
+        if relation.nobody and not pairs and relation.kind == "course":
+            pairs = [()]
+        for pair in pairs:
+            alone = len(pair) == 1
+            if alone and (relation.kind == "close" or not (affirmed or relation.kind == "course")):
+                continue
+            self._hold(relation, pair, affirmed, when, time)
+
+    def _hold(
+        self,
+        relation: Relation,
+        pair: tuple[str | None, ...],
+        affirmed: bool,
+        when: str,
+        time: tuple[str, Tag] | None,
+    ) -> None:
+        if None in pair or len(set(pair)) < len(pair):
+            return
+        self.claims.append(
+            self.claim(relation.kind, pair, relation.value, affirmed, when, relation.tag)
+        )
+        if len(pair) == 2:
+            self.met = pair
+        if time and affirmed and relation.kind in ("meeting", "course") and len(pair) == 2:
+            self.claims.append(self.claim("time", pair, time[0], True, BETWEEN, time[1]))
