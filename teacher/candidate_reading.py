@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from teacher.grounding import TARGET, Claim, Ground
-from teacher.reading import Reader
+from teacher.reading import Names, Reader
 from teacher.tagging import Tag
 
-Names = list[str | None]
-COMPARED = {"of", "as", "like", "with", "than", "what", "to", "besides", "does", "same"}
+COMPARED = {"of", "as", "like", "with", "what", "to", "does", "same"}
 """Words before a candidate that another is only compared with."""
+ASIDE = {"unlike", "like", "than", "besides", "beyond", "except"}
+"""Words before a candidate that is not the one spoken of, wherever it stands."""
 PARTED = ("in", "from", "by", "for")
 """Words before a candidate that the clause so far has been about."""
 
@@ -36,16 +37,26 @@ class CandidateReader(Reader):
         self._boundary()
 
     def end(self) -> None:
-        spoken = {c.candidate for c in self.found}
         if not self.lasting and len(self.letters) == 1 and not self.doubted:
-            letter = self.letters[0]
-            if letter not in spoken:
-                tag = self.choice or self.sentence[-1]
-                self.found.append(self.claim("agrees", (), "", True, TARGET, tag, letter))
-        self.claims += [c for c in self.distributed(self.found) if c.candidate != ""]
+            self._choose(self.letters[0])
+        for claim in self.found:
+            if claim.candidate != "":
+                self.claims.append(claim)
+            elif claim.kind == "region" and not self.lasting:
+                # Before any candidate is named, an outcome tells of the target.
+                self.claims.append(claim._replace(candidate=None))
+
+    def _choose(self, letter: str) -> None:
+        """An outcome that only names a candidate, all others being wrong, chooses it."""
+        named = {str(t.value) for t in self.sentence if t.tag == "candidate"}
+        wrong = {c.candidate for c in self.found if c.kind == "agrees" and not c.affirmed}
+        told = any(c.candidate == letter for c in self.found)
+        if not told and named <= wrong | {letter}:
+            tag = self.choice or self.sentence[-1]
+            self.found.append(self.claim("agrees", (), "", True, TARGET, tag, letter))
 
     def _boundary(self) -> None:
-        self.negated = self.expected = self.skipped = self.contrasted = False
+        self.negated = self.expected = self.skipped = self.contrasted = self.refused = False
         self.clause = len(self.found)
 
     # Boundaries and words that steer.
@@ -64,6 +75,7 @@ class CandidateReader(Reader):
 
     def on_not(self, tag: Tag) -> None:
         self.negated = self.doubted = True
+        self.refused = self.near(1).tag == "candidate"
 
     def on_maybe(self, tag: Tag) -> None:
         self.skipped = True
@@ -80,7 +92,7 @@ class CandidateReader(Reader):
         previous = self.word(self.near(-1)) if self.at else ""
         before = previous.split()[-1] if previous else ""
         letters = self._letters()
-        if before in COMPARED and self.letters:
+        if before in ASIDE or (before in COMPARED and self.letters):
             self.skipped = True
         elif before in PARTED and len(self.found) > self.clause:
             kept, moved = self.found[: self.clause], self.found[self.clause :]
@@ -101,7 +113,7 @@ class CandidateReader(Reader):
             self.expected = self.contrasted = self.negated = False
             self.clause = len(self.found)
             if self.passing:
-                self._whole("agrees", True, tag)
+                self._whole("agrees", not self.refused, tag)
                 self.passing = False
 
     def _letters(self) -> tuple[str, ...]:
@@ -113,7 +125,8 @@ class CandidateReader(Reader):
             if step == 1 or step > 3 or self.near(step).tag != "candidate":
                 return tuple(dict.fromkeys(letters))
             between = self.text[self.sentence[self.at].stop : self.near(step).start].lower()
-            if "candidate" in between and (step > 2 or len(self.found) > self.clause):
+            alone = self.near(1).tag == "and" and len(self.found) == self.clause
+            if "candidate" in between and not alone:
                 # "It is in candidate A, and candidate B ..." is no list.
                 return tuple(dict.fromkeys(letters))
             self.at += step
@@ -153,6 +166,7 @@ class CandidateReader(Reader):
 
     def on_none(self, tag: Tag) -> None:
         self.objects, self.lacking = [], False
+        self.refused = self.near(1).tag == "by" and self.near(2).tag == "candidate"
         if self.found and self.found[-1].kind == "agrees":
             # "It differs in nothing."
             self.found = [c for c in self.found if c.kind != "agrees"]
@@ -248,7 +262,7 @@ class CandidateReader(Reader):
         if not self.letters:
             self.passing = not self.negated
         elif not self.objects and not self._partial():
-            self._whole("agrees", not self.negated, tag)
+            self._whole("agrees", not (self.negated or self.refused), tag)
 
     def on_differ(self, tag: Tag) -> None:
         self.doubted = True

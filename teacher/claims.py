@@ -21,6 +21,9 @@ MOMENTS = {
 }
 """What the present tense of a section speaks of."""
 
+LONGEST = 250
+"""Tags of a sentence, beyond which it is cut."""
+
 
 def find_claims(text: str, predicates: Predicates) -> tuple[Claim, ...]:
     """The claims of a rationale in order, each with its verdict; never raises."""
@@ -36,10 +39,9 @@ def find_claims(text: str, predicates: Predicates) -> tuple[Claim, ...]:
             if name == "Candidate analysis" or (
                 name == "Outcome" and any(t.tag == "candidate" for t in sentence)
             ):
-                candidates.read(sentence)
+                found += candidates.read(sentence)
             else:
-                scene.read(sentence)
-        found += scene.claims + candidates.claims
+                found += scene.read(sentence)
     found.sort(key=lambda claim: claim.span)
     return tuple(claim._replace(verdict=ground.verdict(claim)) for claim in found)
 
@@ -53,9 +55,10 @@ def _answer(text: str, start: int, stop: int) -> list[Claim]:
 
 
 def _sentences(found: list[Tag]) -> list[list[Tag]]:
+    """Sentences, the longest parted: the readers look ahead, and their time is to stay linear."""
     sentences: list[list[Tag]] = [[]]
     for tag in found:
         sentences[-1].append(tag)
-        if tag.tag == "stop":
+        if tag.tag == "stop" or len(sentences[-1]) >= LONGEST:
             sentences.append([])
     return [s for s in sentences if s]

@@ -7,6 +7,10 @@ from teacher.tagging import Noun, Tag
 
 BOUNDARIES = {"comma", "semicolon", "and", "break", "stop"}
 END = Tag("stop", "", 0, 0)
+MOST = 9
+"""Objects that are followed at a time."""
+
+Names = list[str | None]
 
 
 class Reader:
@@ -20,7 +24,9 @@ class Reader:
         self.at = 0
         self.shared: list[tuple[str, str, tuple[str | None, ...], Tag]] = []
 
-    def read(self, sentence: list[Tag]) -> None:
+    def read(self, sentence: list[Tag]) -> list[Claim]:
+        """What a sentence claims, not yet held against anything."""
+        self.claims = []
         self.sentence, self.at, self.shared = sentence, 0, []
         self.mentioned: list[str | None] = []
         self.begin()
@@ -31,6 +37,7 @@ class Reader:
                 handler(tag)
             self.at += 1
         self.end()
+        return self.distributed(self.claims)
 
     def begin(self) -> None:
         raise NotImplementedError
@@ -63,7 +70,7 @@ class Reader:
         names = () if None in subjects else subjects
         return Claim(kind, names, value, affirmed, when, candidate, (span.start, span.stop))
 
-    def group(self, most: int = 9) -> tuple[list[str | None], Tag]:
+    def group(self, most: int = MOST) -> tuple[list[str | None], Tag]:
         """The objects that are listed from the current tag on, and the last tag; leaves the cursor
         there. "The A, the B and the C" is a list, "the A, the B" is not."""
         ends = [self.at]

@@ -2,62 +2,56 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
-from teacher.grounding import BETWEEN, CUT, EITHER, TARGET, Ground
+from teacher.grounding import BETWEEN, CUT, EITHER, TARGET
+from teacher.pair_reading import RELATIONS, PairReader
 from teacher.phrases import COARSE
-from teacher.reading import BOUNDARIES, END, Reader
+from teacher.reading import BOUNDARIES, END, MOST, Names
 from teacher.tagging import Tag
 
-Names = list[str | None]
 VERBS = {"be", "moves", "stays", "rest", "future", "across", "leaves", "enters", "still", "past"}
-OPENING = {"region", "direction", "speed", "moving", "still", "word", "by", "be", "comma", "also"}
-OPENING |= {"into", "toward", "slight", "rest", "out", "hidden", "pronoun", "future", "expected"}
-INVERTED = {"be", "still", "rest", "future", "expected", "word"}
+"""Tags of words that may be a clause's verb."""
+STILL_VERBS = {
+    *("does", "do", "did", "is", "are", "has", "have", "shows", "show", "keeps", "keep"),
+    *("rest", "rests", "stand", "stands", "sit", "sits", "lie", "lies"),
+}
+"""Opening words of phrases for rest that hold a verb ("does not move", but not "at rest")."""
 SAID = {"region", "direction", "speed", "still", "moving", "rest", "out", "hidden"}
-RELATIONS = {"course", "meet", "contact", "passed", "close"}
+"""Tags of what may be said of an object before it is named."""
+OPENING = SAID | {"into", "toward", "slight", "word", "by", "be", "comma", "pronoun", "future"}
+OPENING |= {"expected"}
+"""Tags that may stand between a clause's beginning and a subject that comes late."""
+INVERTED = {"be", "still", "rest", "future", "expected", "word"}
+"""Tags of a verb before its subject: "near the top is the A"."""
+TAKERS = {"by", "close", "meet", "passed", "contact", "between", "course", "show"}
+"""Tags before a noun phrase that is no subject."""
 
 
-@dataclass
-class Relation:
-    """A pair that is being told of: who takes part, and when, as far as it has been read."""
-
-    kind: str
-    tag: Tag
-    value: str
-    affirmed: bool
-    subjects: Names
-    nobody: bool
-    partners: Names = field(default_factory=list)
-    between: bool = False
-
-
-class SceneReader(Reader):
+class SceneReader(PairReader):
     """Follows the subject through a sentence, and holds what is said of it."""
-
-    def __init__(self, text: str, ground: Ground, moment: str) -> None:
-        super().__init__(text, ground)
-        self.moment = moment
-        self.subjects: Names = []
-        self.met: tuple[str | None, ...] = ()
 
     def begin(self) -> None:
         self.before = self.subjects
-        self.subjects = []
+        """Whom the sentence before told of last."""
+        self.begin_pairs()
         self.group_start = 0
+        """Where in `subjects` the part begins that a comma's afterthought is said of."""
         self.pending: list[tuple[str, str, bool, str, Tag]] = []
-        self.relation: Relation | None = None
-        self.time: tuple[str, Tag] | None = None
-        self.finite = self.blocked = self.crossed = self.moved = self.complement = False
-        self.nobody = False
+        """What has been said before its subject was named."""
+        self.finite = False
+        """Whether the subject has its verb, so that a further noun phrase is a new subject."""
+        self.blocked = self.complement = False
+        """Whether what follows may be said of another object than the subject."""
+        self.crossed = self.moved = self.absolute = False
         self.last: Names = []
-        self.met = ()
-        self.companions: Names = []
+        """Whom "which" stands for."""
         self._boundary()
 
     def end(self) -> None:
-        self._flush()
-        self.claims = self.distributed(self.claims)
+        self.flush()
+        ending = [t.tag for t in self.sentence[-2:]]
+        if ending == ["not", "stop"]:
+            # "They look set to meet, but they do not."
+            self.claims = [c for c in self.claims if c.kind != "meeting"]
 
     def _boundary(self) -> None:
         self.negated = self.maybe = self.staying = self.future = self.past = self.slight = False
@@ -66,12 +60,14 @@ class SceneReader(Reader):
     # Boundaries.
 
     def on_comma(self, tag: Tag) -> None:
-        if not self._incomplete():
-            self._flush()
+        if not self.is_incomplete():
+            self.flush()
             self._boundary()
+            self.finite |= self.absolute
+            self.absolute = False
 
     def on_semicolon(self, tag: Tag) -> None:
-        self._flush()
+        self.flush()
         self._boundary()
         self.finite = bool(self.subjects)
         self._open()
@@ -79,8 +75,8 @@ class SceneReader(Reader):
     on_break = on_semicolon
 
     def on_and(self, tag: Tag) -> None:
-        if not self._incomplete():
-            self._flush()
+        if not self.is_incomplete():
+            self.flush()
             self.negated = self.slight = False
             self.crossed = True
             self._open()
@@ -96,9 +92,6 @@ class SceneReader(Reader):
             if said and self.near(step).tag == "object":
                 self.subjects, self.finite, self.blocked, self.nobody = [], False, False, False
 
-    def _incomplete(self) -> bool:
-        return bool(self.relation and self.relation.between and len(self.relation.partners) < 2)
-
     # Words that steer.
 
     def on_not(self, tag: Tag) -> None:
@@ -109,7 +102,7 @@ class SceneReader(Reader):
 
     def on_future(self, tag: Tag) -> None:
         self.future = True
-        self._verb()
+        self.verb()
 
     on_expected = on_future
 
@@ -123,19 +116,19 @@ class SceneReader(Reader):
     def on_word(self, tag: Tag) -> None:
         if self.near(-1).tag == "object":
             # A verb that is not in the vocabulary, if it is one, may be of motion.
-            self._verb()
+            self.verb()
             self.moved |= str(tag.value).endswith("s")
 
     def on_be(self, tag: Tag) -> None:
-        self._verb()
+        self.verb()
 
     on_show = on_be
 
     def on_stays(self, tag: Tag) -> None:
         self.staying = True
-        self._verb()
+        self.verb()
 
-    def _verb(self) -> None:
+    def verb(self) -> None:
         if self.crossed:
             self.blocked = False
         if self.subjects or self.nobody:
@@ -156,10 +149,12 @@ class SceneReader(Reader):
             return
         fresh = self.finite or not self.subjects or self.nobody
         # "Near the top is the A, and the B ..." places the A alone.
-        names, _ = self.group(1 if self.pending and self._parted() else 9)
-        self.subjects = names if fresh else [*self.subjects, *names]
-        self.group_start = 0 if fresh else len(self.subjects) - len(names)
+        names, _ = self.group(1 if self.pending and self._parted() else MOST)
+        self.subjects = names if fresh else [*self.subjects, *names][-MOST:]
+        self.group_start = 0 if fresh else max(0, len(self.subjects) - len(names))
         self.last = names[-1:]
+        # "With the A at rest, the B ...": the A's part ends with the comma.
+        self.absolute = previous.tag == "with"
         inverted = bool(self.pending) and previous.tag in INVERTED
         self.finite, self.blocked, self.nobody, self.complement = inverted, False, False, False
         if relation and not relation.subjects:
@@ -178,16 +173,7 @@ class SceneReader(Reader):
         if previous.tag == "with":
             # "With the A near the top, ..." tells of the A.
             return self.near(-2) is not END and self.near(-2).tag not in BOUNDARIES
-        return previous.tag in (
-            "by",
-            "close",
-            "meet",
-            "passed",
-            "contact",
-            "between",
-            "course",
-            "show",
-        )
+        return previous.tag in TAKERS
 
     def _complement(self) -> None:
         start = self.at
@@ -205,7 +191,7 @@ class SceneReader(Reader):
 
     def on_which(self, tag: Tag) -> None:
         if self.near(-1).tag == "object" or self.near(-2).tag == "object":
-            self._flush()
+            self.flush()
             several = len(self.subjects) - self.group_start > 1 and not self.complement
             self.subjects = [None] if several else self.last
             self.finite = self.blocked = False
@@ -216,7 +202,7 @@ class SceneReader(Reader):
         if previous.tag in ("by", "with", "close", "meet", "passed", "between", "course"):
             self._refer(previous, tag)
             return
-        possessive = self.word(tag) in ("its", "their")
+        possessive = self.word(tag) in ("its", "their") or self.near(1).tag == "object"
         if previous.tag == "object" or possessive or (previous.tag in VERBS and self.subjects):
             return
         self.subjects = self._antecedent(str(tag.value))
@@ -233,13 +219,9 @@ class SceneReader(Reader):
         if pronoun == "it":
             return list(subjects) if len(subjects) == 1 and not self.complement else [None]
         if pronoun in ("former", "latter"):
-            pair = self._both()
+            pair = self.both()
             return [pair[pronoun == "latter"]] if len(pair) == 2 else [None]
-        return self._both()
-
-    def _both(self) -> Names:
-        named = list(dict.fromkeys(self.mentioned)) or list(self.before)
-        return named if len(named) == 2 and None not in named else [None]
+        return self.both()
 
     def _refer(self, previous: Tag, tag: Tag) -> None:
         """A pronoun that is no subject."""
@@ -248,7 +230,7 @@ class SceneReader(Reader):
         if relation and not relation.partners:
             relation.partners = [None]
             if previous.tag == "between":
-                pair = self._both()
+                pair = self.both()
                 relation.partners = pair if len(pair) == 2 else [None, None]
 
     def on_rest_of(self, tag: Tag) -> None:
@@ -266,7 +248,7 @@ class SceneReader(Reader):
         if self.near(-1).tag in RELATIONS | {"by", "with"}:
             self.relation = None
             return
-        self.subjects, self.nobody, self.finite = [], True, False
+        self.subjects, self.nobody, self.finite, self.pending = [], True, False, []
 
     def on_candidate(self, tag: Tag) -> None:
         self.subjects = [None]
@@ -277,7 +259,7 @@ class SceneReader(Reader):
         relation = self.relation
         if relation:
             if relation.kind == "close":
-                self._close_region(relation, tag)
+                self.close_region(relation, tag)
             return
         if self.negated and self.near(-1).tag not in ("not", "be", "future"):
             return
@@ -288,10 +270,16 @@ class SceneReader(Reader):
             return
         if not when:
             when = TARGET if self.future else CUT if self.past else self.moment
-            if self.near(-1).tag == "object" and self.moment == TARGET:
+            if self._is_former():
+                when = CUT
+            elif self.near(-1).tag == "object" and self.moment == TARGET:
                 # "The A near the top will be near the left."
                 when = EITHER
         self._tell("region", str(tag.value), not self.negated, when, tag)
+
+    def _is_former(self) -> bool:
+        """Whether a word after the current one puts it before the target: "out of view before"."""
+        return self.near(1).tag == "past" or self.word(self.near(1)) == "before"
 
     def on_into(self, tag: Tag) -> None:
         self.on_region(tag, CUT if self.moment == CUT and not self.moved else TARGET)
@@ -321,9 +309,10 @@ class SceneReader(Reader):
         self._tell("speed", str(tag.value), not self.negated, CUT, tag)
 
     def on_still(self, tag: Tag) -> None:
-        self._verb()
+        if self.word(tag).split()[0] in STILL_VERBS:
+            self.verb()
         when = self.moment
-        if self.staying or (self.future and when != CUT):
+        if when != CUT and (self.staying or self.future):
             when = BETWEEN
         elif when == TARGET:
             when = EITHER
@@ -335,7 +324,7 @@ class SceneReader(Reader):
 
     def on_moves(self, tag: Tag) -> None:
         self.moved = True
-        self._verb()
+        self.verb()
         self.on_moving(tag)
 
     def on_moving(self, tag: Tag) -> None:
@@ -354,18 +343,21 @@ class SceneReader(Reader):
 
     def on_across(self, tag: Tag) -> None:
         self.moved = self.slight = True
-        self._verb()
+        self.verb()
         self._tell("extent", "moves across", not self.negated, BETWEEN, tag)
 
     def on_put(self, tag: Tag) -> None:
         clause = self.word(tag).split()[0] in ("where", "in", "as", "nearly", "almost", "roughly")
         if not clause or self.staying:
-            self._verb()
+            self.verb()
+            if self.moment == CUT:
+                self.on_still(tag)
+                return
             value = COARSE if tag.value == COARSE else "stays"
             self._tell("extent", value, not self.negated, BETWEEN, tag)
 
     def on_leaves(self, tag: Tag) -> None:
-        self._verb()
+        self.verb()
         bare = len(self.word(tag).split()) == 1
         if not bare or self.near(1).tag in BOUNDARIES:
             self._tell("leaves", "", not self.negated, BETWEEN, tag)
@@ -374,7 +366,7 @@ class SceneReader(Reader):
             self.maybe = True
 
     def on_enters(self, tag: Tag) -> None:
-        self._verb()
+        self.verb()
         bare = len(self.word(tag).split()) == 1
         if not bare or self.near(1).tag in (*BOUNDARIES, "region"):
             self._tell("enters", "", not self.negated, BETWEEN, tag)
@@ -387,12 +379,12 @@ class SceneReader(Reader):
 
     def on_unseen(self, tag: Tag) -> None:
         if self.word(tag).startswith("cannot"):
-            self._verb()
+            self.verb()
         self._sight("unseen", tag)
 
     def _sight(self, value: str, tag: Tag) -> None:
         when = TARGET if self.future else self.moment
-        if self.past or self.near(-1).tag == "by":
+        if self.past or self.near(-1).tag == "by" or self._is_former():
             when = EITHER
         self._tell("sight", value, not self.negated, when, tag)
 
@@ -421,116 +413,3 @@ class SceneReader(Reader):
             self.claims.append(self.claim(kind, (name,), value, affirmed, when, tag))
         if len(subjects) > 1 and affirmed:
             self.shared.append((kind, value, tuple(subjects), tag))
-
-    # What is said of pairs.
-
-    def on_course(self, tag: Tag) -> None:
-        self._relate("course", tag, str(tag.value), not self.negated)
-
-    def on_meet(self, tag: Tag) -> None:
-        self._relate("meeting", tag, "", not self.negated)
-
-    def on_passed(self, tag: Tag) -> None:
-        self._relate("meeting", tag, "", self.negated)
-
-    def on_contact(self, tag: Tag) -> None:
-        following = self.near(1)
-        if following.tag in ("between", "with", "object"):
-            self._relate("meeting", tag, "", not self.negated)
-        elif self.relation is None and self.near(-1).tag not in ("by", "past"):
-            pair = self.met or tuple(self._both())
-            if len(pair) == 2:
-                self._relate("meeting", tag, "", not self.negated)
-                if self.relation:
-                    self.relation.partners, self.relation.between = list(pair), True
-
-    def on_close(self, tag: Tag) -> None:
-        if self.relation and not self.relation.partners and self.relation.kind != "close":
-            return
-        self._relate("close", tag, str(tag.value), not self.negated)
-
-    def on_between(self, tag: Tag) -> None:
-        if self.relation and not self.relation.partners:
-            self.relation.between = True
-
-    def on_when(self, tag: Tag) -> None:
-        opening = self.near(-1) is END or self.near(-1).tag in BOUNDARIES
-        if self.time is None and not (opening and tag.value == "later"):
-            self.time = (str(tag.value), tag)
-
-    def _relate(self, kind: str, tag: Tag, value: str, affirmed: bool) -> None:
-        time = self.time
-        self._flush(keep=self.relation is None)
-        if self.relation is None and time:
-            self.time = time
-        self.relation = Relation(
-            kind, tag, value, affirmed and not self.maybe, list(self.subjects), self.nobody
-        )
-        if self.companions and self.near(1).tag not in ("object", "by", "with"):
-            # "Its course with the B ends without contact."
-            self.relation.partners, self.companions = self.companions, []
-        if self.maybe:
-            self.relation = None
-        elif tag.tag != "contact":
-            self._verb()
-
-    def _close_region(self, relation: Relation, tag: Tag) -> None:
-        """The region of a pair that is close, said right after it."""
-        pair = self._pairs(relation)
-        if len(pair) != 1 or self.maybe or self.negated:
-            return
-        exact = not relation.partners and self.near(-1).tag in ("close", "ignore")
-        kind = "close region" if exact or relation.partners else ""
-        if kind:
-            when = TARGET if self.moment == TARGET or self.future else EITHER
-            self.claims.append(self.claim(kind, pair[0], str(tag.value), True, when, tag))
-
-    def _pairs(self, relation: Relation) -> list[tuple[str | None, ...]]:
-        if relation.between:
-            return [tuple(relation.partners)] if len(relation.partners) == 2 else []
-        if relation.partners:
-            if relation.nobody:
-                return [(name,) for name in relation.partners]
-            return [(a, b) for a in relation.subjects for b in relation.partners]
-        if len(relation.subjects) <= 2:
-            return [tuple(relation.subjects)] if relation.subjects else []
-        return []
-
-    def _flush(self, keep: bool = False) -> None:
-        """End the relation that is being told of, and hold it as claims."""
-        relation, time = self.relation, self.time
-        self.relation = None
-        if not keep:
-            self.time = None
-        if relation is None or self.maybe:
-            return
-        affirmed = relation.affirmed and not relation.nobody
-        when = CUT if self.moment == CUT else TARGET if relation.kind == "close" else BETWEEN
-        if relation.kind == "close" and self.moment == EITHER and not self.future:
-            when = EITHER
-        pairs = self._pairs(relation)
-        if relation.nobody and not pairs and relation.kind == "course":
-            pairs = [()]
-        for pair in pairs:
-            alone = len(pair) == 1
-            if alone and (relation.kind == "close" or not (affirmed or relation.kind == "course")):
-                continue
-            self._hold(relation, pair, affirmed, when, time)
-
-    def _hold(
-        self,
-        relation: Relation,
-        pair: tuple[str | None, ...],
-        affirmed: bool,
-        when: str,
-        time: tuple[str, Tag] | None,
-    ) -> None:
-        if None in pair or len(set(pair)) < len(pair):
-            return
-        self.claims.append(
-            self.claim(relation.kind, pair, relation.value, affirmed, when, relation.tag)
-        )
-        if len(pair) == 2:
-            self.met = pair
-        if time and affirmed and relation.kind in ("meeting", "course") and len(pair) == 2:
-            self.claims.append(self.claim("time", pair, time[0], True, BETWEEN, time[1]))
