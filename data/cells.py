@@ -46,9 +46,10 @@ def make_items_and_queries(
     the quotas ask for; see `RESERVE`."""
     cells = _cells(cfg)
     paths = {name: _part(folder, cfg, scene_ids, name, quota) for name, quota in cells.items()}
+    # The largest cells first, or the last of them would keep a single worker busy at the end.
     jobs = {
         name: partial(_make_cell, cfg, folder, scene_ids, name, quota, paths[name])
-        for name, quota in cells.items()
+        for name, quota in sorted(cells.items(), key=lambda cell: -cell[1].train)
         if not paths[name].exists()
     }
     done = len(cells) - len(jobs)

@@ -71,16 +71,16 @@ class ObjectFacts:
     """One object at the cut and at the target.
 
     `sight` and `target_sight` are "shown", "hidden" (in view but covered) or "out of view";
-    `speed` is "stationary" or a speed word; `heading` and `travel` are compass words of the motion
-    at the cut and from cut to target, None where there is none to speak of or, at a contact, none
-    to see yet; `extent` says how far
-    it goes from cut to target.
+    `speed` is "stationary" or a speed word, None where the object is out of view at the cut, for
+    nobody sees how it moves; `heading` and `travel` are compass words of the motion at the cut and
+    from cut to target, None where there is none to speak of or, at a contact, none to see yet;
+    `extent` says how far it goes from cut to target, "unseen" where it is out of view at both.
     """
 
     object: str
     region: str
     sight: str
-    speed: str
+    speed: str | None
     heading: str | None
     target_region: str
     target_sight: str
@@ -144,13 +144,16 @@ class CandidateFacts:
 class Facts:
     """A scene at the cut and at the target: `instant` and `moment` name the two in words.
 
-    `courses` are pairs on a collision course at the cut, `contacts` pairs that collide between
-    cut and target, whether or not they were on a course.
+    `entering` and `leaving` are the objects that come into view and go out of it from cut to
+    target. `courses` are pairs on a collision course at the cut, `contacts` pairs that collide
+    between cut and target, whether or not they were on a course.
     """
 
     instant: str
     moment: str
     objects: tuple[ObjectFacts, ...]
+    entering: tuple[str, ...]
+    leaving: tuple[str, ...]
     courses: tuple[Meeting, ...]
     contacts: tuple[Meeting, ...]
     close: tuple[Closeness, ...]
@@ -187,11 +190,14 @@ def facts_of(
     if cut is None:
         return None
     names = [o.phrase for o in scene.objects]
+    objects = tuple(_object_facts(scene, i, cut, target) for i in range(len(names)))
     contacts = [c for c in scene.collisions if cut < c.frame <= target]
     return Facts(
         instant="at the end of the observation" if cut == stop else "just before the contact",
         moment=moment,
-        objects=tuple(_object_facts(scene, i, cut, target) for i in range(len(names))),
+        objects=objects,
+        entering=tuple(o.object for o in objects if o.enters),
+        leaving=tuple(o.object for o in objects if o.leaves),
         courses=tuple(
             Meeting((names[i], names[j]), _outcome(scene, i, j, cut))
             for i, j in courses(scene, cut)
@@ -295,24 +301,35 @@ def _sight(scene: Scene, frame: int, index: int) -> str:
 
 def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFacts:
     pixels = scene.image_positions[:, index] * VIEW / np.asarray(scene.image_size)
-    speed = float(np.linalg.norm(scene.velocities[cut, index]))
-    moving = speed >= STATIONARY
-    word = next((word for bound, word in SPEEDS if speed < bound), VERY_FAST)
+    sight, target_sight = _sight(scene, cut, index), _sight(scene, target, index)
+    speed = _speed(scene, index, cut) if sight != OUT else None
+    moving = speed not in (None, "stationary")
     travelled = pixels[target] - pixels[cut]
-    distance = float(np.hypot(*travelled))
-    extent = (
-        "stays" if distance < STAYS else "shifts slightly" if distance < SHIFTS else "moves across"
-    )
+    extent = _extent(travelled) if {sight, target_sight} != {OUT} else "unseen"
     return ObjectFacts(
         object=scene.objects[index].phrase,
         region=region_of(scene, cut, index),
-        sight=_sight(scene, cut, index),
-        speed=word if moving else "stationary",
+        sight=sight,
+        speed=speed,
         heading=compass(pixels[cut] - pixels[free_since(scene, index, cut)]) if moving else None,
         target_region=region_of(scene, target, index),
-        target_sight=_sight(scene, target, index),
+        target_sight=target_sight,
         extent=extent,
-        travel=None if extent == "stays" else compass(travelled),
+        travel=None if extent in ("stays", "unseen") else compass(travelled),
+    )
+
+
+def _speed(scene: Scene, index: int, frame: int) -> str:
+    speed = float(np.linalg.norm(scene.velocities[frame, index]))
+    if speed < STATIONARY:
+        return "stationary"
+    return next((word for bound, word in SPEEDS if speed < bound), VERY_FAST)
+
+
+def _extent(travelled: np.ndarray) -> str:
+    distance = float(np.hypot(*travelled))
+    return (
+        "stays" if distance < STAYS else "shifts slightly" if distance < SHIFTS else "moves across"
     )
 
 

@@ -21,7 +21,7 @@ from teacher.predicates import (
     facts_of,
 )
 
-NARRATOR_VERSION = "3"
+NARRATOR_VERSION = "4"
 ENOUGH = 110
 """Words under which a rationale is told in full: well above the 80 that it needs (paper, Rationale
 construction)."""
@@ -57,7 +57,7 @@ def _pair(objects: tuple[str, str]) -> str:
 
 def _rank(facts: Facts, o: ObjectFacts) -> tuple[bool, bool, bool]:
     met = any(o.object in m.objects for m in (*facts.courses, *facts.contacts))
-    return (not met, o.extent == "stays", o.speed == "stationary")
+    return (not met, o.extent == "stays", o.speed in (None, "stationary"))
 
 
 class _Voice:
@@ -131,7 +131,8 @@ class _Voice:
         for contact in facts.contacts[: self.pairs]:
             if frozenset(contact.objects) not in on_course:
                 told.append(f"{_pair(contact.objects)} will also meet")
-        movers = [o for o in ranked if o.extent != "stays" or o.enters or o.leaves]
+        still = ("stays", "unseen")
+        movers = [o for o in ranked if o.extent not in still or o.enters or o.leaves]
         struck = {name for m in facts.contacts for name in m.objects}
         told += [self.travel(o, o.object in struck) for o in movers[: self.analysed]]
         if not movers:
@@ -166,8 +167,8 @@ class _Voice:
         if o.enters:
             return f"the {o.object} enters the view {o.target_region}"
         way = f" toward the {o.travel}" if o.travel else ""
-        if o.speed == "stationary":
-            cause = "once struck, " if struck else ""
+        if o.speed in (None, "stationary"):
+            cause = "once struck, " if struck and o.speed else ""
         else:
             cause = self.pick("", f"moving {o.speed}, ", "given its speed, ")
         return f"{cause}the {o.object} {o.extent}{way}"

@@ -12,6 +12,7 @@ from conf.schema.benchmark import (
     SelectionConfig,
 )
 from conf.schema.commands import (
+    ENGINES,
     BuildCommand,
     CommandConfig,
     ContrastiveCommand,
@@ -29,6 +30,7 @@ from conf.schema.teacher import TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainConfig
 
 __all__ = [
+    "ENGINES",
     "ArchitectureConfig",
     "BenchmarkConfig",
     "BuildCommand",

@@ -140,9 +140,11 @@ def counterfactual_database(
     cfg: BenchmarkConfig, queries: list[RetrievalQuery], album: Album
 ) -> list[FrameRef]:
     """The source of the counterfactual queries: their targets, then their hard negatives, of each
-    query first what happened instead, then other frames of the scenes without the object."""
+    query first what happened instead, then other frames of the scenes without the object. The test
+    queries' come before the training queries', for those alone are ranked among them."""
     wanted = cfg.retrieval.counterfactual_source
-    for of_rank in zip(*(q.hard_negatives for q in queries), strict=True):
+    ranked = sorted(queries, key=lambda q: q.split != "test")
+    for of_rank in zip(*(q.hard_negatives for q in ranked), strict=True):
         for frame in of_rank:
             if len(album.frames) < wanted:
                 album.add(frame)

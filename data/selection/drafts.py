@@ -18,7 +18,7 @@ from conf.schema import Quota
 from data.geometry import displacement_across, displacements, on_screen
 from data.records import SPLITS, Candidate, FrameRef, Scene, SelectionItem
 
-BUILDERS_VERSION = "4"
+BUILDERS_VERSION = "5"
 """Of the items' and queries' builders: changes whenever the same scenes would give others."""
 
 

@@ -300,9 +300,17 @@ def test_the_standard_test_is_of_test_scenes_alone(benchmark_store) -> None:
 
 
 def test_the_counterfactual_database_shows_what_happened_instead(benchmark_store) -> None:
-    database = set(benchmark_store.database("counterfactual"))
-    for query in benchmark_store.retrieval(pool="counterfactual"):
-        assert query.hard_negatives[0] in database
+    database = benchmark_store.database("counterfactual")
+    album = Album(benchmark_store.scene)
+    assert all(album.add(frame) for frame in database)
+    queries = benchmark_store.retrieval(pool="counterfactual")
+    test = [q.hard_negatives[0] for q in queries if q.split == "test"]
+    train = [q.hard_negatives[0] for q in queries if q.split == "train"]
+    assert test
+    assert not any(album.add(frame) for frame in test)
+    if any(album.add(frame) for frame in train):
+        others = set(database) - {q.target for q in queries}
+        assert others <= {*test, *train}, "there was room for what happened instead"
 
 
 def test_twins_are_those_that_do_not_move(benchmark_store) -> None:

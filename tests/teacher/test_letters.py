@@ -1,0 +1,70 @@
+"""Letters of candidates: which they are, and rationales for another order."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from conf.schema import TeacherConfig
+from teacher.letters import letters, relabel, reorder
+from teacher.predicates import predicates_of
+from teacher.template import narrate
+from teacher.validate import validate
+
+ORDERS = list(permutations(range(4)))
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("Candidate A agrees. A collision follows.", "A"),
+        ("A shows the cube near the top. A red cube rests.", "A"),
+        ("Outcome: A slowly moving sphere leaves.", ""),
+        ("A wrongly puts the cube near the left; A and C differ.", "AAC"),
+        ("Unlike B, A keeps the layout of A's neighbour D.", "BAAD"),
+        ("Answer: A", "A"),
+        ("A, B, and D show other objects.\nA glossy metal cube is missing from (C).", "ABDC"),
+        ("Of candidates A and D, A alone agrees.\n\nAnswer: D", "ADAD"),
+        ("A is right. A pair meets. A mass of objects. A can be ruled out.", "AA"),
+        ("A bounces less than B; A has it near the top - A metal sphere has it not.", "ABA"),
+    ],
+)
+def test_letters_are_told_from_the_article(text, named):
+    assert "".join(text[start:stop] for start, stop in letters(text)) == named
+
+
+def test_the_same_order_changes_nothing_and_orders_compose():
+    text = "Candidate A lacks the cube. B and C differ. A contact follows. Answer: D"
+    assert relabel(text, range(4)) == text
+    for first in ORDERS:
+        back = [first.index(k) for k in range(4)]
+        assert relabel(relabel(text, first), back) == text
+        for second in ORDERS[::5]:
+            both = [first[k] for k in second]
+            assert relabel(relabel(text, first), second) == relabel(text, both)
+
+
+def test_no_order_is_refused():
+    with pytest.raises(ValueError, match=r"\[0, 1, 1, 3\] is no order"):
+        relabel("Answer: A", [0, 1, 1, 3])
+
+
+def test_a_relabelled_rationale_is_as_right_for_the_reordered_item(micro_store):
+    """It is what the validator, with predicates of the other order, finds nothing wrong with."""
+    cfg, rng, told = TeacherConfig(name="template"), np.random.default_rng(0), 0
+    for item in micro_store.selection():
+        scene = micro_store.scene(item.scene_id)
+        predicates = predicates_of(item, scene, micro_store.scene)
+        if predicates is None:
+            continue
+        text = narrate(predicates, item, seed=0)
+        assert validate(text, predicates, item, cfg).accepted
+        order = rng.permutation(4).tolist()
+        other = reorder(item, order)
+        assert [other.candidates[k] for k in range(4)] == [item.candidates[k] for k in order]
+        facts = predicates_of(other, scene, micro_store.scene)
+        verdict = validate(relabel(text, order), facts, other, cfg)
+        assert verdict.accepted, verdict.reasons
+        assert verdict.answer == other.letter
+        told += other.letter != item.letter
+    assert told > 20
