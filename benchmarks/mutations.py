@@ -56,6 +56,8 @@ def predicates_from(record: dict[str, Any]) -> Predicates:
         record["instant"],
         record["moment"],
         tuple(ObjectFacts(**o) for o in record["objects"]),
+        tuple(record["entering"]),
+        tuple(record["leaving"]),
         pairs("courses", Meeting),
         pairs("contacts", Meeting),
         pairs("close", Closeness),
@@ -114,6 +116,8 @@ def directions(p: Predicates, rng: Random) -> list[Mutation]:
 def speeds(p: Predicates, rng: Random) -> list[Mutation]:
     found = []
     for i, o in enumerate(p.objects):
+        if o.speed is None:
+            continue
         speed = _other(rng, ALL_SPEEDS, o.speed)
         word = STILL if speed == "stationary" else rf"[mM]ov(?:ing|es) {speed}\b"
         found.append(Mutation(_with_object(p, i, speed=speed), (o.object, word)))

@@ -130,21 +130,19 @@ def _direction(o: ObjectFacts, value: str, when: str) -> bool | None:
 
 
 def _speed(o: ObjectFacts, value: str, when: str) -> bool | None:
-    return value == o.speed
+    return None if o.speed is None else value == o.speed
 
 
 def _still(o: ObjectFacts, value: str, when: str) -> bool | None:
-    if when == CUT:
-        return o.speed == "stationary"
-    if when == BETWEEN:
-        return o.extent == "stays" or (None if o.extent == "shifts slightly" and value else False)
-    return o.speed == "stationary" or o.extent == "stays"
+    resting = None if o.speed is None else o.speed == "stationary"
+    staying = None if o.extent == "unseen" else o.extent == "stays"
+    return resting if when == CUT else staying if when == BETWEEN else _either(resting, staying)
 
 
 def _extent(o: ObjectFacts, value: str, when: str) -> bool | None:
-    if value.startswith(COARSE):
-        return True if o.extent == "stays" else None if o.extent == "shifts slightly" else False
-    return o.extent == value
+    if o.extent == "unseen" or (value == COARSE and o.extent == "shifts slightly"):
+        return None
+    return o.extent == (value if value != COARSE else "stays")
 
 
 def _sight(o: ObjectFacts, value: str, when: str) -> bool | None:
