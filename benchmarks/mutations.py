@@ -26,7 +26,7 @@ from teacher.predicates import (
 ALL_REGIONS = [region for row in REGIONS for region in row]
 ALL_SPEEDS = ["stationary", *(word for _, word in SPEEDS), VERY_FAST]
 STILL = r"stationary|\brests\b|does not move"
-PAIRED = r"collision course|ontact|meet|very close"
+PAIRED = {"courses": "collision course", "contacts": "ontact|meet", "close": "very close"}
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def pairs(p: Predicates, rng: Random) -> list[Mutation]:
                 partner = rng.choice(free)
                 new = replace(fact, objects=(kept, partner))
                 flipped = replace(p, **{field: (*facts[:k], new, *facts[k + 1 :])})
-                found.append(Mutation(flipped, (kept, partner, PAIRED)))
+                found.append(Mutation(flipped, (kept, partner, PAIRED[field])))
     if p.courses:
         found.append(Mutation(replace(p, courses=()), ("No pair",)))
     return found

@@ -10,6 +10,8 @@ COMPARED = {"of", "as", "like", "with", "what", "to", "does", "same"}
 """Words before a candidate that another is only compared with."""
 ASIDE = {"unlike", "like", "than", "besides", "beyond", "except"}
 """Words before a candidate that is not the one spoken of, wherever it stands."""
+TELLING = {"lack", "gone", "show", "stays", "misplace", "adds"}
+"""Tags after which an object is what the candidate shows or lacks."""
 PARTED = ("in", "from", "by", "for")
 """Words before a candidate that the clause so far has been about."""
 
@@ -30,6 +32,7 @@ class CandidateReader(Reader):
             self.letters = ()
         self.found: list[Claim] = []
         self.objects: Names = []
+        self.kept: Names = []
         self.clause = 0
         self.lacking = self.adding = self.moving = self.skipped = self.passing = False
         self.choice: Tag | None = None
@@ -108,7 +111,7 @@ class CandidateReader(Reader):
                 ]
         else:
             self.letters, self.choice = letters, tag
-            self.objects = []
+            self.kept, self.objects = self.objects, []
             self.lacking = self.adding = self.moving = self.doubted = False
             self.expected = self.contrasted = self.negated = False
             self.clause = len(self.found)
@@ -140,7 +143,7 @@ class CandidateReader(Reader):
             self.group()
             self.objects = []
             return
-        start, told = self.at, self.near(-1).tag in ("lack", "show", "stays", "misplace", "adds")
+        start, told = self.at, self.near(-1).tag in TELLING
         names, last = self.group()
         if told and len(names) > 1 and self.near(1).tag in ("be", "stays", "moves", "gone"):
             # "A lacks the X, and the Y is ...": the Y begins a clause of its own.
@@ -159,13 +162,18 @@ class CandidateReader(Reader):
             self._tell("displaced", "", True, last)
         self.lacking = self.adding = self.moving = self.negated = False
 
+    def on_pronoun(self, tag: Tag) -> None:
+        if tag.value == "it" and not self.objects and len(self.kept) == 1:
+            # "In A the X is near the top, and in B it is near the left."
+            self.objects = self.kept
+
     def on_rest_of(self, tag: Tag) -> None:
         self.objects, self.lacking = [], False
 
     on_all = on_rest_of
 
     def on_none(self, tag: Tag) -> None:
-        self.objects, self.lacking = [], False
+        self.objects, self.lacking, self.negated = [], False, True
         self.refused = self.near(1).tag == "by" and self.near(2).tag == "candidate"
         if self.found and self.found[-1].kind == "agrees":
             # "It differs in nothing."
@@ -266,7 +274,7 @@ class CandidateReader(Reader):
 
     def on_differ(self, tag: Tag) -> None:
         self.doubted = True
-        if not self.objects and not self.negated:
+        if not self.objects and not self.negated and not self.lacking:
             self._whole("agrees", False, tag)
 
     def _partial(self) -> bool:

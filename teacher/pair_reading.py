@@ -32,6 +32,7 @@ class PairReader(Reader):
         """`moment`: what the section's present tense speaks of."""
         super().__init__(text, ground)
         self.moment = moment
+        self.still_when = CUT if moment == CUT else EITHER
         self.subjects: Names = []
         self.negated = self.maybe = self.future = False
 

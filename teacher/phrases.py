@@ -210,6 +210,7 @@ _TABLE: dict[tuple[str, str], str] = {
         "predicted; conforms; coincides; satisfies; satisfy"
     ),
     ("differ", ""): (
+        "error; errors; mistake; mistakes; fault; faults; flaw; flaws; "
         "differs; differ; disagrees; disagree; wrong; wrongly; incorrect; incorrectly; conflicts; "
         "conflict; contradicts; contradict; fails; fail; ruled out; rejected; eliminated; "
         "excluded; inconsistent; mismatch; mismatches; deviates; deviate; mistakenly; is off; "
@@ -217,6 +218,7 @@ _TABLE: dict[tuple[str, str], str] = {
         "rules it out; mismatched; rule out; rules out; goes against; erroneously; falsely; errs"
     ),
     ("lack", ""): (
+        "free of; "
         "lacks; lack; lacking; omits; omit; omitting; does not show; do not show; fails to show; "
         "fail to show; leaves out; leave out; does not include; do not include; does not contain; "
         "do not contain; does not have; do not have; without; no sign of; has no; have no; shows "

@@ -150,11 +150,16 @@ class Reader:
         )
         if noun.still and fitting[0] in self.ground.objects:
             self.claims.append(
-                Claim("still", (fitting[0],), "", True, EITHER, None, (tag.start, tag.stop))
+                Claim(
+                    "still", (fitting[0],), "", True, self.still_when, None, (tag.start, tag.stop)
+                )
             )
         return [fitting[0]]
 
     shows_extras = False
+    """Whether what only a candidate shows may be named."""
+    still_when = EITHER
+    """When "the stationary A" is said to be stationary."""
 
 
 def _fits(noun: Noun, name: str) -> bool:

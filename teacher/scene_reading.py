@@ -44,6 +44,7 @@ class SceneReader(PairReader):
         self.crossed = self.moved = self.absolute = False
         self.last: Names = []
         """Whom "which" stands for."""
+        self.hypothetical = False
         self._boundary()
 
     def end(self) -> None:
@@ -54,7 +55,8 @@ class SceneReader(PairReader):
             self.claims = [c for c in self.claims if c.kind != "meeting"]
 
     def _boundary(self) -> None:
-        self.negated = self.maybe = self.staying = self.future = self.past = self.slight = False
+        self.negated = self.staying = self.future = self.past = self.slight = False
+        self.maybe = self.hypothetical
         self.crossed = True
 
     # Boundaries.
@@ -99,6 +101,7 @@ class SceneReader(PairReader):
 
     def on_maybe(self, tag: Tag) -> None:
         self.maybe = True
+        self.hypothetical |= "if" in self.word(tag).split()
 
     def on_future(self, tag: Tag) -> None:
         self.future = True
@@ -160,11 +163,20 @@ class SceneReader(PairReader):
         if relation and not relation.subjects:
             relation.subjects = self.subjects
         # "Near the top, the A and the B are close" places the pair, not its objects.
-        together = any(t.tag == "close" for t in self.sentence)
+        self._settle(places=not self._is_pair_ahead())
+
+    def _settle(self, places: bool) -> None:
+        """Tell of the subject what was said before it was named."""
         for pending in self.pending:
-            if pending[0] != "region" or not together:
+            if places or pending[0] != "region":
                 self._tell(*pending, subjects=self.subjects)
         self.pending = []
+
+    def _is_pair_ahead(self) -> bool:
+        step = 1
+        while self.near(step).tag not in ("comma", "semicolon", "break", "stop", "close"):
+            step += 1
+        return self.near(step).tag == "close"
 
     def _parted(self) -> bool:
         return self.near(1).tag == "comma" and self.near(2).tag == "and"
@@ -177,7 +189,8 @@ class SceneReader(PairReader):
 
     def _complement(self) -> None:
         start = self.at
-        names, _ = self.group()
+        # "Meets the A, and the B ...": the B begins a clause.
+        names, _ = self.group(1 if self._parted() else MOST)
         if len(names) > 1 and self.near(1).tag in VERBS | {"not", "word", "show", "speed"}:
             # "meets the A and the B stays": the B is a subject of its own.
             self.at = start
@@ -208,10 +221,7 @@ class SceneReader(PairReader):
         self.subjects = self._antecedent(str(tag.value))
         self.group_start = 0
         self.finite = self.blocked = self.nobody = False
-        for pending in self.pending:
-            if pending[0] != "region":
-                self._tell(*pending, subjects=self.subjects)
-        self.pending = []
+        self._settle(places=False)
 
     def _antecedent(self, pronoun: str) -> Names:
         """Whom a pronoun stands for where that is safe to say, else None."""
@@ -262,6 +272,9 @@ class SceneReader(PairReader):
                 self.close_region(relation, tag)
             return
         if self.negated and self.near(-1).tag not in ("not", "be", "future"):
+            return
+        if any(self.near(-k).tag == "leaves" and self._is_bare(self.near(-k)) for k in (1, 2, 3)):
+            # "Leaves the area near the top."
             return
         ahead = self.near(1).tag
         if self.near(-1).tag in ("semicolon", "break") and ahead in ("pronoun", "object"):
@@ -358,17 +371,16 @@ class SceneReader(PairReader):
 
     def on_leaves(self, tag: Tag) -> None:
         self.verb()
-        bare = len(self.word(tag).split()) == 1
-        if not bare or self.near(1).tag in BOUNDARIES:
+        if not self._is_bare(tag) or self.near(1).tag in BOUNDARIES:
             self._tell("leaves", "", not self.negated, BETWEEN, tag)
-        else:
-            # "Leaves the area near the top."
-            self.maybe = True
+
+    def _is_bare(self, tag: Tag) -> bool:
+        """Whether "leaves" or its like stands without what is left."""
+        return " " not in self.word(tag)
 
     def on_enters(self, tag: Tag) -> None:
         self.verb()
-        bare = len(self.word(tag).split()) == 1
-        if not bare or self.near(1).tag in (*BOUNDARIES, "region"):
+        if not self._is_bare(tag) or self.near(1).tag in (*BOUNDARIES, "region"):
             self._tell("enters", "", not self.negated, BETWEEN, tag)
 
     def on_out(self, tag: Tag) -> None:
@@ -381,6 +393,13 @@ class SceneReader(PairReader):
         if self.word(tag).startswith("cannot"):
             self.verb()
         self._sight("unseen", tag)
+
+    def on_gone(self, tag: Tag) -> None:
+        words = self.word(tag).split()
+        if words[0] in ("is", "are", "cannot"):
+            self.verb()
+        if words[-1] in ("view", "visible", "seen", "shown"):
+            self._sight("unseen", tag)
 
     def _sight(self, value: str, tag: Tag) -> None:
         when = TARGET if self.future else self.moment
