@@ -65,7 +65,10 @@ class CandidateReader(Reader):
     # Boundaries and words that steer.
 
     def on_comma(self, tag: Tag) -> None:
+        # "Unlike A, where it is near the left, ..." goes on about A.
+        aside = self.skipped and self.near(1).tag in ("word", "which", "put", "ignore")
         self._boundary()
+        self.skipped = aside
 
     def on_semicolon(self, tag: Tag) -> None:
         self._boundary()
@@ -225,6 +228,8 @@ class CandidateReader(Reader):
     def on_passed(self, tag: Tag) -> None:
         if self.word(tag).startswith("miss"):
             self.on_lack(tag)
+        elif self.word(tag).startswith("avoid"):
+            self.negated = True
 
     def on_gone(self, tag: Tag) -> None:
         if self.near(1).tag == "object":
@@ -268,7 +273,7 @@ class CandidateReader(Reader):
 
     def on_agree(self, tag: Tag) -> None:
         if not self.letters:
-            self.passing = not self.negated
+            self.passing = not self.negated and not (self.lasting and self.objects)
         elif not self.objects and not self._partial():
             self._whole("agrees", not (self.negated or self.refused), tag)
 

@@ -22,6 +22,8 @@ OPENING |= {"expected"}
 """Tags that may stand between a clause's beginning and a subject that comes late."""
 INVERTED = {"be", "still", "rest", "future", "expected", "word"}
 """Tags of a verb before its subject: "near the top is the A"."""
+DENYING = {"not", "be", "moves", "moving", "contrast"}
+"""Tags between which and a negation a direction is denied: "does not move east"."""
 TAKERS = {"by", "close", "meet", "passed", "contact", "between", "course", "show"}
 """Tags before a noun phrase that is no subject."""
 
@@ -67,6 +69,8 @@ class SceneReader(PairReader):
             self._boundary()
             self.finite |= self.absolute
             self.absolute = False
+            if self.near(1).tag == "region" and self.near(2).tag == "object":
+                self._open()
 
     def on_semicolon(self, tag: Tag) -> None:
         self.flush()
@@ -98,6 +102,8 @@ class SceneReader(PairReader):
 
     def on_not(self, tag: Tag) -> None:
         self.negated = True
+
+    on_contrast = on_not
 
     def on_maybe(self, tag: Tag) -> None:
         self.maybe = True
@@ -271,7 +277,7 @@ class SceneReader(PairReader):
             if relation.kind == "close":
                 self.close_region(relation, tag)
             return
-        if self.negated and self.near(-1).tag not in ("not", "be", "future"):
+        if self.negated and self.near(-1).tag not in ("not", "be", "future", "contrast"):
             return
         if any(self.near(-k).tag == "leaves" and self._is_bare(self.near(-k)) for k in (1, 2, 3)):
             # "Leaves the area near the top."
@@ -305,7 +311,7 @@ class SceneReader(PairReader):
             return
         if self.relation:
             return
-        if self.negated and self.near(-1).tag not in ("not", "be", "moves", "moving"):
+        if self.negated and self.near(-1).tag not in DENYING:
             return
         when = self.moment
         if when != CUT:
