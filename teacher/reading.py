@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+
 from teacher.grounding import CUT, EITHER, Claim, Ground
 from teacher.tagging import Noun, Tag
 
@@ -32,9 +35,9 @@ class Reader:
         self.begin()
         while self.at < len(sentence):
             tag = sentence[self.at]
-            handler = getattr(self, f"on_{tag.tag.replace(' ', '_')}", None)
+            handler = _handler(type(self), tag.tag)
             if handler:
-                handler(tag)
+                handler(self, tag)
             self.at += 1
         self.end()
         return self.distributed(self.claims)
@@ -160,6 +163,11 @@ class Reader:
     """Whether what only a candidate shows may be named."""
     still_when = EITHER
     """When "the stationary A" is said to be stationary."""
+
+
+@cache
+def _handler(reader: type[Reader], tag: str) -> Callable[[Reader, Tag], None] | None:
+    return getattr(reader, f"on_{tag.replace(' ', '_')}", None)
 
 
 def _fits(noun: Noun, name: str) -> bool:
