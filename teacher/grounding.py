@@ -13,6 +13,9 @@ CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
 words leave it open, the cut or the target."""
 
 
+VERDICTS = ("supported", "contradicted", "unknown")
+
+
 class Claim(NamedTuple):
     """What a piece of a rationale says, and the predicates' verdict on it.
 

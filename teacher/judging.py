@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
+from teacher.grounding import VERDICTS, Claim
 from teacher.predicates import Predicates
 from teacher.prompts import PROMPT_VERSION
 from teacher.replies import Reply
@@ -36,12 +38,13 @@ class Judge:
     def judge(
         self, reply: Reply, predicates: Predicates, item: SelectionItem, attempt: int
     ) -> Rationale:
-        reasons, sections, answer = (reply.flaw,), {}, None
+        reasons, sections, answer, claims = (reply.flaw,), {}, None, ()
         if len(reply.text) > LONGEST:
             reasons = ("too long",)
         elif reply.flaw is None:
             verdict = validate(reply.text, predicates, item, self.cfg)
             reasons, sections, answer = verdict.reasons, verdict.sections, verdict.answer
+            claims = verdict.claims
         return Rationale(
             item_id=item.item_id,
             attempt=attempt,
@@ -59,6 +62,7 @@ class Judge:
             completion_tokens=reply.completion_tokens,
             grammar=self.grammar,
             finished=reply.finished,
+            claims=tally(claims),
         )
 
     def _settings(self) -> str:
@@ -69,6 +73,14 @@ class Judge:
         if self.grammar is not None:
             shaping.append(self.grammar)
         return hashlib.sha256(json.dumps(shaping).encode()).hexdigest()[:8]
+
+
+def tally(claims: Iterable[Claim]) -> dict[str, list[int]]:
+    """How many claims are supported, contradicted and unknown, by kind."""
+    counts: dict[str, list[int]] = {}
+    for claim in claims:
+        counts.setdefault(claim.kind, [0] * len(VERDICTS))[VERDICTS.index(claim.verdict)] += 1
+    return dict(sorted(counts.items()))
 
 
 def signature(r: Rationale) -> Signature:

@@ -10,11 +10,13 @@ from conf.schema import TeacherConfig
 from data.records import LETTERS, SelectionItem
 from teacher.claims import find_claims
 from teacher.grounding import Claim
+from teacher.letters import letters
 from teacher.numbers import find_numbers
 from teacher.predicates import Predicates
 from teacher.sections import SECTIONS, opening, parts
 
 VALIDATOR_VERSION = "3"
+SMALL_LETTER = re.compile(r"\b[Cc]andidates? [a-d]\b")
 WORD = re.compile(r"[^\W_]+(?:['’-][^\W_]+)*")
 
 
@@ -41,16 +43,21 @@ def validate(text: str, predicates: Predicates, item: SelectionItem, cfg: Teache
         reasons.append("too long")
     sections, answer, problems = _parse(text)
     reasons += problems
-    analysis = sections.get("Candidate analysis", "")
-    for candidate in predicates.candidates:
-        # In a sentence about candidates, for "A" is also an article.
-        if analysis and not re.search(rf"[Cc]andidates?\b[^.]*\b{candidate.letter}\b", analysis):
-            reasons.append(f"candidate not analysed: {candidate.letter}")
+    reasons += _not_analysed(sections.get("Candidate analysis", ""))
     if answer is not None and answer != item.letter:
         reasons.append(f"wrong answer: {answer}")
     claims = find_claims(text, predicates)
     reasons += dict.fromkeys(f"contradicts: {c}" for c in claims if c.verdict == "contradicted")
     return Verdict(not reasons, tuple(reasons), sections, answer, claims)
+
+
+def _not_analysed(analysis: str) -> list[str]:
+    if not analysis:
+        return []
+    named = {analysis[start:stop] for start, stop in letters(analysis)}
+    reasons = [f"candidate not analysed: {letter}" for letter in LETTERS if letter not in named]
+    # For another order such a letter could not be told from an article, and would stay.
+    return reasons + [f"small letter: {m[0]}" for m in SMALL_LETTER.finditer(analysis)]
 
 
 def word_count(text: str) -> int:
