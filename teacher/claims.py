@@ -6,12 +6,12 @@ contradicted only where the predicates say otherwise in any reading.
 
 from __future__ import annotations
 
-from teacher.candidate_reading import CandidateReader
-from teacher.grounding import CUT, EITHER, TARGET, Claim, Ground
 from teacher.predicates import Predicates
-from teacher.scene_reading import SceneReader
+from teacher.reading.candidates import CandidateReader
+from teacher.reading.grounding import CUT, EITHER, TARGET, Claim, Ground
+from teacher.reading.scenes import SceneReader
+from teacher.reading.tagging import Tag, tags
 from teacher.sections import parts
-from teacher.tagging import Tag, tags
 
 MOMENTS = {
     "Scene parse": CUT,

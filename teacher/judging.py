@@ -8,9 +8,9 @@ from collections.abc import Iterable
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
-from teacher.grounding import VERDICTS, Claim
 from teacher.predicates import Predicates
 from teacher.prompts import PROMPT_VERSION
+from teacher.reading.grounding import VERDICTS, Claim
 from teacher.replies import Reply
 from teacher.template import NARRATOR_VERSION
 from teacher.validate import VALIDATOR_VERSION, validate

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from conf.schema import TeacherConfig
 from data.records import LETTERS, SelectionItem
 from teacher.claims import find_claims
-from teacher.grounding import Claim
 from teacher.letters import letters
 from teacher.numbers import find_numbers
 from teacher.predicates import Predicates
+from teacher.reading.grounding import Claim
 from teacher.sections import SECTIONS, opening, parts
 
 VALIDATOR_VERSION = "3"

@@ -15,7 +15,6 @@ from benchmarks.paraphrases import paraphrase
 from benchmarks.prose import EDITS
 from conf.schema import TeacherConfig
 from teacher.claims import find_claims
-from teacher.phrases import PHRASES
 from teacher.predicates import (
     OUT,
     CandidateFacts,
@@ -26,6 +25,7 @@ from teacher.predicates import (
     Predicates,
     predicates_of,
 )
+from teacher.reading.phrases import PHRASES
 from teacher.sections import SECTIONS
 from teacher.template import narrate
 from teacher.validate import validate

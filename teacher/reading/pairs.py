@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from teacher.grounding import BETWEEN, CUT, EITHER, TARGET, Ground
-from teacher.reading import BOUNDARIES, END, Names, Reader
-from teacher.tagging import Tag
+from teacher.reading.grounding import BETWEEN, CUT, EITHER, TARGET, Ground
+from teacher.reading.reader import BOUNDARIES, END, Names, Reader
+from teacher.reading.tagging import Tag
 
 RELATIONS = {"course", "meet", "contact", "passed", "close"}
 

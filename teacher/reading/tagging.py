@@ -6,8 +6,8 @@ import re
 from typing import NamedTuple
 
 from data.records import LETTERS
-from teacher import phrases
 from teacher.predicates import REGIONS
+from teacher.reading import phrases
 
 WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)?|[.,;:!?()—–]")
 ARTICLES = {"the", "a", "an", "its", "their", "that", "this", "some", "any", "another", "such"}

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-from teacher.grounding import CUT, EITHER, Claim, Ground
-from teacher.tagging import Noun, Tag
+from teacher.reading.grounding import CUT, EITHER, Claim, Ground
+from teacher.reading.tagging import Noun, Tag
 
 BOUNDARIES = {"comma", "semicolon", "and", "break", "stop"}
 END = Tag("stop", "", 0, 0)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from teacher.phrases import COARSE
 from teacher.predicates import COMPASS, OUT, Difference, ObjectFacts, Predicates
+from teacher.reading.phrases import COARSE
 
 CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
 """What a claim is about: the cut, the way from there to the target, the target, or, where the

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from teacher.grounding import TARGET, Claim, Ground
-from teacher.reading import Names, Reader
-from teacher.tagging import Tag
+from teacher.reading.grounding import TARGET, Claim, Ground
+from teacher.reading.reader import Names, Reader
+from teacher.reading.tagging import Tag
 
 COMPARED = {"of", "as", "like", "with", "what", "to", "does", "same"}
 """Words before a candidate that another is only compared with."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from teacher.grounding import BETWEEN, CUT, EITHER, TARGET
-from teacher.pair_reading import RELATIONS, PairReader
-from teacher.phrases import COARSE
-from teacher.reading import BOUNDARIES, END, MOST, Names
-from teacher.tagging import Tag
+from teacher.reading.grounding import BETWEEN, CUT, EITHER, TARGET
+from teacher.reading.pairs import RELATIONS, PairReader
+from teacher.reading.phrases import COARSE
+from teacher.reading.reader import BOUNDARIES, END, MOST, Names
+from teacher.reading.tagging import Tag
 
 VERBS = {"be", "moves", "stays", "rest", "future", "across", "leaves", "enters", "still", "past"}
 """Tags of words that may be a clause's verb."""
