@@ -38,7 +38,7 @@ CONTEXTUAL = ("one", "once", "first", "minute", "frame", "pixel", "feet", "px")
 VAGUE = ("few", "several", "many", "multiple", "numerous", "countless", "handful", "lots")
 """The words of `lexicon.VAGUE` that a rationale can do without. The others are as often innocent;
 the plurals that they would count are barred instead."""
-OPENERS = ("ten", "cent", "sec", "nil")
+OPENERS = ("ten", "cent", "sec")
 """Number words that innocent ones begin with ("tends", "center", "section")."""
 TENS = (
     "twenties",
