@@ -2,7 +2,7 @@
 
     python -m benchmarks.grammar http://127.0.0.1:8000/v1 MODEL
 
-Asks for a rationale of each of 96 made scenes, 32 at a time, with the grammar and without, and
+Asks for a rationale of each of 64 made scenes, 32 at a time, with the grammar and without, and
 judges each answer's form: all that `validate` rejects but a wrong letter, for a model that has
 learnt nothing knows no right one. The request that compiles the grammar is timed by itself.
 """
@@ -25,8 +25,8 @@ from teacher.prompts import messages
 from teacher.validate import validate
 from tests.teacher import synthetic
 
-REQUESTS, IN_FLIGHT = 96, 32
-MAX_TOKENS = 1500
+REQUESTS, IN_FLIGHT = 64, 32
+MAX_TOKENS = 2500
 """Above `TeacherConfig.max_tokens`, for a random model spells its words in many tokens."""
 
 

@@ -27,6 +27,10 @@ STEM, WHOLE = "stem", "whole"
 SPELT = "(=[' ,;:.-])"
 """What follows letters. Without it the engine would try tens of thousands of tokens, such as
 " fooBar", at every step instead of once, when it compiles."""
+LONGEST = 16
+"""Letters at most behind the point where a word parts from every number word, so that a model that
+repeats itself comes to an end. Rules cost less here than a repeat count, which the engine follows
+at every step."""
 ANSWER_WORDS = word_count("Answer: A")
 
 CONTEXTUAL = ("one", "once", "first", "minute", "frame", "pixel", "feet", "px")
@@ -34,7 +38,7 @@ CONTEXTUAL = ("one", "once", "first", "minute", "frame", "pixel", "feet", "px")
 VAGUE = ("few", "several", "many", "multiple", "numerous", "countless", "handful", "lots")
 """The words of `lexicon.VAGUE` that a rationale can do without. The others are as often innocent;
 the plurals that they would count are barred instead."""
-OPENERS = ("ten", "cent", "sec", "nil")
+OPENERS = ("ten", "cent", "sec")
 """Number words that innocent ones begin with ("tends", "center", "section")."""
 TENS = (
     "twenties",
@@ -152,7 +156,8 @@ def _words() -> list[str]:
         r'stop::=spelt "." (=[ \n])',
         f'once::=" " [Oo] "nce " ({_either(AFTER_ONCE)}) [,;:]? (=[ ])',
         f"""spelt::=" " {letters} ("'" ({_either(ENDINGS)})?)? (=[ ,;:.])""",
-        f"any::=[a-z]* {SPELT}",
+        *(f'any{n}::=[a-z] any{n - 1}|"" {SPELT}' for n in range(LONGEST, 1, -1)),
+        f'any1::=[a-z]|"" {SPELT}',
         *(_rule(name, state, name == part) for state, name in states.items()),
     ]
 
@@ -182,7 +187,7 @@ def _state(node: Trie, states: dict[State, str]) -> str:
     for letter in ascii_lowercase:
         child = node.get(letter, {})
         if STEM not in child:
-            edges.append((letter, _state(child, states) if child else "any"))
+            edges.append((letter, _state(child, states) if child else f"any{LONGEST}"))
     return states.setdefault((WHOLE not in node, tuple(edges)), f"s{len(states)}")
 
 

@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from string import ascii_letters
@@ -12,7 +13,7 @@ import pytest
 from conf.errors import UserError
 from conf.schema import TeacherConfig
 from teacher import lexicon
-from teacher.grammar import grammar
+from teacher.grammar import OPENERS, grammar
 from teacher.predicates import predicates_of
 from teacher.template import narrate
 from teacher.validate import validate, word_count
@@ -22,14 +23,10 @@ ENGINE = Path(__file__).parents[2] / ".venv-vllm/bin/python"
 JUDGE = """
 import json, sys
 import numpy as np, xgrammar
-asked = json.load(sys.stdin)
-vocabulary = asked["pieces"] + ["<end>"]
-tokens = xgrammar.TokenizerInfo(vocabulary, stop_token_ids=[len(vocabulary) - 1])
-compiled = xgrammar.GrammarCompiler(tokens).compile_grammar(asked["grammar"])
-def accepts(text):
+def accepts(compiled, text):
     matcher = xgrammar.GrammarMatcher(compiled, terminate_without_stop_token=True)
     return matcher.accept_string(text) and matcher.is_terminated()
-def sample(seed):
+def sample(compiled, vocabulary, seed):
     rng, text = np.random.default_rng(seed), ""
     matcher = xgrammar.GrammarMatcher(compiled)
     mask = xgrammar.allocate_token_bitmask(1, len(vocabulary))
@@ -40,7 +37,14 @@ def sample(seed):
         assert matcher.accept_token(token)
         text += vocabulary[token] if token < len(vocabulary) - 1 else ""
     return text
-print(json.dumps([[accepts(t) for t in asked["texts"]], [sample(s) for s in asked["seeds"]]]))
+for line in sys.stdin:
+    asked = json.loads(line)
+    vocabulary = asked["pieces"] + ["<end>"]
+    tokens = xgrammar.TokenizerInfo(vocabulary, stop_token_ids=[len(vocabulary) - 1])
+    compiled = xgrammar.GrammarCompiler(tokens).compile_grammar(asked["grammar"])
+    accepted = [accepts(compiled, text) for text in asked["texts"]]
+    made = [sample(compiled, vocabulary, seed) for seed in asked["seeds"]]
+    print(json.dumps([accepted, made]), flush=True)
 """
 DEFAULT = TeacherConfig(name="test")
 NUMBERS = (*lexicon.CARDINALS, *lexicon.ORDINALS, *lexicon.QUANTITIES, *lexicon.TIMES)
@@ -55,19 +59,29 @@ PIECES = (
 )
 
 
-def ask(cfg: TeacherConfig, texts: list[str], samples: int = 0) -> tuple[list[bool], list[str]]:
-    """Whether the engine takes each text, and texts that it makes of random pieces."""
-    asked = {
-        "grammar": grammar(cfg),
-        "texts": texts,
-        "pieces": sorted(set(PIECES)),
-        "seeds": list(range(samples)),
-    }
-    command = [str(ENGINE), "-c", JUDGE]
-    run = subprocess.run(command, input=json.dumps(asked), capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-    accepted, made = json.loads(run.stdout)
-    return accepted, made
+Ask = Callable[..., tuple[list[bool], list[str]]]
+
+
+@pytest.fixture(scope="module")
+def ask() -> Iterator[Ask]:
+    """Asks the engine whether it takes each text, and for texts that it makes of random pieces."""
+    with subprocess.Popen(
+        [str(ENGINE), "-c", JUDGE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as engine:
+
+        def ask(cfg: TeacherConfig, texts: list[str], samples: int = 0):
+            asked = {
+                "grammar": grammar(cfg),
+                "texts": texts,
+                "pieces": sorted(set(PIECES)),
+                "seeds": list(range(samples)),
+            }
+            engine.stdin.write(json.dumps(asked) + "\n")
+            engine.stdin.flush()
+            return json.loads(engine.stdout.readline())
+
+        yield ask
+        engine.stdin.close()
 
 
 @cache
@@ -106,6 +120,7 @@ BROKEN = {
     "markup": lambda t: t.replace(" the ", " **the** ", 1),
     "brackets": lambda t: t.replace(" the ", " (the) ", 1),
     "a capital within a word": lambda t: t.replace(" the ", " thE ", 1),
+    "a word without end": lambda t: t.replace(" the ", f" {'a' * 40} ", 1),
     "a lone letter": lambda t: t.replace(" the ", " x ", 1),
     "text before": lambda t: "Well. " + t,
     "text after": lambda t: t + "\n",
@@ -123,13 +138,13 @@ BROKEN = {
 
 
 @pytest.mark.slow
-def test_every_rationale_of_the_narrator_matches():
+def test_every_rationale_of_the_narrator_matches(ask: Ask):
     texts = [*rationales(), of_words(150)]
     assert ask(DEFAULT, texts)[0] == [True] * len(texts)
 
 
 @pytest.mark.slow
-def test_a_rule_broken_is_refused():
+def test_a_rule_broken_is_refused(ask: Ask):
     whole = [*rationales()[:5], of_words(150).replace("rests", "rests at the side", 1)]
     texts = {
         (name, k): spoil(text) for name, spoil in BROKEN.items() for k, text in enumerate(whole)
@@ -141,8 +156,10 @@ def test_a_rule_broken_is_refused():
 
 
 @pytest.mark.slow
-def test_number_words_are_refused_and_innocent_ones_are_not():
+def test_number_words_are_refused_and_innocent_ones_are_not(ask: Ask):
     numbers = {*NUMBERS, "one", "first", "few", "iv", "drei", "tenfold", "twofold", "thirties"}
+    # Behind a number word there is no way on, or a server that chose one would have to babble.
+    numbers |= {f"{n}ness" for n in NUMBERS if n not in OPENERS}
     barred = sorted({form for n in numbers for form in (n, n.title(), f"near-{n}", f"{n}-like")})
     innocent = [
         *("tends", "tension", "often", "center", "central", "section", "secure", "wonder", "stone"),
@@ -158,7 +175,7 @@ def test_number_words_are_refused_and_innocent_ones_are_not():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("low", "high"), [(80, 250), (64, 64), (1, 70)])
-def test_words_are_counted_as_the_validator_counts_them(low, high):
+def test_words_are_counted_as_the_validator_counts_them(ask: Ask, low, high):
     counts = [n for n in range(60, 260) if abs(n - low) < 3 or abs(n - high) < 3]
     texts = [of_words(n) for n in counts]
     assert [word_count(t) for t in texts] == counts
@@ -167,7 +184,7 @@ def test_words_are_counted_as_the_validator_counts_them(low, high):
 
 
 @pytest.mark.slow
-def test_what_is_made_of_random_pieces_has_the_form_and_no_number():
+def test_what_is_made_of_random_pieces_has_the_form_and_no_number(ask: Ask):
     rng = np.random.default_rng(0)
     while True:
         scene, item = synthetic.random_scene(rng), synthetic.item((60, 80, 100, 120))
