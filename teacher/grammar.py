@@ -167,8 +167,8 @@ def _barred() -> Trie:
     a word that began with one would leave a server nowhere to go but nonsense ("twoness")."""
     stems = {*lexicon.CARDINALS, *lexicon.ORDINALS, *lexicon.QUANTITIES, *lexicon.TIMES}
     stems = stems - set(OPENERS) | {*CONTEXTUAL, *VAGUE}
-    plurals = {word for word in lexicon.COUNTED if word.endswith("s")}
-    whole = {word for word in WORDS if word.isascii()} | {*lexicon.ROMAN, *plurals, *TENS}
+    whole = {word for word in WORDS if word.isascii()} | {*lexicon.ROMAN, *lexicon.PLURAL_UNITS}
+    whole |= set(TENS)
     whole |= {opener + suffix for opener in OPENERS for suffix in lexicon.SUFFIXES}
     whole |= {"", *ascii_lowercase}
     trie: Trie = {}
