@@ -1,5 +1,7 @@
 """Runs of the command on a store in memory: resuming, damage, and what servers answer."""
 
+from dataclasses import replace
+
 import pyarrow.parquet as pq
 import pytest
 
@@ -93,7 +95,8 @@ def test_the_accepted_are_a_parquet_file_too(store, odd):
     path = store.folder / "rationales.parquet"
     narration = narrate_store(store, config(odd("number")))
     rows = pq.read_table(path).to_pylist()
-    assert [Rationale.from_row(row) for row in rows] == narration.rationales
+    unclaimed = [replace(r, claims={}) for r in narration.rationales]
+    assert [Rationale.from_row(row) for row in rows] == unclaimed
     assert len(rows) == 12
     narrate_store(store, TeacherConfig(name="template", min_words=249))
     assert pq.read_table(path).num_rows == 0
