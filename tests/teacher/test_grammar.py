@@ -193,7 +193,10 @@ def test_what_is_made_of_random_pieces_has_the_form_and_no_number(ask: Ask):
             break
     made = ask(DEFAULT, [], samples=40)[1]
     verdicts = [validate(text, predicates, item, DEFAULT) for text in made]
-    reasons = [r for v in verdicts for r in v.reasons if not r.startswith("wrong answer")]
+    # What is said at random is seldom true.
+    reasons = [
+        r for v in verdicts for r in v.reasons if not r.startswith(("wrong answer", "contradicts"))
+    ]
     assert {r.split(":")[0] for r in reasons} <= {"number"}
     # Words apart by hyphens, and some with a letter thrice in a row, are left to the validator.
     assert sum(any("number" in r for r in v.reasons) for v in verdicts) <= 4, reasons
