@@ -198,8 +198,9 @@ def test_what_is_made_of_random_pieces_has_the_form_and_no_number(ask: Ask):
         r for v in verdicts for r in v.reasons if not r.startswith(("wrong answer", "contradicts"))
     ]
     assert {r.split(":")[0] for r in reasons} <= {"number"}
-    # Words apart by hyphens, and some with a letter thrice in a row, are left to the validator.
-    assert sum(any("number" in r for r in v.reasons) for v in verdicts) <= 4, reasons
+    # Words apart by hyphens, glued to others or with doubled letters are left to the validator:
+    # here some in 40 texts of 80 to 250 words, which are made of pieces of number words.
+    assert sum(any("number" in r for r in v.reasons) for v in verdicts) <= 8, reasons
 
 
 def test_a_grammar_that_no_rationale_fits_is_an_error():
