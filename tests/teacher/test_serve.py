@@ -162,6 +162,18 @@ def run_script(script, folder, stop):
         return serve.await_health(process, f"http://127.0.0.1:{free_port()}/v1", log, stop)
 
 
+def ends(pid):
+    """Whether a process is dead soon: a kill takes a moment, and some machines never bury."""
+    for _ in range(100):
+        try:
+            if psutil.Process(pid).status() == psutil.STATUS_ZOMBIE:
+                return True
+        except psutil.NoSuchProcess:
+            return True
+        time.sleep(0.05)
+    return False
+
+
 def test_a_server_that_dies_ends_with_its_log(tmp_path, caplog):
     caplog.set_level("INFO")
     with pytest.raises(UserError, match=r"ended by itself with status 3; .*server\.log ends as"):
@@ -189,8 +201,7 @@ def test_what_does_not_end_is_killed_with_all_that_it_started(tmp_path, monkeypa
     threading.Thread(target=stop_once_deaf).start()
     assert run_script(script, tmp_path, stop) is False
     for pid in map(int, serve.last_line(tmp_path / "server.log").split()[1:]):
-        # A machine may never bury its dead.
-        assert not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+        assert ends(pid)
 
 
 @pytest.mark.slow
@@ -263,9 +274,9 @@ def await_lines(folder, count, client):
 
 @pytest.mark.slow
 def test_the_server_ends_with_all_that_it_started(server):
-    processes = server.processes()
-    assert len(processes) > 1
+    pids = [process.pid for process in server.processes()]
+    assert len(pids) > 1
     # As Ctrl-C does.
     assert server.stop(signal.SIGINT) == 0
-    assert psutil.wait_procs(processes, timeout=5)[1] == []
+    assert all(ends(pid) for pid in pids)
     assert server.said.read_text().endswith("has stopped\n")
