@@ -200,7 +200,6 @@ def test_what_does_not_end_is_killed_with_all_that_it_started(tmp_path, monkeypa
     (tmp_path / "server.log").touch()
     threading.Thread(target=stop_once_deaf).start()
     assert run_script(script, tmp_path, stop) is False
-    until = time.monotonic() + 60
     for pid in map(int, serve.last_line(tmp_path / "server.log").split()[1:]):
         assert ends(pid)
 
