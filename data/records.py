@@ -257,6 +257,20 @@ class Rationale:
     seed: int
     reasons: tuple[str, ...] = ()
     sections: dict[str, str] = field(default_factory=dict)
+    prompt_tokens: int | None = None
+    """What a server read for this answer; null without a server. Of several answers to one
+    request the first has the whole prompt and the others have none."""
+    completion_tokens: int | None = None
+    """What a server wrote; the answers to one request share its sum evenly."""
+    grammar: str | None = None
+    """Version of the grammar that the server was held to; null where it was free."""
+    finished: float | None = None
+    """When a server gave it, seconds since 1970; null without a server."""
+    fallback: bool = False
+    """Whether the built-in narrator told it in place of a teacher, for an item that was set
+    aside."""
+    claims: dict[str, list[int]] = field(default_factory=dict)
+    """How many of its claims the predicates support, contradict and leave unknown, by kind."""
 
     def to_row(self) -> dict[str, Any]:
         return {**asdict(self), "reasons": list(self.reasons)}

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import io
 import json
 import os
 from collections.abc import Iterable
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from conf.errors import UserError
 from data.records import Rationale
+from data.store import write_atomically
+from teacher.validate import SECTIONS
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 DIGEST = "sha256"
 UNREADABLE = (ValueError, TypeError, KeyError, AttributeError)
@@ -100,3 +107,29 @@ def read_rationales(path: Path) -> list[Rationale]:
                 "answer is asked for again"
             ) from error
     return rationales
+
+
+def save_accepted(rationales: list[Rationale], path: Path) -> None:
+    """Put accepted rationales into a parquet file, whole or not at all."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    sink = io.BytesIO()
+    schema = _schema()
+    columns = {name: [getattr(r, name) for r in rationales] for name in schema.names}
+    table = pa.Table.from_pydict(columns, schema=schema)
+    pq.write_table(table, sink, compression="zstd")
+    write_atomically(path, sink.getvalue())
+
+
+def _schema() -> pa.Schema:
+    """Of every field but the claims' counts, for some are null in all rows."""
+    import pyarrow as pa
+
+    types = {"accepted": pa.bool_(), "fallback": pa.bool_(), "finished": pa.float64()}
+    types["reasons"] = pa.list_(pa.string())
+    types["sections"] = pa.struct([(name, pa.string()) for name in SECTIONS])
+    whole = ("attempt", "seed", "prompt_tokens", "completion_tokens")
+    types |= dict.fromkeys(whole, pa.int64())
+    names = [f.name for f in fields(Rationale) if f.name != "claims"]
+    return pa.schema([(name, types.get(name, pa.string())) for name in names])

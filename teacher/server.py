@@ -1,104 +1,102 @@
-"""The client of an OpenAI-compatible server. A server that is down costs time, not attempts."""
+"""One OpenAI-compatible server: how it is asked, and what can come back."""
 
 from __future__ import annotations
 
 import asyncio
-import http.client
+import email.utils
 import time
-import urllib.error
-import urllib.request
-from dataclasses import dataclass
+from typing import Any
 
 import openai
 
 from conf.errors import UserError
 from conf.schema import TeacherConfig
+from teacher.health import health_problem
+from teacher.replies import Reply, replies
 
-PAUSE, LONGEST_PAUSE = 0.5, 5.0
-"""Seconds between looks at a server that is down: the first, doubled up to the longest."""
-
+Chat = list[dict[str, str]]
 
 NO_REPLY = (AttributeError, IndexError, TypeError, ValueError)
 """What the client raises at a reply that is not of the API's form."""
 
 
-@dataclass(frozen=True)
-class Reply:
-    """A server's answer; `cut_off` where it ran into the token limit."""
+class RequestError(Exception):
+    """A request without an answer."""
 
-    text: str
-    cut_off: bool
+
+class MalformedReplyError(RequestError):
+    """A reply that is not of the API's form."""
+
+
+class RateLimitedError(RequestError):
+    """The server wants to be left alone, for `seconds` where it says so."""
+
+    def __init__(self, problem: str, seconds: float | None) -> None:
+        super().__init__(problem)
+        self.seconds = seconds
 
 
 class Server:
-    """Asks `cfg.model` at `cfg.url`. Use it inside one event loop."""
+    """Asks `cfg.model` at `url`. Use it inside one event loop."""
 
-    def __init__(self, cfg: TeacherConfig) -> None:
+    def __init__(self, url: str, cfg: TeacherConfig, constraint: dict[str, Any] | None) -> None:
+        self.url = url
         self.cfg = cfg
         self.client = openai.AsyncOpenAI(
-            base_url=cfg.url, api_key="none", max_retries=0, timeout=cfg.timeout
+            base_url=url, api_key="none", max_retries=0, timeout=cfg.timeout
         )
-        self.health = f"{cfg.url.rstrip('/').removesuffix('/v1')}/health"
-        self.looking = asyncio.Lock()
+        # No seed: one a request crashed vLLM on a CPU at 32 in flight.
+        self.extra: dict[str, Any] = {
+            "top_k": cfg.top_k,
+            "chat_template_kwargs": {"enable_thinking": False},
+        }
+        if constraint:
+            self.extra["structured_outputs"] = constraint
 
-    async def ask(self, messages: list[dict[str, str]]) -> Reply:
-        """One answer to a chat, however often the server has to be waited for.
+    async def ask(self, chat: Chat, n: int, max_tokens: int) -> list[Reply]:
+        """`n` answers to a chat.
 
         Raises:
-            UserError: the server stays down for longer than `cfg.patience`, does not know the
-                model, or refuses the request.
+            RequestError: there is no answer, this time.
+            UserError: the server does not know the model, or refuses the request.
         """
-        deadline, pause = None, PAUSE
-        while True:
-            try:
-                return await self._ask(messages)
-            except openai.NotFoundError as error:
-                raise await self._unknown_model() from error
-            except (
-                openai.APIConnectionError,
-                openai.InternalServerError,
-                openai.RateLimitError,
-            ) as error:
-                deadline = deadline or time.monotonic() + self.cfg.patience
-                if time.monotonic() + pause > deadline:
-                    raise self._gone(error) from error
-            except openai.APIStatusError as error:
-                raise UserError(f"{self.cfg.url} refused a request: {error.message}") from error
-            await asyncio.sleep(pause)
-            pause = min(2 * pause, LONGEST_PAUSE)
-            await self.wait(deadline)
-
-    async def wait(self, deadline: float | None = None) -> None:
-        """Return once the server answers; UserError if it does not before the deadline (in
-        time.monotonic()'s seconds), or within `cfg.patience` seconds."""
-        deadline = deadline or time.monotonic() + self.cfg.patience
-        pause = PAUSE
-        # One look at a time, for every request in flight waits here at once.
-        async with self.looking:
-            while (problem := await asyncio.to_thread(_problem, self.health)) is not None:
-                if time.monotonic() + pause > deadline:
-                    raise self._gone(problem)
-                await asyncio.sleep(pause)
-                pause = min(2 * pause, LONGEST_PAUSE)
-
-    async def _ask(self, messages: list[dict[str, str]]) -> Reply:
         cfg = self.cfg
         try:
-            completion = await self.client.chat.completions.create(
-                model=cfg.model,
-                messages=messages,
-                temperature=cfg.temperature,
-                top_p=cfg.top_p,
-                max_tokens=cfg.max_tokens,
-                extra_body={"top_k": cfg.top_k, "chat_template_kwargs": {"enable_thinking": False}},
-            )
-            choice = completion.choices[0]
-            return Reply((choice.message.content or "").strip(), choice.finish_reason == "length")
-        except NO_REPLY as error:
-            raise UserError(
-                f"{cfg.url} does not answer as an OpenAI-compatible server does "
-                f"({type(error).__name__}: {error}); such a URL ends in /v1"
+            # The client's own timeout starts again with every byte that comes.
+            async with asyncio.timeout(cfg.timeout):
+                completion = await self.client.chat.completions.create(
+                    model=cfg.model,
+                    messages=chat,
+                    n=n,
+                    temperature=cfg.temperature,
+                    top_p=cfg.top_p,
+                    max_tokens=max_tokens,
+                    extra_body=self.extra,
+                )
+            return replies(completion, n)
+        except openai.NotFoundError as error:
+            raise await self._unknown_model() from error
+        except openai.RateLimitError as error:
+            raise RateLimitedError("HTTP 429", _retry_after(error)) from error
+        except openai.InternalServerError as error:
+            raise RequestError(f"HTTP {error.status_code}") from error
+        except openai.APIStatusError as error:
+            raise UserError(f"{self.url} refused a request: {error.message}") from error
+        except (openai.APITimeoutError, TimeoutError) as error:
+            raise RequestError(
+                f"no answer within teacher.timeout={cfg.timeout:g} seconds"
             ) from error
+        except openai.APIConnectionError as error:
+            raise RequestError(str(error.__cause__ or error)) from error
+        except (openai.APIResponseValidationError, *NO_REPLY) as error:
+            raise MalformedReplyError(f"{type(error).__name__}: {error}") from error
+
+    async def health(self) -> str | None:
+        """What is wrong with the server, None if it is up."""
+        return await asyncio.to_thread(health_problem, self.url)
+
+    async def close(self) -> None:
+        await self.client.close()
 
     async def _unknown_model(self) -> UserError:
         try:
@@ -106,24 +104,19 @@ class Server:
         except (openai.OpenAIError, *NO_REPLY):
             served = "an unknown set"
         return UserError(
-            f"{self.cfg.url} does not serve teacher.model={self.cfg.model}; it has {served}. Is "
+            f"{self.url} does not serve teacher.model={self.cfg.model}; it has {served}. Is "
             "that the URL of an OpenAI-compatible server, ending in /v1?"
         )
 
-    def _gone(self, problem: object) -> UserError:
-        return UserError(
-            f"teacher.url={self.cfg.url} has not answered for teacher.patience="
-            f"{self.cfg.patience:g} seconds ({problem}); start the server and run this again, it "
-            "goes on with what is answered"
-        )
 
-
-def _problem(health: str) -> str | None:
-    """What is wrong with a server, None if it is up. One without a health page is up."""
+def _retry_after(error: openai.APIStatusError) -> float | None:
+    """Seconds of a Retry-After header, which may also be a date."""
+    header = error.response.headers.get("retry-after", "")
     try:
-        with urllib.request.urlopen(health, timeout=10):
-            return None
-    except urllib.error.HTTPError as error:
-        return f"HTTP {error.code}" if error.code >= 500 else None
-    except (OSError, http.client.HTTPException) as error:
-        return str(error) or type(error).__name__
+        return max(0.0, float(header))
+    except ValueError:
+        pass
+    try:
+        return max(0.0, email.utils.parsedate_to_datetime(header).timestamp() - time.time())
+    except ValueError:
+        return None

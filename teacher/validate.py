@@ -1,4 +1,5 @@
-"""The verdict on a rationale: its sections, its length, the absence of numbers, and its answer."""
+"""The verdict on a rationale: its sections, its length, the absence of numbers, the truth of its
+claims, and its answer."""
 
 from __future__ import annotations
 
@@ -7,13 +8,15 @@ from dataclasses import dataclass, field
 
 from conf.schema import TeacherConfig
 from data.records import LETTERS, SelectionItem
+from teacher.claims import find_claims
+from teacher.letters import letters
 from teacher.numbers import find_numbers
 from teacher.predicates import Predicates
+from teacher.reading.grounding import Claim
+from teacher.sections import SECTIONS, opening, parts
 
-VALIDATOR_VERSION = "2"
-SECTIONS = ("Scene parse", "Motion analysis", "Prediction", "Candidate analysis", "Outcome")
-"""Headings of a rationale in order; the line "Answer: X" ends it."""
-HEADING = re.compile(rf"^({'|'.join(SECTIONS)}|Answer):[ \t]*", re.MULTILINE)
+VALIDATOR_VERSION = "3"
+SMALL_LETTER = re.compile(r"\b[Cc]andidates? [a-d]\b")
 WORD = re.compile(r"[^\W_]+(?:['’-][^\W_]+)*")
 
 
@@ -26,6 +29,8 @@ class Verdict:
     reasons: tuple[str, ...]
     sections: dict[str, str] = field(default_factory=dict)
     answer: str | None = None
+    claims: tuple[Claim, ...] = ()
+    """What the rationale claims, each with the predicates' verdict on it."""
 
 
 def validate(text: str, predicates: Predicates, item: SelectionItem, cfg: TeacherConfig) -> Verdict:
@@ -38,14 +43,21 @@ def validate(text: str, predicates: Predicates, item: SelectionItem, cfg: Teache
         reasons.append("too long")
     sections, answer, problems = _parse(text)
     reasons += problems
-    analysis = sections.get("Candidate analysis", "")
-    for candidate in predicates.candidates:
-        # In a sentence about candidates, for "A" is also an article.
-        if analysis and not re.search(rf"[Cc]andidates?\b[^.]*\b{candidate.letter}\b", analysis):
-            reasons.append(f"candidate not analysed: {candidate.letter}")
+    reasons += _not_analysed(sections.get("Candidate analysis", ""))
     if answer is not None and answer != item.letter:
         reasons.append(f"wrong answer: {answer}")
-    return Verdict(not reasons, tuple(reasons), sections, answer)
+    claims = find_claims(text, predicates)
+    reasons += dict.fromkeys(f"contradicts: {c}" for c in claims if c.verdict == "contradicted")
+    return Verdict(not reasons, tuple(reasons), sections, answer, claims)
+
+
+def _not_analysed(analysis: str) -> list[str]:
+    if not analysis:
+        return []
+    named = {analysis[start:stop] for start, stop in letters(analysis)}
+    reasons = [f"candidate not analysed: {letter}" for letter in LETTERS if letter not in named]
+    # For another order such a letter could not be told from an article, and would stay.
+    return reasons + [f"small letter: {m[0]}" for m in SMALL_LETTER.finditer(analysis)]
 
 
 def word_count(text: str) -> int:
@@ -54,19 +66,18 @@ def word_count(text: str) -> int:
 
 
 def _parse(text: str) -> tuple[dict[str, str], str | None, list[str]]:
-    headings = list(HEADING.finditer(text))
-    bounds = [*(m.start() for m in headings), len(text)]
-    parts = [(m[1], text[m.end() : bounds[k + 1]].strip()) for k, m in enumerate(headings)]
-    sections = {name: body for name, body in parts if name != "Answer"}
-    answers = [body for name, body in parts if name == "Answer"]
+    bounds = parts(text)
+    told = [(name, text[start:stop].strip()) for name, start, stop in bounds]
+    sections = {name: body for name, body in told if name != "Answer"}
+    answers = [body for name, body in told if name == "Answer"]
     problems = [f"missing section: {name}" for name in SECTIONS if name not in sections]
     problems += [f"empty section: {name}" for name, body in sections.items() if not body]
-    names = [name for name, _ in parts]
+    names = [name for name, _ in told]
     if len(set(names)) < len(names):
         problems.append("repeated section")
     if names != sorted(names, key=[*SECTIONS, "Answer"].index):
         problems.append("sections out of order")
-    if text[: headings[0].start() if headings else 0].strip():
+    if opening(text).strip():
         problems.append("text before the sections")
     if not answers:
         return sections, None, [*problems, "no answer"]

@@ -22,6 +22,7 @@ from conf.schema.commands import (
     ReportCommand,
     RetrieveCommand,
     SelectCommand,
+    ServeCommand,
     SftCommand,
     StatisticsCommand,
 )
@@ -48,6 +49,7 @@ __all__ = [
     "RetrieverConfig",
     "SelectCommand",
     "SelectionConfig",
+    "ServeCommand",
     "SftCommand",
     "SftTrainConfig",
     "StatisticsCommand",

@@ -15,6 +15,7 @@ from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
 
 FRAMES_AHEAD = ("named", "all", "none")
 ENGINES = ("loky", "ray")
+DTYPES = ("auto", "bfloat16", "float16", "float32")
 
 
 @dataclass
@@ -110,6 +111,47 @@ class GalleryCommand(CommandConfig):
 class NarrateCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     teacher: TeacherConfig = MISSING
+    shown: int = 20
+    """Rationales on the report's page, beside their frames; chosen by `teacher.seed`."""
+
+    def check(self) -> list[str]:
+        return super().check() + too_small(self, "", {"shown": 0})
+
+
+@dataclass
+class ServeCommand(CommandConfig):
+    teacher: TeacherConfig = MISSING
+    """Its url says where to listen, its model under which name."""
+    model: str | None = None
+    """Folder of the model, or its name at the hub; null takes teacher.model."""
+    environment: str = ".venv-vllm"
+    """Folder of the Python environment that has vLLM; `make vllm-env` makes it."""
+    prompt_tokens: int = 3072
+    """Tokens that a prompt may have; with teacher.max_tokens it makes the model's context."""
+    dtype: str = "auto"
+    """Of weights and activations: auto, bfloat16, float16 or float32."""
+    cards: int | None = None
+    """GPUs that share the model; null takes the largest power of two that the machine has."""
+    memory: float = 0.9
+    """Share of each GPU's memory."""
+    cache_gb: float = 4.0
+    """GiB of the key-value cache of a server without a GPU."""
+
+    def check(self) -> list[str]:
+        least = {"prompt_tokens": 1, "cards": 1}
+        problems = super().check() + too_small(self, "", least)
+        if len(self.teacher.urls) != 1:
+            problems.append(
+                f"teacher.url={self.teacher.url}: a server needs one address, such as "
+                "teacher.url=http://127.0.0.1:8000/v1"
+            )
+        if self.dtype not in DTYPES:
+            problems.append(f"dtype={self.dtype}: the options are {', '.join(DTYPES)}")
+        if not 0 < self.memory <= 1:
+            problems.append(f"memory={self.memory} must be above 0 and at most 1")
+        if not self.cache_gb > 0:
+            problems.append(f"cache_gb={self.cache_gb} must be above 0")
+        return problems
 
 
 @dataclass

@@ -16,6 +16,7 @@ SCHEMAS = {
     "data.export": schema.ExportCommand,
     "data.gallery": schema.GalleryCommand,
     "teacher.narrate": schema.NarrateCommand,
+    "teacher.serve": schema.ServeCommand,
     "train.sft": schema.SftCommand,
     "train.contrastive": schema.ContrastiveCommand,
     "evaluation.select": schema.SelectCommand,
@@ -58,6 +59,15 @@ def test_a_student_brings_its_recipe():
         336,
         3072,
     )
+
+
+def test_a_teacher_may_be_on_several_servers():
+    command = "python -m teacher.narrate teacher=qwen3_32b"
+    one = settings(command).teacher
+    several = settings(f"{command} teacher.url=[http://a:8000/v1,https://b/v1]").teacher
+    assert one.urls == ["http://127.0.0.1:8000/v1"]
+    assert several.urls == ["http://a:8000/v1", "https://b/v1"]
+    assert settings("python -m teacher.narrate").teacher.urls == []
 
 
 def test_a_typed_value_and_an_overlay_win_over_a_recipe():

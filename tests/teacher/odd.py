@@ -1,0 +1,158 @@
+"""A small real server that answers chats by the built-in narrator, and oddly when it is told to."""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+import time
+from collections.abc import Iterable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from socket import SO_LINGER, SOL_SOCKET
+from typing import Any
+
+from conf.schema import TeacherConfig
+from teacher.predicates import predicates_of
+from teacher.prompts import messages
+from teacher.template import narrate
+from tests.teacher.made import MadeStore
+
+Fault = int | bytes | str | dict[str, str]
+"""A status; the bytes of a body; headers of a refusal (429); or one of the words of `odd_text`,
+`hang` and `reset`."""
+
+
+def odd_text(word: str, text: str) -> tuple[str, str]:
+    """A text and its finish_reason."""
+    return {
+        "cut": (text[:200], "length"),
+        "number": (text.replace("The ", "The two ", 1), "stop"),
+        "empty": ("", "stop"),
+        "thinking": (f"<think>\nLet me see.\n</think>\n\n{text}", "stop"),
+        "long": ("The ball rolls east. " * 500_000, "stop"),
+        "surrogate": (text.replace("The ", "\ud800 ", 1), "stop"),
+    }[word]
+
+
+class OddServer(ThreadingHTTPServer):
+    """`faults` come before proper answers, in order; `always` comes instead of them. `asked` are
+    the requests; `most` is how many were in flight at once."""
+
+    daemon_threads = True
+
+    def __init__(self, store: MadeStore, faults: Iterable[Fault] = (), port: int = 0) -> None:
+        super().__init__(("127.0.0.1", port), Handler)
+        self.faults, self.always = list(faults), {}
+        self.asked: list[dict[str, Any]] = []
+        self.times: list[float] = []
+        self.lock = threading.Lock()
+        self.in_flight = self.most = 0
+        self.delay = 0.0
+        self.texts = {}
+        for item in store.selection("train"):
+            predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
+            if predicates:
+                chat = messages(predicates, item, TeacherConfig(name="odd"))
+                self.texts[chat[1]["content"]] = narrate(predicates, item, 0)
+        threading.Thread(target=self.serve_forever, args=(0.02,), daemon=True).start()
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}/v1"
+
+    def handle_error(self, *_: object) -> None:
+        """A client that hangs up is nothing to tell."""
+
+    def stop(self) -> None:
+        self.shutdown()
+        self.server_close()
+
+
+class Handler(BaseHTTPRequestHandler):
+    server: OddServer
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+    def do_GET(self) -> None:
+        if self.path == "/health":
+            self.say(200, {})
+        else:
+            self.say(200, {"object": "list", "data": [{"id": "other", "object": "model"}]})
+
+    def do_POST(self) -> None:
+        request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        server, said = self.server, request["messages"][-1]["content"]
+        with server.lock:
+            server.asked.append(request)
+            server.times.append(time.monotonic())
+            server.in_flight += 1
+            server.most = max(server.most, server.in_flight)
+            fault = server.always.get(said) or server.always.get("*")
+            if fault is None and server.faults:
+                fault = server.faults.pop(0)
+        time.sleep(server.delay)
+        try:
+            self.answer(request, server.texts.get(said, "Hello."), fault)
+        finally:
+            with server.lock:
+                server.in_flight -= 1
+
+    def answer(self, request: dict[str, Any], text: str, fault: Fault | None) -> None:
+        if isinstance(fault, int):
+            self.say(fault, {"error": {"message": "fault", "type": "t", "code": fault}})
+        elif isinstance(fault, dict):
+            self.say(429, {"error": {"message": "slow down"}}, fault)
+        elif isinstance(fault, bytes):
+            self.raw(fault)
+        elif fault == "hang":
+            time.sleep(3)
+        elif fault == "reset":
+            # Half of an answer, then a reset in place of an end.
+            self.send_response(200)
+            self.send_header("Content-Type", "application/json")
+            self.send_header("Content-Length", "1000")
+            self.end_headers()
+            self.wfile.write(b'{"choices": [')
+            self.connection.setsockopt(SOL_SOCKET, SO_LINGER, struct.pack("ii", 1, 0))
+            self.connection.close()
+        else:
+            told = odd_text(fault, text) if fault else (text, "stop")
+            self.say(200, completion(*told, request.get("n") or 1))
+
+    def say(self, status: int, body: dict[str, Any], headers: dict[str, str] | None = None) -> None:
+        content = json.dumps(body).encode()
+        self.send_response(status)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(content)))
+        for key, value in (headers or {}).items():
+            self.send_header(key, value)
+        self.end_headers()
+        self.wfile.write(content)
+
+    def raw(self, content: bytes) -> None:
+        self.send_response(200)
+        self.send_header(
+            "Content-Type", "application/json" if content[:1] in b"{[" else "text/html"
+        )
+        self.end_headers()
+        self.wfile.write(content)
+
+
+def completion(text: str, finish_reason: str, n: int) -> dict[str, Any]:
+    choices = [
+        {
+            "index": k,
+            "finish_reason": finish_reason,
+            "message": {"role": "assistant", "content": text},
+        }
+        for k in range(n)
+    ]
+    return {
+        "id": "x",
+        "object": "chat.completion",
+        "created": 0,
+        "model": "tiny",
+        "choices": choices,
+        "usage": {"prompt_tokens": 1000, "completion_tokens": 101 * n, "total_tokens": 1},
+    }

@@ -1,0 +1,264 @@
+"""What rationales claim is read, the true let through and the false found.
+
+claims.txt holds sentences about FACTS, each marked true or false, with its section's letter.
+prose.jsonl holds a language model's rationales with the predicates that they were written from.
+"""
+
+import json
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from benchmarks.mutations import KINDS, mutations, predicates_from
+from benchmarks.paraphrases import paraphrase
+from benchmarks.prose import EDITS
+from conf.schema import TeacherConfig
+from teacher.claims import find_claims
+from teacher.predicates import (
+    OUT,
+    CandidateFacts,
+    Closeness,
+    Difference,
+    Meeting,
+    ObjectFacts,
+    Predicates,
+    predicates_of,
+)
+from teacher.reading.phrases import PHRASES
+from teacher.sections import SECTIONS
+from teacher.template import narrate
+from teacher.validate import validate
+
+HERE = Path(__file__).parent
+SECTION = {"S": SECTIONS[0], "M": SECTIONS[1], "P": SECTIONS[2], "C": SECTIONS[3], "O": SECTIONS[4]}
+RED, BLUE, GREEN = "red metal cube", "blue rubber sphere", "green metal sphere"
+GRAY, PURPLE, CYAN = "gray rubber cylinder", "purple metal cylinder", "cyan rubber cube"
+LEFT, CENTER, RIGHT, BOTTOM = (
+    "near the left",
+    "near the center",
+    "near the right",
+    "near the bottom",
+)
+TOP_LEFT, TOP_RIGHT = "near the top-left", "near the top-right"
+BOTTOM_LEFT = "near the bottom-left"
+ACROSS, SHIFTS, SHOWN = "moves across", "shifts slightly", "shown"
+FACTS = Predicates(
+    instant="just before the contact",
+    moment="at the target moment",
+    objects=(
+        ObjectFacts(RED, LEFT, SHOWN, "quickly", "east", CENTER, SHOWN, ACROSS, "east"),
+        ObjectFacts(BLUE, CENTER, SHOWN, "stationary", None, RIGHT, SHOWN, SHIFTS, "southeast"),
+        ObjectFacts(
+            GREEN, TOP_RIGHT, SHOWN, "slowly", "southwest", TOP_RIGHT, SHOWN, SHIFTS, "southwest"
+        ),
+        ObjectFacts(GRAY, BOTTOM, SHOWN, "stationary", None, BOTTOM, SHOWN, "stays", None),
+        ObjectFacts(PURPLE, OUT, OUT, None, None, BOTTOM_LEFT, SHOWN, ACROSS, "north"),
+        ObjectFacts(CYAN, TOP_LEFT, SHOWN, "steadily", "west", OUT, OUT, ACROSS, "west"),
+    ),
+    entering=(PURPLE,),
+    leaving=(CYAN,),
+    courses=(Meeting((RED, BLUE), "imminent"), Meeting((GREEN, BLUE), None)),
+    contacts=(Meeting((RED, BLUE), "imminent"),),
+    close=(Closeness((RED, BLUE), CENTER),),
+    candidates=(
+        CandidateFacts(
+            "A",
+            False,
+            False,
+            (
+                Difference(RED, "region", region=LEFT),
+                Difference(BLUE, "displaced", heading="west", extent="clearly"),
+            ),
+        ),
+        CandidateFacts("B", True, False, ()),
+        CandidateFacts(
+            "C",
+            False,
+            True,
+            (Difference(RED, "missing"), Difference("yellow rubber cube", "extra")),
+        ),
+        CandidateFacts(
+            "D",
+            False,
+            False,
+            (
+                Difference(GREEN, "displaced", heading="north", extent="slightly"),
+                Difference(CYAN, "extra"),
+            ),
+        ),
+    ),
+)
+CASES = [line.split(" ", 2) for line in (HERE / "claims.txt").read_text().splitlines()]
+PROSE = [json.loads(line) for line in (HERE / "prose.jsonl").read_text().splitlines()]
+
+
+def contradicted(text, predicates):
+    return [str(c) for c in find_claims(text, predicates) if c.verdict == "contradicted"]
+
+
+def verdicts(section, sentence):
+    claims = find_claims(f"{SECTION[section]}: {sentence}", FACTS)
+    return {str(c): c.verdict for c in claims if c.kind != "mention"}
+
+
+@pytest.mark.parametrize(("truth", "section", "sentence"), CASES)
+def test_a_false_sentence_is_contradicted_and_a_true_one_is_not(truth, section, sentence):
+    found = contradicted(f"{SECTION[section]}: {sentence}", FACTS)
+    assert bool(found) == (truth == "false"), found
+
+
+@pytest.mark.parametrize(
+    ("section", "sentence", "claims"),
+    [
+        (
+            "S",
+            "The red cube is near the left, moving quickly toward the west.",
+            {
+                f"region {LEFT} ({RED})": "supported",
+                f"speed quickly ({RED})": "supported",
+                f"direction west ({RED})": "contradicted",
+            },
+        ),
+        (
+            "S",
+            "The gray rubber cylinder is not near the left.",
+            {f"region not {LEFT} ({GRAY})": "supported"},
+        ),
+        (
+            "S",
+            "Neither the gray rubber cylinder nor the red metal cube is near the bottom.",
+            {
+                f"region not {BOTTOM} ({GRAY})": "contradicted",
+                f"region not {BOTTOM} ({RED})": "supported",
+            },
+        ),
+        (
+            "M",
+            "The red metal cube is about to hit the blue rubber sphere.",
+            {
+                f"meeting ({RED} and {BLUE})": "supported",
+                f"time imminent ({RED} and {BLUE})": "supported",
+            },
+        ),
+        (
+            "M",
+            "The green metal sphere and the blue rubber sphere will not meet.",
+            {f"meeting not ({GREEN} and {BLUE})": "supported"},
+        ),
+        # What an object that is out of view does before it comes in is not known.
+        ("S", "The purple metal cylinder rolls slowly.", {f"speed slowly ({PURPLE})": "unknown"}),
+        # Whom a pronoun stands for is not guessed.
+        (
+            "P",
+            "The red metal cube is close to the blue rubber sphere and it is near the top.",
+            None,
+        ),
+        ("S", "It is near the top.", {"region near the top": "unknown"}),
+        ("M", "If it were struck, the gray rubber cylinder would move east.", {}),
+        (
+            "C",
+            "A shows the red metal cube near the left rather than near the top.",
+            {
+                f"region {LEFT} ({RED}) in A": "supported",
+                f"region near the top ({RED})": "contradicted",
+            },
+        ),
+        (
+            "C",
+            "Candidates A and C lack the red metal cube.",
+            {f"lacks ({RED}) in A": "contradicted", f"lacks ({RED}) in C": "supported"},
+        ),
+        ("O", "Only candidate D agrees.", {"agrees in D": "contradicted"}),
+    ],
+)
+def test_claims_are_read_with_their_subject_and_their_polarity(section, sentence, claims):
+    found = verdicts(section, sentence)
+    if claims is None:
+        assert "contradicted" not in found.values()
+    else:
+        assert found == claims
+
+
+def test_most_of_what_true_sentences_say_is_supported():
+    found = [v for truth, s, text in CASES if truth == "true" for v in verdicts(s, text).values()]
+    assert found.count("supported") > 0.9 * len(found) > 200
+
+
+def test_a_claim_stands_where_its_span_says():
+    text = f"Scene parse: The {RED} is near the left.\nOutcome: B is right.\nAnswer: B"
+    spans = {(c.kind, text[slice(*c.span)]) for c in find_claims(text, FACTS)}
+    assert ("region", "near the left") in spans
+    assert ("mention", f"The {RED}") in spans
+    assert ("agrees", "B") in spans
+
+
+@pytest.fixture(scope="module")
+def narrated(benchmark_store):
+    """The benchmark's training items with their predicates and the narrator's rationales."""
+    found = []
+    for item in benchmark_store.selection("train"):
+        scene = benchmark_store.scene(item.scene_id)
+        predicates = predicates_of(item, scene, benchmark_store.scene)
+        if predicates is not None:
+            found.append((item, predicates, narrate(predicates, item, seed=1)))
+    assert len(found) > 30
+    return found
+
+
+def test_nothing_that_the_narrator_says_is_contradicted(narrated):
+    for item, predicates, text in narrated:
+        assert contradicted(text, predicates) == []
+        assert contradicted(paraphrase(text, Random(item.item_id)), predicates) == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_flipped_fact_is_found(narrated, kind):
+    found = []
+    for item, predicates, text in narrated:
+        for mutation in mutations(predicates, kind, Random(item.item_id)):
+            false = narrate(mutation.predicates, item, seed=1)
+            if false != text and mutation.is_told(false):
+                found.append(bool(contradicted(false, predicates)))
+    assert sum(found) >= 0.97 * len(found) > 20
+
+
+def test_nothing_that_a_language_model_rightly_says_is_contradicted():
+    for record in PROSE:
+        assert contradicted(record["text"], predicates_from(record["predicates"])) == []
+
+
+@pytest.mark.parametrize("kind", EDITS)
+def test_a_false_word_in_prose_is_found(kind):
+    found = []
+    for record in PROSE:
+        predicates = predicates_from(record["predicates"])
+        edits = EDITS[kind](record["text"], predicates, Random(record["item_id"]))
+        found += [bool(contradicted(text, predicates)) for text, _ in edits]
+    assert sum(found) >= 0.96 * len(found) > 20
+
+
+def test_no_text_makes_it_raise_and_the_same_text_gives_the_same():
+    rng = Random(0)
+    words = [*PHRASES, RED, BLUE, "the red cube", "A", "B", "Candidate D", "near the top", "both"]
+    words += [*",.;:()—’'\n", "it", "they", "Outcome: ", "Answer: ", "\nPrediction: ", "", "“", "é"]
+    for length in (0, 1, 2, 3, 5, 8, 20, 60, 200) * 40:
+        body = " ".join(rng.choice(words) for _ in range(length))
+        for section in SECTIONS:
+            text = f"{section}: {body}"
+            assert find_claims(text, FACTS) == find_claims(text, FACTS)
+    for section in SECTIONS:
+        find_claims(f"{section}: " + f"the {RED} and A, " * 5000, FACTS)
+
+
+def test_the_validator_rejects_what_is_contradicted_and_keeps_the_claims(narrated):
+    cfg = TeacherConfig(name="template")
+    item, predicates, text = narrated[0]
+    verdict = validate(text, predicates, item, cfg)
+    assert verdict.accepted
+    assert {c.verdict for c in verdict.claims} <= {"supported", "unknown"}
+    assert sum(c.verdict == "supported" for c in verdict.claims) > 20
+    (mutation, *_) = mutations(predicates, "color", Random(0))
+    false = validate(narrate(mutation.predicates, item, seed=1), predicates, item, cfg)
+    assert not false.accepted
+    assert {reason.split(":")[0] for reason in false.reasons} == {"contradicts"}
