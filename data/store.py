@@ -134,7 +134,8 @@ def save_rows(rows: list[dict[str, Any]], path: Path) -> None:
 def load_rows(path: Path) -> list[dict[str, Any]]:
     import pyarrow.parquet as pq
 
-    return pq.read_table(path).to_pylist()
+    # Not read_table, which imports pandas first.
+    return pq.ParquetFile(path).read().to_pylist()
 
 
 def digest(path: Path) -> str:

@@ -109,6 +109,8 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
         # Settled items are left out here, so that none takes a place among the requests in flight.
         jobs = [(i, len(answers[i.item_id])) for i in items if _open(answers[i.item_id], cfg)]
 
+        before = sum(map(len, answers.values()))
+
         def keep(new: list[Rationale]) -> None:
             journal.append(new)
             for rationale in new:
@@ -128,7 +130,8 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
         rationales = accepted_of(items, answers)
         save_accepted(rationales, store.folder / "rationales.parquet")
     summary = summarise(items, answers, cfg.attempts, too_short)
-    return Narration(rationales, summary, asked=bool(jobs))
+    asked = sum(map(len, answers.values())) > before
+    return Narration(rationales, summary, asked)
 
 
 def _open(given: list[Rationale], cfg: TeacherConfig) -> bool:
