@@ -5,7 +5,8 @@
         scenes/<id>.npz      one scene's oracle; <id>-without-<k> is it with object k absent
         selection.parquet retrieval.parquet database.parquet
         frames/<id>.zip      a cache of that scene's rendered frames, not part of the manifest
-        rationales.jsonl     appended by the teacher, not part of the manifest
+        rationales.jsonl     every answer of teachers, not part of the manifest
+        rationales.parquet   the accepted ones of the last narration, not part of it either
 
 A store is written in a folder beside it and renamed when it is whole, every part atomically, so
 that a killed build goes on with the parts it has. Frames follow from the oracle and the renderer,

@@ -13,7 +13,7 @@ OPENING = re.compile(r"(?:\A|[.!?:;\n(\"“—–-])\s*\Z")
 FOLLOWING = re.compile(r"[ \n]+([A-Za-z]+)")
 BESIDE_VERBS = re.compile(
     "and|or|nor|alone|also|too|then|still|never|always|only|itself|again|cannot|can|will|would"
-    "|should|could|must|may|might|did|had"
+    "|should|could|must|may|might|did|had|now|likewise|here|thus|therefore|instead|however|meanwhile"
 )
 """What may follow a letter that opens a sentence, beside verbs in -s and marks."""
 

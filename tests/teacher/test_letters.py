@@ -26,6 +26,7 @@ ORDERS = list(permutations(range(4)))
         ("A, B, and D show other objects.\nA glossy metal cube is missing from (C).", "ABDC"),
         ("Of candidates A and D, A alone agrees.\n\nAnswer: D", "ADAD"),
         ("A is right. A pair meets. A mass of objects. A can be ruled out.", "AA"),
+        ("A now has it near the top; A likewise. A nearby cube. A therefore differs.", "AAA"),
         ("A bounces less than B; A has it near the top - A metal sphere has it not.", "ABA"),
     ],
 )
