@@ -87,7 +87,16 @@ class CandidateReader(Reader):
         self._boundary()
 
     def on_break(self, tag: Tag) -> None:
-        self._boundary()
+        if self.word(tag) != "so" or self.word(self.near(-1)) not in ("do", "does"):
+            self._boundary()
+
+    def on_be(self, tag: Tag) -> None:
+        # "Had A shown the X, ..."
+        self.skipped |= self.near(-1) is END and self.word(tag) == "had"
+
+    def on_word(self, tag: Tag) -> None:
+        if tag.value in ("first", "second") and self.two and self.near(1).tag != "object":
+            self._choose_of_two(tag.value == "second")
 
     def on_and(self, tag: Tag) -> None:
         self._boundary()
@@ -118,6 +127,9 @@ class CandidateReader(Reader):
             self.letters, self.skipped = (), True
             return
         if before in ASIDE or (before in COMPARED and self.letters) or self._is_compared(start):
+            if all(t.tag != "and" for t in self.sentence[start : self.at]):
+                # "Compared with A, B ..." is no list.
+                self.at = start
             self.skipped = True
         elif before in PARTED and self.skipped:
             self.letters = ()
@@ -225,13 +237,16 @@ class CandidateReader(Reader):
             self.objects = self.kept
 
         elif tag.value in ("former", "latter"):
-            last = tag.value == "latter"
-            if len(self.two) == 2 and len(self.objects) < 2:
-                self.letters, self.objects = (self.two[last],), []
-            elif len(self.objects) == 2 and not self.two:
-                self.objects = [self.objects[last]]
-            else:
-                self.letters, self.objects = (), []
+            self._choose_of_two(tag.value == "latter")
+
+    def _choose_of_two(self, last: bool) -> None:
+        """Go on about the first or the last of two candidates, or of two objects."""
+        if len(self.two) == 2 and len(self.objects) < 2:
+            self.letters, self.objects = (self.two[last],), []
+        elif len(self.objects) == 2 and not self.two:
+            self.objects = [self.objects[last]]
+        else:
+            self.letters, self.objects = (), []
 
     def on_rest_of(self, tag: Tag) -> None:
         if self.word(self.near(-1)) in PARTED and self.word(tag).endswith("others"):
@@ -349,7 +364,10 @@ class CandidateReader(Reader):
     # What is said of a whole candidate.
 
     def on_agree(self, tag: Tag) -> None:
-        if self._is_choice_ahead():
+        if self.near(1).tag == "candidate" and self._is_compared(self.at + 1):
+            # "D matches B in everything but the X."
+            self.doubted = True
+        elif self._is_choice_ahead():
             self.passing = not self.negated
         elif not self.letters:
             self.passing = not self.negated and not (self.lasting and self.objects)

@@ -111,6 +111,8 @@ class SceneReader(PairReader):
         top is the A", "while moving slowly, the A"."""
         step = 1
         while self.near(step).tag in OPENING:
+            if self.word(self.near(step)) == "where":
+                return
             step += 1
         if step > 1 and self.near(step - 1).tag not in ("by", "with"):
             said = any(self.near(k).tag in SAID for k in range(1, step))
@@ -131,6 +133,8 @@ class SceneReader(PairReader):
 
     def on_future(self, tag: Tag) -> None:
         self.future = True
+        if self.word(tag) == "would" and any(t.tag == "maybe" for t in self.sentence):
+            self.maybe = True
         self.verb()
 
     on_expected = on_future
@@ -253,7 +257,8 @@ class SceneReader(PairReader):
             self.relation.partners = names
         elif self.near(-1).tag == "with" or self.sentence[start - 1].tag == "with":
             self.companions = names
-        self.last = names[-1:]
+        if self.sentence[start - 1].tag != "contrast":
+            self.last = names[-1:]
         self.blocked, self.crossed, self.complement = True, False, True
 
     def on_which(self, tag: Tag) -> None:
@@ -272,6 +277,11 @@ class SceneReader(PairReader):
             return
         if self.word(tag) in ("itself", "themselves") and previous.tag == "comma":
             # "Pushes the B east, itself going west."
+            self.subjects, self.group_start = [None], 0
+            return
+        done = previous.tag == "word" and self.word(previous).endswith(("s", "ed", "ing"))
+        if done and self.word(previous) not in ("joins", "joining"):
+            # "The A pushes it east": what follows is of another than the A.
             self.subjects, self.group_start = [None], 0
             return
         possessive = self.word(tag) in ("its", "their") or self.near(1).tag == "object"
@@ -355,6 +365,10 @@ class SceneReader(PairReader):
             return
         if self.near(1).tag == "and" and self.near(2).value in SIDE_WORDS:
             # "Near the left and the right are ..." gives each its own.
+            return
+        unplaced = self.near(1).tag == "be" and self.word(tag).startswith("the ")
+        if unplaced or self.near(1).tag == "none":
+            # "The top is empty", "near the top nothing remains."
             return
         if any(self.near(-k).tag == "leaves" and self._is_bare(self.near(-k)) for k in (1, 2, 3)):
             # "Leaves the area near the top."
@@ -447,7 +461,8 @@ class SceneReader(PairReader):
             when = CUT if self.moment == CUT else EITHER
             self._tell("still", "", True, when, tag)
 
-    on_off = on_moving
+    def on_off(self, tag: Tag) -> None:
+        self.moved = True
 
     def on_slight(self, tag: Tag) -> None:
         if self.moved or self.near(1).tag in ("moves", "moving", "off"):
