@@ -94,6 +94,12 @@ class CandidateReader(Reader):
         # "Had A shown the X, ..."
         self.skipped |= self.near(-1) is END and self.word(tag) == "had"
 
+    def on_leaves(self, tag: Tag) -> None:
+        # "B does not leave the X near the top."
+        self.skipped |= self.negated
+
+    on_show = on_leaves
+
     def on_word(self, tag: Tag) -> None:
         if tag.value in ("first", "second") and self.two and self.near(1).tag != "object":
             self._choose_of_two(tag.value == "second")
@@ -168,7 +174,9 @@ class CandidateReader(Reader):
         if related and self.last_word(self._tag_at(back - 1)) in COMPARING:
             return True
         if self._tag_at(back).tag == "not":
-            return False
+            # "B, not D, has ..."
+            enclosed = self._tag_at(back - 1).tag == self.near(1).tag == "comma"
+            return enclosed and self._tag_at(back - 2).tag == "candidate"
         while self._tag_at(back).tag not in BOUNDARIES:
             if self._tag_at(back).tag == "candidate":
                 return True
@@ -353,7 +361,7 @@ class CandidateReader(Reader):
         self.objects, self.adding = [], False
 
     def _tell(self, kind: str, value: str, affirmed: bool, tag: Tag) -> None:
-        if self.skipped:
+        if self.skipped or self.refused:
             return
         for name in self.objects:
             for letter in self.letters or ("",):

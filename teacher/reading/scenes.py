@@ -104,7 +104,10 @@ class SceneReader(PairReader):
             self.flush()
             self.negated = self.slight = False
             self.crossed = True
-            self._open()
+            # "Near the left and near the right, the A ..." goes on with a list.
+            listed = self.near(-1).tag == self.near(1).tag == "region"
+            if not (listed and self.near(2).tag == "comma"):
+                self._open()
 
     def _open(self) -> None:
         """Forget the subject where a clause opens with what is said of the next: "and near the
@@ -446,6 +449,8 @@ class SceneReader(PairReader):
         self._tell("still", "", not self.negated, when, tag)
 
     def on_rest(self, tag: Tag) -> None:
+        if self.near(1).tag in BOUNDARIES:
+            self.verb()
         if self.near(-1).tag == "object" or self.near(-1).tag == "and":
             self.on_still(tag)
 
