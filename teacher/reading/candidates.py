@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from teacher.reading.grounding import TARGET, Claim, Ground
-from teacher.reading.reader import Names, Reader
+from teacher.reading.reader import BOUNDARIES, END, Names, Reader
 from teacher.reading.tagging import Tag
 
 COMPARED = {"of", "as", "like", "with", "what", "to", "does", "same"}
@@ -12,6 +12,13 @@ ASIDE = {"unlike", "like", "than", "besides", "beyond", "except"}
 """Words before a candidate that is not the one spoken of, wherever it stands."""
 TELLING = {"lack", "gone", "show", "stays", "misplace", "adds"}
 """Tags after which an object is what the candidate shows or lacks."""
+COMPARING = {
+    *("compared", "comparison", "similar", "similarly", "identical", "equal", "relative", "akin"),
+    *("as", "contrasted", "next", "like", "unlike", "than"),
+}
+"""Words before such a word, whatever candidate was spoken of before."""
+EXCEPTING = {"but", "except", "save"}
+NOUNS = {"error", "errors", "mistake", "mistakes", "fault", "faults", "flaw", "flaws"}
 PARTED = ("in", "from", "by", "for")
 """Words before a candidate that the clause so far has been about."""
 
@@ -26,6 +33,8 @@ class CandidateReader(Reader):
         super().__init__(text, ground)
         self.lasting = lasting
         self.letters: tuple[str, ...] = ()
+        self.two: tuple[str, ...] = ()
+        """The two candidates that "the former" and "the latter" stand for."""
 
     def begin(self) -> None:
         if not self.lasting:
@@ -36,6 +45,7 @@ class CandidateReader(Reader):
         self.clause = 0
         self.lacking = self.adding = self.moving = self.skipped = self.passing = False
         self.choice: Tag | None = None
+        self.named_any = False
         self.doubted = False
         self._boundary()
 
@@ -66,7 +76,10 @@ class CandidateReader(Reader):
 
     def on_comma(self, tag: Tag) -> None:
         # "Unlike A, where it is near the left, ..." goes on about A.
-        aside = self.skipped and self.near(1).tag in ("word", "which", "put", "ignore")
+        aside = self.skipped and (
+            self.near(1).tag in ("which", "put", "ignore")
+            or (self.near(1).tag == "word" and self.near(1).value != "there")
+        )
         self._boundary()
         self.skipped = aside
 
@@ -74,7 +87,22 @@ class CandidateReader(Reader):
         self._boundary()
 
     def on_break(self, tag: Tag) -> None:
-        self._boundary()
+        if self.word(tag) != "so" or self.word(self.near(-1)) not in ("do", "does"):
+            self._boundary()
+
+    def on_be(self, tag: Tag) -> None:
+        # "Had A shown the X, ..."
+        self.skipped |= self.near(-1) is END and self.word(tag) == "had"
+
+    def on_leaves(self, tag: Tag) -> None:
+        # "B does not leave the X near the top."
+        self.skipped |= self.negated
+
+    on_show = on_leaves
+
+    def on_word(self, tag: Tag) -> None:
+        if tag.value in ("first", "second") and self.two and self.near(1).tag != "object":
+            self._choose_of_two(tag.value == "second")
 
     def on_and(self, tag: Tag) -> None:
         self._boundary()
@@ -97,9 +125,20 @@ class CandidateReader(Reader):
     def on_candidate(self, tag: Tag) -> None:
         previous = self.word(self.near(-1)) if self.at else ""
         before = previous.split()[-1] if previous else ""
+        start = self.at
         letters = self._letters()
-        if before in ASIDE or (before in COMPARED and self.letters):
+        named, self.named_any = self.named_any, True
+        if before in EXCEPTING and self._is_of_all(self._tag_at(start - 2)):
+            # "All candidates but B contain an error."
+            self.letters, self.skipped = (), True
+            return
+        if before in ASIDE or (before in COMPARED and self.letters) or self._is_compared(start):
+            if all(t.tag != "and" for t in self.sentence[start : self.at]):
+                # "Compared with A, B ..." is no list.
+                self.at = start
             self.skipped = True
+        elif before in PARTED and self.skipped:
+            self.letters = ()
         elif before in PARTED and len(self.found) > self.clause:
             kept, moved = self.found[: self.clause], self.found[self.clause :]
             seen = dict.fromkeys((c.kind, c.subjects, c.value, c.affirmed, c.span) for c in moved)
@@ -112,8 +151,11 @@ class CandidateReader(Reader):
                     Claim(kind, subjects, value, affirmed, TARGET, letter, span)
                     for letter in letters
                 ]
+            # Where another candidate was spoken of, what follows may be about either.
+            self.letters = () if named else letters
         else:
             self.letters, self.choice = letters, tag
+            self.two = letters if len(letters) == 2 else ()
             self.kept, self.objects = self.objects, []
             self.lacking = self.adding = self.moving = self.doubted = False
             self.expected = self.contrasted = self.negated = False
@@ -121,6 +163,32 @@ class CandidateReader(Reader):
             if self.passing:
                 self._whole("agrees", not self.refused, tag)
                 self.passing = False
+
+    def _is_compared(self, start: int) -> bool:
+        """Whether the candidate at `start` is only compared with the one that its clause is about
+        ("D resembles A"), or with one that is named next ("as in A, D ...")."""
+        back = start - 1
+        if self._tag_at(back).tag == "contrast" and self.word(self._tag_at(back)) != "and not":
+            return True
+        related = self._tag_at(back).tag == "by" or self.word(self._tag_at(back)) == "with"
+        if related and self.last_word(self._tag_at(back - 1)) in COMPARING:
+            return True
+        if self._tag_at(back).tag == "not":
+            # "B, not D, has ..."
+            enclosed = self._tag_at(back - 1).tag == self.near(1).tag == "comma"
+            return enclosed and self._tag_at(back - 2).tag == "candidate"
+        while self._tag_at(back).tag not in BOUNDARIES:
+            if self._tag_at(back).tag == "candidate":
+                return True
+            back -= 1
+        return False
+
+    def _is_of_all(self, tag: Tag) -> bool:
+        general = tag.tag in ("all", "none", "not", "others", "rest of")
+        return general or self.word(tag) in ("all", "every", "each", "any")
+
+    def _tag_at(self, index: int) -> Tag:
+        return self.sentence[index] if index >= 0 else END
 
     def _letters(self) -> tuple[str, ...]:
         letters = [str(self.sentence[self.at].value)]
@@ -139,6 +207,9 @@ class CandidateReader(Reader):
             letters.append(str(self.sentence[self.at].value))
 
     def on_others(self, tag: Tag) -> None:
+        if self.word(self.near(-1)) in PARTED:
+            # "It is near the left in the others."
+            self.found = self.found[: self.clause]
         self.letters, self.objects, self.choice = (), [], None
 
     def on_object(self, tag: Tag) -> None:
@@ -146,6 +217,7 @@ class CandidateReader(Reader):
             self.group()
             self.objects = []
             return
+        denied = self.near(-1).tag == "not" and self.letters != ()
         start, told = self.at, self.near(-1).tag in TELLING
         names, last = self.group()
         if told and len(names) > 1 and self.near(1).tag in ("be", "stays", "moves", "gone"):
@@ -154,6 +226,8 @@ class CandidateReader(Reader):
             names, last = self.group(1)
         self.objects = names
         self.expected = self.contrasted = False
+        # "A has neither the X near the top nor ..."
+        self.skipped |= denied
         if self.skipped:
             return
         if self.lacking:
@@ -170,10 +244,27 @@ class CandidateReader(Reader):
             # "In A the X is near the top, and in B it is near the left."
             self.objects = self.kept
 
-    def on_rest_of(self, tag: Tag) -> None:
-        self.objects, self.lacking = [], False
+        elif tag.value in ("former", "latter"):
+            self._choose_of_two(tag.value == "latter")
 
-    on_all = on_rest_of
+    def _choose_of_two(self, last: bool) -> None:
+        """Go on about the first or the last of two candidates, or of two objects."""
+        if len(self.two) == 2 and len(self.objects) < 2:
+            self.letters, self.objects = (self.two[last],), []
+        elif len(self.objects) == 2 and not self.two:
+            self.objects = [self.objects[last]]
+        else:
+            self.letters, self.objects = (), []
+
+    def on_rest_of(self, tag: Tag) -> None:
+        if self.word(self.near(-1)) in PARTED and self.word(tag).endswith("others"):
+            self.on_others(tag)
+            return
+        self.objects, self.lacking = [], False
+        self.negated |= self.word(tag).split()[0] in ("nothing", "no")
+
+    def on_all(self, tag: Tag) -> None:
+        self.objects, self.lacking = [], False
 
     def on_none(self, tag: Tag) -> None:
         self.objects, self.lacking, self.negated = [], False, True
@@ -231,6 +322,15 @@ class CandidateReader(Reader):
         elif self.word(tag).startswith("avoid"):
             self.negated = True
 
+    def on_moves(self, tag: Tag) -> None:
+        # "A misses the move of the X."
+        self.lacking = False
+
+    on_moving = on_moves
+
+    def on_future(self, tag: Tag) -> None:
+        self.skipped |= self.word(tag) == "would"
+
     def on_gone(self, tag: Tag) -> None:
         if self.near(1).tag == "object":
             self.lacking = not self.negated
@@ -261,7 +361,7 @@ class CandidateReader(Reader):
         self.objects, self.adding = [], False
 
     def _tell(self, kind: str, value: str, affirmed: bool, tag: Tag) -> None:
-        if self.skipped:
+        if self.skipped or self.refused:
             return
         for name in self.objects:
             for letter in self.letters or ("",):
@@ -272,15 +372,50 @@ class CandidateReader(Reader):
     # What is said of a whole candidate.
 
     def on_agree(self, tag: Tag) -> None:
-        if not self.letters:
+        if self.near(1).tag == "candidate" and self._is_compared(self.at + 1):
+            # "D matches B in everything but the X."
+            self.doubted = True
+        elif self._is_choice_ahead():
+            self.passing = not self.negated
+        elif not self.letters:
             self.passing = not self.negated and not (self.lasting and self.objects)
         elif not self.objects and not self._partial():
             self._whole("agrees", not (self.negated or self.refused), tag)
 
+    def _is_choice_ahead(self) -> bool:
+        """Whether it is the candidate named next that agrees: "the answer is therefore B"."""
+        step = 1
+        while self.near(step).tag in ("be", "word", "break", "future"):
+            step += 1
+        copula = any(self.near(k).tag in ("be", "future") for k in range(1, step))
+        return copula and self.near(step).tag == "candidate"
+
     def on_differ(self, tag: Tag) -> None:
         self.doubted = True
+        if self._is_between():
+            # "A and B differ in the X", "A differs from B in the X."
+            return
+        if self.lacking:
+            # "D does not have the error of C."
+            self.lacking = False
+            return
+        if self.objects and self.near(-1).tag == "comma" and self.word(tag) in NOUNS:
+            # "It is near the left, an error not seen in B."
+            self.objects, self.skipped = [], True
+            return
         if not self.objects and not self.negated and not self.lacking:
             self._whole("agrees", False, tag)
+
+    def _is_between(self) -> bool:
+        """Whether it is from one another that candidates differ."""
+        if not self.word(self.sentence[self.at]).startswith("differ"):
+            return False
+        step = 1
+        while self.near(step).tag not in BOUNDARIES | {"object"}:
+            if self.near(step).tag == "candidate":
+                return True
+            step += 1
+        return len(self.letters) > 1 and self.near(1).tag != "ignore"
 
     def _partial(self) -> bool:
         """Whether an agreement is said to be in an object, or to have an exception."""

@@ -66,18 +66,35 @@ class PairReader(Reader):
         self._relate("meeting", tag, "", not self.negated)
 
     def on_passed(self, tag: Tag) -> None:
+        if self.word(tag).startswith("no ") and not self._ahead({"between", "with"}):
+            opening = self.near(-1) is END or self.near(-1).tag in BOUNDARIES
+            if opening or "there" in (self.word(self.near(-1)), self.word(self.near(-2))):
+                # "No contact awaits the A" is not about the pair told of before.
+                return
         self._relate("meeting", tag, "", self.negated)
 
     def on_contact(self, tag: Tag) -> None:
         following = self.near(1)
         if following.tag in ("between", "with", "object"):
             self._relate("meeting", tag, "", not self.negated)
+        elif self.negated or self._ahead({"not", "none", "contrast"}):
+            # A contact that is denied need not be that of the pair told of before.
+            return
         elif self.relation is None and self.near(-1).tag not in ("by", "past"):
             pair = self.met or tuple(self.both())
             if len(pair) == 2:
                 self._relate("meeting", tag, "", not self.negated)
                 if self.relation:
                     self.relation.partners, self.relation.between = list(pair), True
+
+    def _ahead(self, wanted: set[str]) -> bool:
+        """Whether one of the tags follows in the clause."""
+        step = 1
+        while self.near(step).tag not in BOUNDARIES:
+            if self.near(step).tag in wanted:
+                return True
+            step += 1
+        return False
 
     def on_close(self, tag: Tag) -> None:
         if self.relation and not self.relation.partners and self.relation.kind != "close":

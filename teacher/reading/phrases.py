@@ -300,7 +300,7 @@ _TABLE: dict[tuple[str, str], str] = {
     ("maybe", ""): (
         "no longer; if; unless; until; may; might; could; once; when; whenever; even if; would "
         "have; had it; whether; likely; perhaps; possibly; seems; appears to; unlikely; were it "
-        "not; had the; without the need"
+        "not; had the; without the need; too late; too slow to; unable to"
     ),
     ("future", ""): (
         "will; will be; going to; at the target moment; by the target moment; ends up; end up; "
@@ -335,7 +335,8 @@ _TABLE: dict[tuple[str, str], str] = {
         "the whole scene; every other object; all others; the other candidates; the resting "
         "objects; stationary objects; moving objects; any other object; an other; the layout of "
         "the other objects; the other pairs; other pairs; another pair; any pair; anything; no "
-        "other objects; anything else; any other; the remaining pairs; all the others"
+        "other objects; anything else; any other; the remaining pairs; all the others; the other "
+        "two; the other three"
     ),
     ("all", ""): (
         "all objects; every object; all of the objects; everything; all the objects; each object; "

@@ -135,6 +135,9 @@ class Reader:
         assert isinstance(noun, Noun)
         known = [*self.ground.objects, *(self.ground.extras if self.shows_extras else ())]
         fitting = [name for name in known if _fits(noun, name)]
+        if len(fitting) > 1 and not (noun.color or noun.material or noun.plural or noun.others):
+            # "The A cube and the B sphere move, the cube quickly."
+            fitting = [name for name in fitting if name in self.mentioned] or fitting
         if not fitting and not noun.others and self.word(self.near(-1)) != "no":
             when = EITHER if self.shows_extras else CUT
             self.claims.append(

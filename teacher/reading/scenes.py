@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 from teacher.reading.grounding import BETWEEN, CUT, EITHER, TARGET
 from teacher.reading.pairs import RELATIONS, PairReader
-from teacher.reading.phrases import COARSE
+from teacher.reading.phrases import COARSE, COLUMNS, MIDDLE, ROWS
 from teacher.reading.reader import BOUNDARIES, END, MOST, Names
 from teacher.reading.tagging import Tag
 
@@ -15,17 +17,22 @@ STILL_VERBS = {
     *("rest", "rests", "stand", "stands", "sit", "sits", "lie", "lies"),
 }
 """Opening words of phrases for rest that hold a verb ("does not move", but not "at rest")."""
-SAID = {"region", "direction", "speed", "still", "moving", "rest", "out", "hidden"}
+SAID = {"from", "region", "direction", "speed", "still", "moving", "rest", "out", "hidden"}
 """Tags of what may be said of an object before it is named."""
 OPENING = SAID | {"into", "toward", "slight", "word", "by", "be", "comma", "pronoun", "future"}
 OPENING |= {"expected"}
 """Tags that may stand between a clause's beginning and a subject that comes late."""
 INVERTED = {"be", "still", "rest", "future", "expected", "word"}
 """Tags of a verb before its subject: "near the top is the A"."""
-DENYING = {"not", "be", "moves", "moving", "contrast"}
+DENYING = {"not", "be", "moves", "moving", "contrast", "still"}
 """Tags between which and a negation a direction is denied: "does not move east"."""
 TAKERS = {"by", "close", "meet", "passed", "contact", "between", "course", "show"}
 """Tags before a noun phrase that is no subject."""
+ASIDE = {"unlike", "besides", "despite", "except", "excepting", "apart", "beside", "given"}
+"""Words before a noun phrase that is only set against the subject."""
+WAS = {"was", "were", "had"}
+"""Opening words of phrases of the past that are verbs."""
+SIDE_WORDS = {*ROWS, *COLUMNS, *MIDDLE}
 
 
 class SceneReader(PairReader):
@@ -47,6 +54,14 @@ class SceneReader(PairReader):
         self.last: Names = []
         """Whom "which" stands for."""
         self.hypothetical = False
+        self.inner = False
+        """Whether a clause of a place is being read ("where the A was"), within another's."""
+        self.neither = self.relative = False
+        self.pronominal = False
+        """Whether the subject is a pronoun, which no list goes on from."""
+        self.gapped = self.verbal = False
+        """Whether the subject has what is said of it without a verb ("the A moves east, the B
+        west"), and whether an earlier subject of the sentence had its verb."""
         self._boundary()
 
     def end(self) -> None:
@@ -66,7 +81,11 @@ class SceneReader(PairReader):
     def on_comma(self, tag: Tag) -> None:
         if not self.is_incomplete():
             self.flush()
+            # "Neither the A, which moves, nor the B, ...": what is denied of both comes later.
+            self.hypothetical |= self.neither and self.relative
             self._boundary()
+            if self.inner and self.near(1).tag != "break":
+                self.subjects, self.group_start, self.inner = [None], 0, False
             self.finite |= self.absolute
             self.absolute = False
             if self.near(1).tag == "region" and self.near(2).tag == "object":
@@ -85,13 +104,18 @@ class SceneReader(PairReader):
             self.flush()
             self.negated = self.slight = False
             self.crossed = True
-            self._open()
+            # "Near the left and near the right, the A ..." goes on with a list.
+            listed = self.near(-1).tag == self.near(1).tag == "region"
+            if not (listed and self.near(2).tag == "comma"):
+                self._open()
 
     def _open(self) -> None:
         """Forget the subject where a clause opens with what is said of the next: "and near the
         top is the A", "while moving slowly, the A"."""
         step = 1
         while self.near(step).tag in OPENING:
+            if self.word(self.near(step)) == "where":
+                return
             step += 1
         if step > 1 and self.near(step - 1).tag not in ("by", "with"):
             said = any(self.near(k).tag in SAID for k in range(1, step))
@@ -102,6 +126,7 @@ class SceneReader(PairReader):
 
     def on_not(self, tag: Tag) -> None:
         self.negated = True
+        self.neither |= self.word(tag) == "neither"
 
     on_contrast = on_not
 
@@ -111,12 +136,16 @@ class SceneReader(PairReader):
 
     def on_future(self, tag: Tag) -> None:
         self.future = True
+        if self.word(tag) == "would" and any(t.tag == "maybe" for t in self.sentence):
+            self.maybe = True
         self.verb()
 
     on_expected = on_future
 
     def on_past(self, tag: Tag) -> None:
         self.past = True
+        if self.word(tag).split()[0] in WAS:
+            self.verb()
 
     def on_lack(self, tag: Tag) -> None:
         if self.word(tag).startswith("without"):
@@ -156,7 +185,18 @@ class SceneReader(PairReader):
         if self._is_complement(previous):
             self._complement()
             return
+        self.verbal |= self.finite
+        if self._is_relative(previous):
+            self.flush()
+            self.last = self.group()[0]
+            self.inner = previous.tag != "which"
+            # What is done to "the A, which the B hits" is not told apart.
+            self.subjects, self.group_start = self.last if self.inner else [None], 0
+            self.finite = self.blocked = self.nobody = self.gapped = False
+            self.pending = []
+            return
         fresh = self.finite or not self.subjects or self.nobody
+        fresh |= self.pronominal or self.gapped
         # "Near the top is the A, and the B ..." places the A alone.
         names, _ = self.group(1 if self.pending and self._parted() else MOST)
         self.subjects = names if fresh else [*self.subjects, *names][-MOST:]
@@ -166,10 +206,22 @@ class SceneReader(PairReader):
         self.absolute = previous.tag == "with"
         inverted = bool(self.pending) and previous.tag in INVERTED
         self.finite, self.blocked, self.nobody, self.complement = inverted, False, False, False
+        self.pronominal = self.gapped = False
         if relation and not relation.subjects:
             relation.subjects = self.subjects
         # "Near the top, the A and the B are close" places the pair, not its objects.
         self._settle(places=not self._is_pair_ahead())
+
+    def _is_relative(self, previous: Tag) -> bool:
+        """Whether the noun phrase is the subject of a clause about another object or a place:
+        "the A, which the B hits", "where the B was"."""
+        if self.word(previous) == "where":
+            return True
+        step = -2
+        while self.near(step).tag in ("by", "comma"):
+            step -= 1
+        places = ("object", "region", "into", "from")
+        return previous.tag == "which" and self.near(step).tag in places
 
     def _settle(self, places: bool) -> None:
         """Tell of the subject what was said before it was named."""
@@ -191,7 +243,10 @@ class SceneReader(PairReader):
         if previous.tag == "with":
             # "With the A near the top, ..." tells of the A.
             return self.near(-2) is not END and self.near(-2).tag not in BOUNDARIES
-        return previous.tag in TAKERS
+        if previous.tag == "contrast" and self.subjects:
+            # "The A, rather than the B, ..."
+            return True
+        return previous.tag in TAKERS or self.word(previous) in ASIDE
 
     def _complement(self) -> None:
         start = self.at
@@ -205,10 +260,12 @@ class SceneReader(PairReader):
             self.relation.partners = names
         elif self.near(-1).tag == "with" or self.sentence[start - 1].tag == "with":
             self.companions = names
-        self.last = names[-1:]
+        if self.sentence[start - 1].tag != "contrast":
+            self.last = names[-1:]
         self.blocked, self.crossed, self.complement = True, False, True
 
     def on_which(self, tag: Tag) -> None:
+        self.relative = True
         if self.near(-1).tag == "object" or self.near(-2).tag == "object":
             self.flush()
             several = len(self.subjects) - self.group_start > 1 and not self.complement
@@ -221,10 +278,21 @@ class SceneReader(PairReader):
         if previous.tag in ("by", "with", "close", "meet", "passed", "between", "course"):
             self._refer(previous, tag)
             return
+        if self.word(tag) in ("itself", "themselves") and previous.tag == "comma":
+            # "Pushes the B east, itself going west."
+            self.subjects, self.group_start = [None], 0
+            return
+        done = previous.tag == "word" and self.word(previous).endswith(("s", "ed", "ing"))
+        if done and self.word(previous) not in ("joins", "joining"):
+            # "The A pushes it east": what follows is of another than the A.
+            self.subjects, self.group_start = [None], 0
+            return
         possessive = self.word(tag) in ("its", "their") or self.near(1).tag == "object"
         if previous.tag == "object" or possessive or (previous.tag in VERBS and self.subjects):
             return
-        self.subjects = self._antecedent(str(tag.value))
+        self.verbal |= self.finite
+        self.subjects = [None] if self._is_ahead() else self._antecedent(str(tag.value))
+        self.pronominal, self.gapped = True, False
         self.group_start = 0
         self.finite = self.blocked = self.nobody = False
         self._settle(places=False)
@@ -238,6 +306,13 @@ class SceneReader(PairReader):
             pair = self.both()
             return [pair[pronoun == "latter"]] if len(pair) == 2 else [None]
         return self.both()
+
+    def _is_ahead(self) -> bool:
+        """Whether a pronoun may stand for whom the next clause names: "although it was at rest,
+        the A moves"."""
+        opening = self.sentence[: self.at]
+        subordinate = any(t.tag in ("break", "maybe", "by") for t in opening)
+        return subordinate and all(t.tag != "object" for t in opening)
 
     def _refer(self, previous: Tag, tag: Tag) -> None:
         """A pronoun that is no subject."""
@@ -257,7 +332,16 @@ class SceneReader(PairReader):
         self.subjects, self.group_start = [None], 0
         self.finite = self.blocked = self.nobody = False
 
-    on_all = on_rest_of
+    def on_all(self, tag: Tag) -> None:
+        self.on_rest_of(tag)
+        names = list(dict.fromkeys(self.mentioned))
+        taken = any(
+            t.tag in TAKERS and following.tag == "object"
+            for t, following in pairwise(self.sentence)
+        )
+        if self.word(tag) == "all of them" and None not in names and len(names) > 1 and not taken:
+            self.subjects = names
+
     on_no_other = on_rest_of
 
     def on_none(self, tag: Tag) -> None:
@@ -277,7 +361,17 @@ class SceneReader(PairReader):
             if relation.kind == "close":
                 self.close_region(relation, tag)
             return
+        if self.negated and self._is_kept(tag):
+            self._tell("region", str(tag.value), True, EITHER, tag)
+            return
         if self.negated and self.near(-1).tag not in ("not", "be", "future", "contrast"):
+            return
+        if self.near(1).tag == "and" and self.near(2).value in SIDE_WORDS:
+            # "Near the left and the right are ..." gives each its own.
+            return
+        unplaced = self.near(1).tag == "be" and self.word(tag).startswith("the ")
+        if unplaced or self.near(1).tag == "none":
+            # "The top is empty", "near the top nothing remains."
             return
         if any(self.near(-k).tag == "leaves" and self._is_bare(self.near(-k)) for k in (1, 2, 3)):
             # "Leaves the area near the top."
@@ -295,6 +389,18 @@ class SceneReader(PairReader):
                 # "The A near the top will be near the left."
                 when = EITHER
         self._tell("region", str(tag.value), not self.negated, when, tag)
+
+    def _is_kept(self, tag: Tag) -> bool:
+        """Whether a negation leaves a region standing: "has not moved from near the top", "does
+        not leave its place near the top", "nor has the A near the top"."""
+        previous = self.near(-1)
+        if tag.tag == "from":
+            return previous.tag in ("moves", "moving")
+        if previous.tag == "object":
+            return not self.blocked and self.word(self.near(-2)) not in ("is", "are", "be")
+        return any(
+            self.near(-k).tag == "leaves" and self._is_bare(self.near(-k)) for k in (1, 2, 3)
+        )
 
     def _is_former(self) -> bool:
         """Whether a word after the current one puts it before the target: "out of view before"."""
@@ -328,6 +434,11 @@ class SceneReader(PairReader):
         self._tell("speed", str(tag.value), not self.negated, CUT, tag)
 
     def on_still(self, tag: Tag) -> None:
+        if "not" in self.word(tag).split() and self.near(1).tag in ("direction", "speed"):
+            # "Does not move east."
+            self.negated = self.moved = True
+            self.verb()
+            return
         if self.word(tag).split()[0] in STILL_VERBS:
             self.verb()
         when = self.moment
@@ -338,6 +449,8 @@ class SceneReader(PairReader):
         self._tell("still", "", not self.negated, when, tag)
 
     def on_rest(self, tag: Tag) -> None:
+        if self.near(1).tag in BOUNDARIES:
+            self.verb()
         if self.near(-1).tag == "object" or self.near(-1).tag == "and":
             self.on_still(tag)
 
@@ -353,7 +466,8 @@ class SceneReader(PairReader):
             when = CUT if self.moment == CUT else EITHER
             self._tell("still", "", True, when, tag)
 
-    on_off = on_moving
+    def on_off(self, tag: Tag) -> None:
+        self.moved = True
 
     def on_slight(self, tag: Tag) -> None:
         if self.moved or self.near(1).tag in ("moves", "moving", "off"):
@@ -434,7 +548,17 @@ class SceneReader(PairReader):
             subjects = self.subjects[-1:] if apart else self.subjects
             if not self.finite and not apart:
                 subjects = self.subjects[self.group_start :]
+            self.gapped |= not self.finite and (self.verbal or self._is_verbless(kind))
         for name in subjects:
             self.claims.append(self.claim(kind, (name,), value, affirmed, when, tag))
         if len(subjects) > 1 and affirmed:
             self.shared.append((kind, value, tuple(subjects), tag))
+
+    def _is_verbless(self, kind: str) -> bool:
+        """Whether a motion is said of the subject without so much as a participle."""
+        step = -1
+        while self.near(step).tag not in ("object", *BOUNDARIES):
+            if self.near(step).tag in ("moving", "moves"):
+                return False
+            step -= 1
+        return kind in ("direction", "speed", "extent")
