@@ -7,9 +7,11 @@ killed goes on from there; the built-in narrator then ends with the very bytes o
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +24,7 @@ from data.records import Rationale, SelectionItem
 from teacher.journal import Journal, save_accepted
 from teacher.judging import Judge, signature
 from teacher.predicates import predicates_of
-from teacher.progress import Progress
+from teacher.progress import Progress, kinds
 from teacher.replies import Reply
 from teacher.report.summary import Summary, accepted_of, summarise
 from teacher.template import narrate
@@ -39,21 +41,32 @@ BATCH = 200
 
 @dataclass(frozen=True)
 class Narration:
-    """A teacher's answers for a store: the accepted rationales in item order, the figures about
-    all of them, and whether any was asked for just now."""
+    """A teacher's answers for a store: the accepted rationales in item order, all answers by item,
+    how many items have too short a prefix, and whether any answer is new."""
 
     rationales: list[Rationale]
-    summary: Summary
+    items: list[SelectionItem]
+    answers: dict[str, list[Rationale]]
+    attempts: int
+    too_short: int
     asked: bool
 
+    @cached_property
+    def summary(self) -> Summary:
+        """The figures of a report. They read every word, so they are worked out when asked for."""
+        return summarise(self.items, self.answers, self.attempts, self.too_short)
+
     def __str__(self) -> str:
-        told = self.summary
-        reasons = ", ".join(f"{count} {kind}" for kind, count in told.rejected.items())
-        words = f" ({np.mean(told.lengths):.0f} words on average)" if told.lengths else ""
-        instead = f", {told.fallback} by the built-in narrator instead" if told.fallback else ""
+        rejected = Counter(
+            kind for given in self.answers.values() for r in given for kind in kinds(r)
+        )
+        reasons = ", ".join(f"{count} {kind}" for kind, count in rejected.most_common())
+        instead = sum(r.fallback for r in self.rationales)
+        told = f" ({instead} by the built-in narrator instead)" if instead else ""
+        aside = len(self.items) - self.too_short - len(self.rationales)
         return (
-            f"rationales: {told.accepted} accepted{words}{instead}, {told.set_aside} items set "
-            f"aside, {told.too_short} with too short a prefix; answers were rejected for: "
+            f"rationales: {len(self.rationales)} accepted{told}, {aside} items set aside, "
+            f"{self.too_short} with too short a prefix; answers were rejected for: "
             f"{reasons or 'nothing'}"
         )
 
@@ -65,21 +78,22 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     narration = narrate_store(store, cfg.teacher)
     log.info(narration)
-    summary = narration.summary
-    if narration.asked or not (run.folder / "report.html").exists():
+    report, page = run.folder / "report.json", run.folder / "report.html"
+    if narration.asked or not page.exists():
         from teacher.report.page import write_page
 
-        write_json(run.folder / "report.json", summary.to_dict())
-        write_text(run.folder / "report.txt", summary.text() + "\n")
-        shown = (cfg.shown, cfg.teacher.seed)
-        write_page(store, narration.rationales, summary.text(), *shown, run.folder)
-    log.info("report: %s", run.folder / "report.html")
+        told = narration.summary.text()
+        write_json(report, narration.summary.to_dict())
+        write_text(run.folder / "report.txt", told + "\n")
+        write_page(store, narration.rationales, told, cfg.shown, cfg.teacher.seed, run.folder)
+    log.info("report: %s", page)
+    summary = json.loads(report.read_bytes())
     return {
-        "accepted": float(summary.accepted),
-        "answers": float(sum(summary.asked)),
-        "set_aside": float(summary.set_aside),
-        "too_short": float(summary.too_short),
-        "mean_words": float(np.mean(summary.lengths)) if summary.lengths else 0.0,
+        "accepted": float(summary["accepted"]),
+        "answers": float(sum(summary["asked"])),
+        "set_aside": float(summary["set_aside"]),
+        "too_short": float(summary["too_short"]),
+        "mean_words": float(np.mean(summary["lengths"] or [0])),
     }
 
 
@@ -129,9 +143,8 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
             keep([r for item in aside for r in _stand_in(item, store, judge)])
         rationales = accepted_of(items, answers)
         save_accepted(rationales, store.folder / "rationales.parquet")
-    summary = summarise(items, answers, cfg.attempts, too_short)
     asked = sum(map(len, answers.values())) > before
-    return Narration(rationales, summary, asked)
+    return Narration(rationales, items, dict(answers), cfg.attempts, too_short, asked)
 
 
 def _open(given: list[Rationale], cfg: TeacherConfig) -> bool:
