@@ -44,9 +44,9 @@ run: setup ## Train and measure the tiny student and the tiny retriever, and rep
 test: setup vllm-env ## Run every test
 	$(BIN)/python -m pytest
 
-# What tests/train imports takes longer than all quick tests.
+# What the tests of trainers and of their evaluation import takes longer than all quick tests.
 check: setup lint ## Lint, then run the quick tests
-	$(BIN)/python -m pytest -m "not slow" --ignore tests/train
+	$(BIN)/python -m pytest -m "not slow" --ignore tests/train --ignore tests/evaluation/test_commands.py
 
 lint: setup ## Check format and style
 	$(BIN)/ruff format --check .

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import torch
-from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
-from transformers import PreTrainedTokenizerFast, Qwen3Config, Qwen3ForCausalLM
+if TYPE_CHECKING:
+    from transformers import PreTrainedTokenizerFast
 
 SPECIAL = ("<|endoftext|>", "<|im_start|>", "<|im_end|>")
 TEMPLATE = (
@@ -20,6 +20,10 @@ TEMPLATE = (
 
 def save_tiny_qwen3(folder: Path, texts: Iterable[str], vocabulary: int = 1024) -> Path:
     """Write a model and a tokenizer trained on `texts` as vLLM reads them."""
+    # Imported here, for few of the tests that import this file serve a model.
+    import torch
+    from transformers import Qwen3Config, Qwen3ForCausalLM
+
     tokenizer = _tokenizer(texts, vocabulary)
     torch.manual_seed(0)
     config = Qwen3Config(
@@ -47,6 +51,9 @@ def save_tiny_qwen3(folder: Path, texts: Iterable[str], vocabulary: int = 1024) 
 
 
 def _tokenizer(texts: Iterable[str], vocabulary: int) -> PreTrainedTokenizerFast:
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
+    from transformers import PreTrainedTokenizerFast
+
     tokenizer = Tokenizer(models.BPE())
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     tokenizer.decoder = decoders.ByteLevel()
