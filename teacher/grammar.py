@@ -13,8 +13,7 @@ from string import ascii_lowercase
 from conf.errors import UserError
 from conf.schema import TeacherConfig
 from data.records import LETTERS
-from teacher import lexicon
-from teacher.numbers import WORDS
+from teacher.numbers import WORDS, lexicon
 from teacher.validate import SECTIONS, word_count
 
 GRAMMAR_VERSION = "1"

@@ -11,7 +11,7 @@ from data.records import Rationale, SelectionItem
 from teacher.predicates import Predicates
 from teacher.prompts import PROMPT_VERSION
 from teacher.reading.grounding import VERDICTS, Claim
-from teacher.replies import Reply
+from teacher.servers.replies import Reply
 from teacher.template import NARRATOR_VERSION
 from teacher.validate import VALIDATOR_VERSION, validate
 

@@ -25,13 +25,13 @@ from teacher.journal import Journal, save_accepted
 from teacher.judging import Judge, signature
 from teacher.predicates import predicates_of
 from teacher.progress import Progress, kinds
-from teacher.replies import Reply
 from teacher.report.summary import Summary, accepted_of, summarise
+from teacher.servers.replies import Reply
 from teacher.template import narrate
 
 if TYPE_CHECKING:
     from data.store import Store
-    from teacher.asking import Job, Keep
+    from teacher.servers.asking import Job, Keep
 
 log = logging.getLogger(__name__)
 
@@ -135,7 +135,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
             if cfg.url is None:
                 too_short = _narrate_all(jobs, store, judge, keep, progress)
             elif jobs:
-                from teacher.asking import Asking
+                from teacher.servers.asking import Asking
 
                 too_short = asyncio.run(Asking(store, cfg, judge, keep, progress).run(jobs))
         if cfg.fallback:

@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 from conf.entry import Run, command
 from conf.errors import UserError
 from conf.schema import ServeCommand
-from teacher.health import health_problem
+from teacher.servers.health import health_problem
 
 log = logging.getLogger(__name__)
 

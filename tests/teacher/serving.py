@@ -12,7 +12,7 @@ from pathlib import Path
 
 import psutil
 
-from teacher.health import health_problem
+from teacher.servers.health import health_problem
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = ROOT / ".venv-vllm"

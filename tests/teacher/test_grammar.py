@@ -12,8 +12,8 @@ import pytest
 
 from conf.errors import UserError
 from conf.schema import TeacherConfig
-from teacher import lexicon
 from teacher.grammar import OPENERS, grammar
+from teacher.numbers import lexicon
 from teacher.predicates import predicates_of
 from teacher.template import narrate
 from teacher.validate import validate, word_count

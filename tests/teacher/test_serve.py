@@ -19,11 +19,11 @@ import pytest
 from conf.errors import UserError
 from conf.schema import ServeCommand, TeacherConfig
 from teacher import serve
-from teacher.client import Client
 from teacher.grammar import GRAMMAR_VERSION
 from teacher.journal import read_rationales
 from teacher.narrate import narrate_store
 from teacher.serve import Machine
+from teacher.servers.client import Client
 from tests.teacher.made import corpus, made_store
 from tests.teacher.serving import ROOT, Serving, free_port
 from tests.teacher.tiny_qwen3 import save_tiny_qwen3

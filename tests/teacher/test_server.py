@@ -10,8 +10,8 @@ import pytest
 
 from conf.errors import UserError
 from conf.schema import TeacherConfig
-from teacher.client import Client, jitter
 from teacher.narrate import narrate_store
+from teacher.servers.client import Client, jitter
 from tests.teacher.odd import OddServer, completion
 
 CHAT = [{"role": "user", "content": "Are you there?"}]

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
-from teacher.client import Client, UnansweredError
 from teacher.judging import Judge
 from teacher.predicates import Predicates, predicates_of
 from teacher.progress import Progress
 from teacher.prompts import messages
-from teacher.replies import Reply
+from teacher.servers.client import Client, UnansweredError
+from teacher.servers.replies import Reply
 
 if TYPE_CHECKING:
     from data.store import Store

@@ -11,7 +11,14 @@ from typing import Any
 
 from conf.errors import UserError
 from conf.schema import TeacherConfig
-from teacher.server import Chat, MalformedReplyError, RateLimitedError, Reply, RequestError, Server
+from teacher.servers.server import (
+    Chat,
+    MalformedReplyError,
+    RateLimitedError,
+    Reply,
+    RequestError,
+    Server,
+)
 
 log = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain, compress, repeat
 
-from teacher.lexicon import IDEOGRAPHS, IDIOMS, PICTOGRAPHS
+from teacher.numbers.lexicon import IDEOGRAPHS, IDIOMS, PICTOGRAPHS
 
 Spans = list[tuple[int, int]]
 

@@ -11,8 +11,8 @@ import openai
 
 from conf.errors import UserError
 from conf.schema import TeacherConfig
-from teacher.health import health_problem
-from teacher.replies import Reply, replies
+from teacher.servers.health import health_problem
+from teacher.servers.replies import Reply, replies
 
 Chat = list[dict[str, str]]
 

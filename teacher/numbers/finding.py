@@ -15,8 +15,8 @@ from collections.abc import Callable
 from functools import lru_cache
 from itertools import accumulate
 
-from teacher import lexicon
-from teacher.folding import FOLDS, Spans, fold, fold_word
+from teacher.numbers import lexicon
+from teacher.numbers.folding import FOLDS, Spans, fold, fold_word
 
 Rule = Callable[["Prose", int], "tuple[int, int] | None"]
 

@@ -12,8 +12,7 @@ def _set(text: str) -> frozenset[str]:
 
 
 UNITS_AND_TEENS = _words(
-    "zero nought naught nil two three four five six seven eight nine ten eleven twelve "
-    "thirteen "
+    "zero nought naught nil two three four five six seven eight nine ten eleven twelve thirteen "
     "fourteen fifteen sixteen seventeen eighteen nineteen"
 )
 TENS = _words("twenty thirty forty fourty fifty sixty seventy eighty ninety ninty")
@@ -23,28 +22,21 @@ CARDINALS = (*UNITS_AND_TEENS, *TENS, *SCALES)
 
 ORDINALS = _words(
     "second third fourth fifth sixth seventh eighth eigth ninth nineth tenth eleventh twelfth "
-    "twelth thirteenth fourteenth fifteenth sixteenth seventeenth eighteenth nineteenth "
-    "twentieth "
+    "twelth thirteenth fourteenth fifteenth sixteenth seventeenth eighteenth nineteenth twentieth "
     "thirtieth fortieth fourtieth fiftieth sixtieth seventieth eightieth ninetieth hundredth "
-    "thousandth millionth billionth trillionth umpteenth nth kth ith jth zeroth tertiary "
-    "secondly "
+    "thousandth millionth billionth trillionth umpteenth nth kth ith jth zeroth tertiary secondly "
     "thirdly fourthly fifthly"
 )
 """Every English ordinal but "first", which has rules of its own."""
 
 QUANTITIES = _words(
-    "half halves halved halving halfway quarter quarters quartered thirds fourths fifths "
-    "sixths "
+    "half halves halved halving halfway quarter quarters quartered thirds fourths fifths sixths "
     "sevenths eighths ninths tenths hundredths thousandths twice thrice double doubles doubled "
-    "doubling doubly triple triples tripled tripling triply treble trebled quadruple "
-    "quadruples "
-    "quadrupled quintuple quintupled sextuple septuple octuple onefold dozen dozens "
-    "dozenth couple "
-    "couples duo trio triad triads triplet triplets umpteen quartet quintet sextet septet "
-    "octet "
-    "twain single singly percent percentage "
-    "percentages percentile pct permille cent cents fortnight decade decades century centuries "
-    "millennium millennia oclock teens zeroes onehalf"
+    "doubling doubly triple triples tripled tripling triply treble trebled quadruple quadruples "
+    "quadrupled quintuple quintupled sextuple septuple octuple onefold dozen dozens dozenth "
+    "couple couples duo trio triad triads triplet triplets umpteen quartet quintet sextet septet "
+    "octet twain single singly percent percentage percentages percentile pct permille cent cents "
+    "fortnight decade decades century centuries millennium millennia oclock teens zeroes onehalf"
 )
 
 TIMES = _words(
@@ -60,29 +52,24 @@ MISSPELT = _words(
 FOREIGN = _words("""
 uno dos tres cuatro cinco seis siete ocho nueve diez doce quince dieciséis diecisiete dieciocho
 diecinueve veinte veintiuno veintidós treinta cuarenta cincuenta sesenta setenta ochenta noventa
-cien
-ciento doscientos doscientas mil segundo segunda segundos segundas tercer tercero tercera terceros
-cuarto cuarta quinto quinta séptimo décimo mitad doble dobles triple docena docenas tercio tercios
-deux trois quatre cinq sept huit neuf dix onze douze treize quatorze quinze vingt trente
-quarante cinquante soixante mille moitié demi demie deuxième deuxièmes seconde secondes troisième
-quatrième cinquième sixième quart quarts douzaine dizaine centaine
+cien ciento doscientos doscientas mil segundo segunda segundos segundas tercer tercero tercera
+terceros cuarto cuarta quinto quinta séptimo décimo mitad doble dobles triple docena docenas
+tercio tercios
+deux trois quatre cinq sept huit neuf dix onze douze treize quatorze quinze vingt trente quarante
+cinquante soixante mille moitié demi demie deuxième deuxièmes seconde secondes troisième quatrième
+cinquième sixième quart quarts douzaine dizaine centaine
 eins zwei zwo drei dreien vier fünf sechs sieben acht neun zehn zwölf dreizehn vierzehn fünfzehn
-zwanzig
-dreißig vierzig fünfzig hundert tausend zweite zweiten zweiter zweites zweitem dritte dritten
-dritter
-drittes drittem vierte vierten vierter fünfte fünften zweimal dreimal viermal fünfmal zehnmal
-zweifach
-dreifach hälfte halb halbe halben halber halbes doppelt doppelte doppelten dutzend drittel viertel
-sekunde sekunden stunde stunden prozent
+zwanzig dreißig vierzig fünfzig hundert tausend zweite zweiten zweiter zweites zweitem dritte
+dritten dritter drittes drittem vierte vierten vierter fünfte fünften zweimal dreimal viermal
+fünfmal zehnmal zweifach dreifach hälfte halb halbe halben halber halbes doppelt doppelte
+doppelten dutzend drittel viertel sekunde sekunden stunde stunden prozent
 quattro cinque sei sette otto nove dieci undici dodici tredici quindici venti trenta quaranta
-cinquanta
-cento mila secondi seconda terzo terza terzi quarta quinta doppio doppia mezza dozzina
+cinquanta cento mila secondi seconda terzo terza terzi quarta quinta doppio doppia mezza dozzina
 dois duas três quatro cinco sete oito dez doze vinte trinta cem segundo terceiro terceira quarto
-metade
-meia dobro dúzia
+metade meia dobro dúzia
 twee drie vijf zeven negen tien twaalf dertien veertien vijftien twintig dertig veertig vijftig
-honderd
-duizend tweede derde vierde vijfde helft halve dubbele tweemaal driemaal dozijn seconden procent
+honderd duizend tweede derde vierde vijfde helft halve dubbele tweemaal driemaal dozijn seconden
+procent
 två tre fyra sju åtta nio tio
 dwa trzy cztery pięć sześć siedem osiem dziewięć dziesięć
 bir iki dört beş altı yedi sekiz dokuz
@@ -90,28 +77,23 @@ dua tiga empat lima enam tujuh delapan sembilan sepuluh
 ichi roku hachi juu futatsu mittsu yottsu
 один два две двух двум двумя двое три трёх трём тремя трое четыре четырёх четырём пять пяти пятью
 шесть шести семь семи восемь восьми девять десять десяти одиннадцать двенадцать двадцать тридцать
-сорок
-пятьдесят сто двести тысяча тысячи тысяч половина половину половины дважды трижды вдвое втрое
-второй вторая второе второго второму вторым втором вторую третий третья третье третьего третьем
-третью
-четвёртый четвёртая пятый пятая десятый десятая треть четверть
-секунда секунду секунды секунд минуты минут процентов дюжина
+сорок пятьдесят сто двести тысяча тысячи тысяч половина половину половины дважды трижды вдвое
+втрое второй вторая второе второго второму вторым втором вторую третий третья третье третьего
+третьем третью четвёртый четвёртая пятый пятая десятый десятая треть четверть секунда секунду
+секунды секунд минуты минут процентов дюжина
 δύο τρία τρεις τέσσερα τέσσερις πέντε έξι επτά οκτώ εννέα δέκα
 واحد واحدة اثنان اثنين اثنتان اثنتين ثلاثة ثلاث أربعة أربع خمسة خمس ستة ست سبعة سبع ثمانية ثماني
-ثمان
-تسعة تسع عشرة عشر عشرون عشرين مئة مائة ألف مرتين نصف ثلث ربع ثاني ثانية ثالث ثالثة رابع رابعة
+ثمان تسعة تسع عشرة عشر عشرون عشرين مئة مائة ألف مرتين نصف ثلث ربع ثاني ثانية ثالث ثالثة رابع رابعة
 كرتان كرتين مكعبان مكعبين أسطوانتان أسطوانتين
 दो तीन चार पांच पाँच छह छः सात आठ नौ दस ग्यारह बारह बीस सौ हज़ार दूसरा दूसरी तीसरा तीसरी तीसरे
-चौथा
-चौथी आधा आधी आधे दोगुना दोगुनी पहला पहली
+चौथा चौथी आधा आधी आधे दोगुना दोगुनी पहला पहली
 하나 둘 셋 넷 다섯 여섯 일곱 여덟 아홉 열 두개 세개 두 세 번째 절반
 שתיים שניים שני שתי שלוש שלושה ארבע ארבעה חמש חמישה שבע שמונה תשע עשר
 """)
 """Numbers in other languages, where they are no English word."""
 FOREIGN_FIRSTS = _words(
-    "primera primero primeras primeros premier première primeiro primeira primo erste "
-    "ersten erster "
-    "erstes erstem eerste первый первая первое первого первому первым первом первую"
+    "primera primero primeras primeros premier première primeiro primeira primo erste ersten "
+    "erster erstes erstem eerste первый первая первое первого первому первым первом первую"
 )
 """Words that have the rules of "first"."""
 NAMES = _set("otto dix tio tre bir mille mila lima")
@@ -119,8 +101,8 @@ NAMES = _set("otto dix tio tre bir mille mila lima")
 ARABIC_PREFIXES = "(?:[وفبلك]|ال|لل)+"
 """Articles and prepositions that Arabic writes as part of the next word."""
 IDIOMS = _words("""
-两者 雙方 双方 一起 一样 一樣 一致 一直 一旦 一边 一邊 一方 一定 一般
-一些 一緒 一瞬 一同 統一 统一 万一 十分 半径 半徑 三角 六面
+两者 雙方 双方 一起 一样 一樣 一致 一直 一旦 一边 一邊 一方 一定 一般 一些 一緒 一瞬 一同 統一
+统一 万一 十分 半径 半徑 三角 六面
 """)
 """Words of ideographs that count nothing, though a numeral is part of them."""
 UNSPACED = _words("ひとつ ふたつ みっつ よっつ いつつ むっつ ななつ やっつ ここのつ สอง สาม")
@@ -137,8 +119,7 @@ PICTOGRAPHS = {
 
 SUFFIXES = _words(
     "x s fold some ish way ways pack time times th ths sided dimensional ball balls sphere "
-    "spheres "
-    "cube cubes cylinder cylinders object objects frame frames second pair body"
+    "spheres cube cubes cylinder cylinders object objects frame frames second pair body"
 )
 """What a number word may be glued to and still state a number ("threefold", "tenx")."""
 
@@ -147,31 +128,26 @@ ROMAN = _set(
     "xxx xl"
 )
 ITALIAN = _set(
-    "le gli di ci sono con tra fra dei delle colpisce ogni sue suoi altri altre questi "
-    "queste la alla "
-    "sfere cubi cilindri oggetti palle palline volte corpi collisioni urti rimbalzi pezzi "
-    "terzi metri "
-    "fotogrammi del della dell e"
+    "le gli di ci sono con tra fra dei delle colpisce ogni sue suoi altri altre questi queste la "
+    "alla sfere cubi cilindri oggetti palle palline volte corpi collisioni urti rimbalzi pezzi "
+    "terzi metri fotogrammi del della dell e"
 )
 """Words beside which "due" and "metà" are Italian."""
 ENUMERATED = _set(
-    "act case chapter class event figure item level mark no number object option part "
-    "phase point "
-    "scene section stage step type volume candidate sphere cube cylinder ball collision fig "
-    "nr vol ch"
+    "act case chapter class event figure item level mark no number object option part phase point "
+    "scene section stage step type volume candidate sphere cube cylinder ball collision fig nr "
+    "vol ch"
 )
 """Nouns after which a lone I, V or X is a numeral. Candidates go by A to D, so they count here."""
 
 UNITS = _set(
     "frame step timestep tick pixel px unit millimeter millimetre centimeter centimetre meter "
-    "metre kilometer kilometre inch mile degree radian moment instant beat "
-    "day week month year diameter radius width length"
+    "metre kilometer kilometre inch mile degree radian moment instant beat day week month year "
+    "diameter radius width length"
 )
 PLURAL_UNITS = _set(
-    "frames steps timesteps ticks pixels px units millimeters millimetres centimeters "
-    "centimetres "
-    "meters metres kilometers kilometres inches feet miles degrees radians moments "
-    "instants beats "
+    "frames steps timesteps ticks pixels px units millimeters millimetres centimeters centimetres "
+    "meters metres kilometers kilometres inches feet miles degrees radians moments instants beats "
     "times diameters radii widths lengths days weeks months years"
 )
 """What is counted as soon as a vague quantity such as "a few" stands before it."""
@@ -183,32 +159,25 @@ VAGUE = _set(
     "few several many some numerous multiple handful countless various couple dozens tens lots"
 )
 FILLERS = _set(
-    "of more the further additional short brief video extra tiny full whole remaining next "
-    "last following body ball "
-    "sphere cube "
-    "cylinder object image"
+    "of more the further additional short brief video extra tiny full whole remaining next last "
+    "following body ball sphere cube cylinder object image"
 )
 """What may stand between a vague quantity and its unit."""
 
 NOUNS = _set(
-    "sphere spheres cube cubes cylinder cylinders ball balls block object objects thing "
-    "collision "
+    "sphere spheres cube cubes cylinder cylinders ball balls block object objects thing collision "
     "contact event frame step metal rubber gray grey red blue green brown cyan purple yellow "
     "region candidate image option scene pair bounce hit strike time moving stationary more "
     "quarter third tenth fifth hundred thousand million dozen unit pixel corner edge wall"
 )
 """Words that "one" counts even after "the" or an adjective."""
 ADJECTIVES = _set(
-    "the this that which other another each every no any such either neither whichever "
-    "whatever gray grey red blue green brown cyan purple yellow metal rubber metallic left "
-    "right "
-    "top bottom upper lower inner outer middle central near far fast slow quick heavy "
-    "light large "
-    "small big little tall round same correct wrong right true best next last final "
-    "previous still "
-    "stationary visible hidden nearby distant lone remaining new old good likely rear "
-    "front back "
-    "matte shiny dark bright mobile free different similar"
+    "the this that which other another each every no any such either neither whichever whatever "
+    "gray grey red blue green brown cyan purple yellow metal rubber metallic left right top "
+    "bottom upper lower inner outer middle central near far fast slow quick heavy light large "
+    "small big little tall round same correct wrong right true best next last final previous "
+    "still stationary visible hidden nearby distant lone remaining new old good likely rear front "
+    "back matte shiny dark bright mobile free different similar"
 )
 """Words after which "one" is a pronoun; so is it after words in -er, -est, -ed and -ing."""
 MODALS = _set("would can could might may should must will expects sees wonders")
@@ -218,18 +187,15 @@ NOT_ADJECTIVES = _set(
 )
 CLAUSE_OPENERS = _set(
     "it its the a an this that these those they their he she both each all any some no nothing "
-    "everything contact motion struck hit gone past inside out free clear at there either "
-    "neither "
-    "gray grey red blue green brown cyan purple yellow we you i fully completely finally "
-    "entirely "
+    "everything contact motion struck hit gone past inside out free clear at there either neither "
+    "gray grey red blue green brown cyan purple yellow we you i fully completely finally entirely "
     "already under behind hidden"
 )
 """Words before which "once" is a conjunction, as it is before those in -ed and -ing."""
 EXACTLY = _set("only just exactly than least most but even")
 """Words after which "once" counts."""
 EVENTS = _set(
-    "collision collisions contact contacts impact impacts bounce bounces hit hits strike "
-    "strikes "
+    "collision collisions contact contacts impact impacts bounce bounces hit hits strike strikes "
     "event events encounter encounters crash crashes"
 )
 BEFORE_MINUTE = _set("per each every next last final full whole another")
@@ -240,8 +206,7 @@ AFTER_MINUTE = _set(
 """Words before which it is."""
 TIME_PREPOSITIONS = _set(
     "in within after for about per than under over by every takes lasts took lasted around "
-    "roughly "
-    "almost nearly until before"
+    "roughly almost nearly until before"
 )
 """Words after which "a minute" is, unless it describes the next word."""
 SCENE = (
@@ -253,8 +218,7 @@ SCENE = (
 """Words that a number may be run together with ("tworedspheres")."""
 NOT_ROMAN = _set("mix div dix di mi ci li cv cli dvi mlx xml")
 PIECES = _set(
-    "a i for do on no to so he mill trip sing coup thou sand red led let tri sec sect min "
-    "ion and "
+    "a i for do on no to so he mill trip sing coup thou sand red led let tri sec sect min ion and "
     "per cent way me ho fort fin sex sept oct cub dec ad half minute hour th ten d c b s o"
 )
 """Words and letters that prose may put side by side though together they spell a number."""

@@ -1,0 +1,7 @@
+"""Every number that prose states: `find_numbers`."""
+
+from __future__ import annotations
+
+from teacher.numbers.finding import WORDS, find_numbers
+
+__all__ = ["WORDS", "find_numbers"]
