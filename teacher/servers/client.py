@@ -15,6 +15,7 @@ from teacher.servers.server import (
     Chat,
     MalformedReplyError,
     RateLimitedError,
+    RefusedError,
     Reply,
     RequestError,
     Server,
@@ -91,9 +92,9 @@ class Client:
         """Up to `n` answers to a chat, however often servers have to be waited for.
 
         Raises:
-            UnansweredError: servers that are up fail at this chat again and again.
+            UnansweredError: servers that are up fail at this chat again and again, or refuse it.
             UserError: no server can be asked for longer than `cfg.patience`, or one does not know
-                the model, refuses the request, or is of another kind.
+                the model, refuses any request, or is of another kind.
         """
         faults = 0
         while True:
@@ -107,7 +108,7 @@ class Client:
                 if not await self._look(place):
                     continue
                 faults += 1
-                if faults == FAULTS:
+                if faults == FAULTS or isinstance(fault, RefusedError):
                     if await self._sings(place):
                         raise UnansweredError(str(fault)) from fault
                     faults = 0
@@ -159,16 +160,18 @@ class Client:
             if problem is None and broken:
                 try:
                     problem = await self._canary(place)
-                except (MalformedReplyError, UserError) as error:
+                except (RequestError, UserError) as error:
                     problem = str(error)
             place.problem = problem
         log.info(f"{place.server.url} is up again")
 
     async def _sings(self, place: Place) -> bool:
-        """Whether a server answers what any server can. Raises UserError for one of another
-        kind."""
+        """Whether a server answers what any server can. Raises UserError for one that refuses it or
+        is of another kind."""
         try:
             problem = await self._canary(place)
+        except RefusedError as fault:
+            raise UserError(f"{place.server.url} refuses any request: {fault}") from fault
         except MalformedReplyError as fault:
             raise UserError(
                 f"{place.server.url} does not answer as an OpenAI-compatible server does "
@@ -182,7 +185,7 @@ class Client:
         """What is wrong with a server's answer to any chat, None for an answer."""
         try:
             await self._ask(place, CANARY, 1, 1)
-        except MalformedReplyError:
+        except (MalformedReplyError, RefusedError):
             raise
         except RequestError as fault:
             return str(fault)

@@ -28,6 +28,10 @@ class MalformedReplyError(RequestError):
     """A reply that is not of the API's form."""
 
 
+class RefusedError(RequestError):
+    """The server will not answer this request, however often it is sent."""
+
+
 class RateLimitedError(RequestError):
     """The server wants to be left alone, for `seconds` where it says so."""
 
@@ -58,7 +62,7 @@ class Server:
 
         Raises:
             RequestError: there is no answer, this time.
-            UserError: the server does not know the model, or refuses the request.
+            UserError: the server does not know the model.
         """
         cfg = self.cfg
         try:
@@ -81,7 +85,7 @@ class Server:
         except openai.InternalServerError as error:
             raise RequestError(f"HTTP {error.status_code}") from error
         except openai.APIStatusError as error:
-            raise UserError(f"{self.url} refused a request: {error.message}") from error
+            raise RefusedError(error.message) from error
         except (openai.APITimeoutError, TimeoutError) as error:
             raise RequestError(
                 f"no answer within teacher.timeout={cfg.timeout:g} seconds"

@@ -211,7 +211,6 @@ def test_a_finished_served_run_needs_no_server(store, odd):
     before = lines(store)
     again = narrate_store(store, config(server))
     assert (again.rationales, again.summary) == (narration.rationales, narration.summary)
-    assert not again.asked
     assert lines(store) == before
 
 
@@ -220,9 +219,23 @@ def test_an_unknown_model_is_named_with_those_there(store, odd):
         narrate_store(store, config(odd(404), concurrency=1))
 
 
-def test_a_refused_request_is_told(store, odd):
-    with pytest.raises(UserError, match="refused a request"):
-        narrate_store(store, config(odd(400), concurrency=1))
+@pytest.mark.parametrize("status", [400, 401, 422])
+def test_a_server_that_refuses_everything_is_told(store, odd, status):
+    server = odd()
+    server.always["*"] = status
+    with pytest.raises(UserError, match=f"{server.url} refuses any request: .*fault"):
+        narrate_store(store, config(server))
+    assert told(store) == []
+
+
+def test_an_item_that_is_refused_is_not_asked_again_and_again(store, odd):
+    server = odd()
+    said = next(iter(server.texts))
+    server.always[said] = 400
+    narration = narrate_store(store, config(server, attempts=1))
+    assert narration.summary.rejected == {"unanswered": 1}
+    assert len(narration.rationales) == 11
+    assert [r["messages"][-1]["content"] for r in server.asked].count(said) == 1
 
 
 @pytest.mark.parametrize(
