@@ -13,7 +13,7 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+JOURNAL = "rationales.jsonl"
 BATCH = 200
 """Lines of the built-in narrator between two waits for the disk."""
 
@@ -42,14 +43,14 @@ BATCH = 200
 @dataclass(frozen=True)
 class Narration:
     """A teacher's answers for a store: the accepted rationales in item order, all answers by item,
-    how many items have too short a prefix, and whether any answer is new."""
+    and how many items have too short a prefix."""
 
     rationales: list[Rationale]
     items: list[SelectionItem]
     answers: dict[str, list[Rationale]]
     attempts: int
+    seed: int
     too_short: int
-    asked: bool
 
     @cached_property
     def summary(self) -> Summary:
@@ -78,23 +79,30 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     narration = narrate_store(store, cfg.teacher)
     log.info(narration)
-    report, page = run.folder / "report.json", run.folder / "report.html"
-    if narration.asked or not page.exists():
+    report = ensure_report(store, narration, cfg.shown, run.folder)
+    return {
+        "accepted": float(report["accepted"]),
+        "answers": float(sum(report["asked"])),
+        "set_aside": float(report["set_aside"]),
+        "too_short": float(report["too_short"]),
+        "mean_words": float(np.mean(report["lengths"] or [0])),
+    }
+
+
+def ensure_report(store: Store, narration: Narration, shown: int, folder: Path) -> dict[str, Any]:
+    """The figures of a folder's report.json, with `shown` rationales on report.html. Both are
+    written anew where they are older than the last answer."""
+    figures, page = folder / "report.json", folder / "report.html"
+    answered = (store.folder / JOURNAL).stat().st_mtime
+    if not page.exists() or page.stat().st_mtime < answered:
         from teacher.report.page import write_page
 
         told = narration.summary.text()
-        write_json(report, narration.summary.to_dict())
-        write_text(run.folder / "report.txt", told + "\n")
-        write_page(store, narration.rationales, told, cfg.shown, cfg.teacher.seed, run.folder)
+        write_json(figures, narration.summary.to_dict())
+        write_text(folder / "report.txt", told + "\n")
+        write_page(store, narration.rationales, told, shown, narration.seed, folder)
     log.info("report: %s", page)
-    summary = json.loads(report.read_bytes())
-    return {
-        "accepted": float(summary["accepted"]),
-        "answers": float(sum(summary["asked"])),
-        "set_aside": float(summary["set_aside"]),
-        "too_short": float(summary["too_short"]),
-        "mean_words": float(np.mean(summary["lengths"] or [0])),
-    }
+    return json.loads(figures.read_bytes())
 
 
 def ensure_rationales(store: Store, cfg: TeacherConfig) -> list[Rationale]:
@@ -114,7 +122,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
     """
     items = store.selection("train")
     judge = Judge(cfg)
-    with Journal(store.folder / "rationales.jsonl") as journal:
+    with Journal(store.folder / JOURNAL) as journal:
         answers = defaultdict(list)
         for rationale in journal.rationales:
             wanted = cfg.fallback or not rationale.fallback
@@ -122,8 +130,6 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
                 answers[rationale.item_id].append(rationale)
         # Settled items are left out here, so that none takes a place among the requests in flight.
         jobs = [(i, len(answers[i.item_id])) for i in items if _open(answers[i.item_id], cfg)]
-
-        before = sum(map(len, answers.values()))
 
         def keep(new: list[Rationale]) -> None:
             journal.append(new)
@@ -143,8 +149,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
             keep([r for item in aside for r in _stand_in(item, store, judge)])
         rationales = accepted_of(items, answers)
         save_accepted(rationales, store.folder / "rationales.parquet")
-    asked = sum(map(len, answers.values())) > before
-    return Narration(rationales, items, dict(answers), cfg.attempts, too_short, asked)
+    return Narration(rationales, items, dict(answers), cfg.attempts, cfg.seed, too_short)
 
 
 def _open(given: list[Rationale], cfg: TeacherConfig) -> bool:

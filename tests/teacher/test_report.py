@@ -1,6 +1,7 @@
 """The report on a teacher's answers: its figures by hand, and its page in files."""
 
 import json
+import os
 import re
 from dataclasses import replace
 
@@ -8,7 +9,7 @@ import pytest
 
 from conf.schema import TeacherConfig
 from data.records import Rationale
-from teacher.narrate import narrate_store
+from teacher.narrate import ensure_report, narrate_store
 from teacher.report.page import write_page
 from teacher.report.summary import summarise
 from tests.teacher import synthetic
@@ -114,6 +115,21 @@ def test_the_page_shows_rationales_beside_their_frames(micro_store, tmp_path):
     assert write_page(micro_store, narration.rationales, told, 4, 0, tmp_path).read_text() == page
     nobody = write_page(micro_store, [], told, 4, 0, tmp_path).read_text()
     assert "0 of" in nobody
+
+
+def test_a_report_older_than_the_last_answer_is_written_anew(micro_store, tmp_path):
+    """Such a report is what a run leaves that is killed between its last answer and its report."""
+    narration = narrate_store(micro_store, TeacherConfig(name="template"))
+    page = tmp_path / "report.html"
+    assert ensure_report(micro_store, narration, 2, tmp_path)["accepted"] > 0
+    whole = page.read_bytes()
+    page.write_bytes(b"kept")
+    ensure_report(micro_store, narration, 2, tmp_path)
+    assert page.read_bytes() == b"kept"
+    answered = (micro_store.folder / "rationales.jsonl").stat().st_mtime
+    os.utime(page, (answered - 1, answered - 1))
+    ensure_report(micro_store, narration, 2, tmp_path)
+    assert page.read_bytes() == whole
 
 
 def test_a_fallback_is_marked_and_only_taken_when_asked_for(store, odd):
