@@ -17,6 +17,7 @@ COMMANDS = (
     "data.export",
     "data.gallery",
     "teacher.narrate",
+    "teacher.serve",
     "train.sft",
     "train.contrastive",
     "evaluation.select",
@@ -40,6 +41,7 @@ def test_packages_import_only_from_their_left(package: str) -> None:
             assert roots <= allowed, f"{path.relative_to(ROOT)} imports {roots - allowed}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_imports_nothing_heavy(command: str) -> None:
     code = (

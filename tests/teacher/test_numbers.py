@@ -163,6 +163,7 @@ def test_mutated_sentences_do_not_raise():
             find_numbers(mutant)
 
 
+@pytest.mark.slow
 def test_no_character_raises():
     for start in range(0, sys.maxunicode + 1, 1 << 12):
         find_numbers("".join(map(chr, range(start, start + (1 << 12)))))

@@ -69,6 +69,7 @@ def test_a_rate_limit_is_waited_for_and_costs_no_attempt(odd):
     assert server.times[1] - server.times[0] >= 0.5
 
 
+@pytest.mark.slow
 def test_a_rate_limit_may_be_a_date(odd):
     server = odd({"Retry-After": formatdate(time.time() + 2, usegmt=True)})
     ask(config(server))
@@ -98,7 +99,7 @@ def test_a_limit_without_end_ends_with_patience(odd):
 
 def test_servers_share_the_work_by_how_busy_they_are(odd):
     slow, fast = odd(), odd()
-    slow.delay, fast.delay = 0.3, 0.02
+    slow.delay, fast.delay = 0.1, 0.005
 
     async def main():
         async with Client(config(slow, fast)) as client:
