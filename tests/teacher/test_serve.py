@@ -23,6 +23,7 @@ from teacher.grammar import GRAMMAR_VERSION
 from teacher.journal import read_rationales
 from teacher.narrate import narrate_store
 from teacher.serve import Machine
+from teacher.servers import process
 from teacher.servers.client import Client
 from tests.teacher.made import corpus, made_store
 from tests.teacher.serving import ROOT, Serving, free_port
@@ -158,8 +159,8 @@ def test_servers_of_several_addresses_are_started_one_by_one():
 def run_script(script, folder, stop):
     """A server's life, with a script in the place of vLLM."""
     log, arguments = folder / "server.log", ["-c", script, "--model", "none"]
-    with serve.running(Path(sys.executable), arguments, log) as process:
-        return serve.await_health(process, f"http://127.0.0.1:{free_port()}/v1", log, stop)
+    with process.running(Path(sys.executable), arguments, log) as server:
+        return process.await_health(server, f"http://127.0.0.1:{free_port()}/v1", log, stop)
 
 
 def ends(pid):
@@ -182,7 +183,7 @@ def test_a_server_that_dies_ends_with_its_log(tmp_path, caplog):
 
 
 def test_what_does_not_end_is_killed_with_all_that_it_started(tmp_path, monkeypatch):
-    monkeypatch.setattr(serve, "GRACE", 0.5)
+    monkeypatch.setattr(process, "GRACE", 0.5)
     script = (
         "import os, signal, subprocess, sys, time\n"
         "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
@@ -193,15 +194,34 @@ def test_what_does_not_end_is_killed_with_all_that_it_started(tmp_path, monkeypa
     stop = threading.Event()
 
     def stop_once_deaf():
-        while "deaf" not in serve.last_line(tmp_path / "server.log"):
+        while "deaf" not in process.last_line(tmp_path / "server.log"):
             time.sleep(0.02)
         stop.set()
 
     (tmp_path / "server.log").touch()
     threading.Thread(target=stop_once_deaf).start()
     assert run_script(script, tmp_path, stop) is False
-    for pid in map(int, serve.last_line(tmp_path / "server.log").split()[1:]):
+    for pid in map(int, process.last_line(tmp_path / "server.log").split()[1:]):
         assert ends(pid)
+
+
+def test_the_server_ends_when_the_command_is_killed(tmp_path):
+    log = tmp_path / "server.log"
+    log.touch()
+    script = "import os, time; print(os.getpid(), flush=True); time.sleep(600)"
+    arguments = ["-c", script, "--model", "none"]
+    code = (
+        "import sys, time\nfrom pathlib import Path\nfrom teacher.servers import process\n"
+        f"with process.running(Path(sys.executable), {arguments!r}, Path({str(log)!r})):\n"
+        "    time.sleep(600)"
+    )
+    command = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
+    while not log.read_text().endswith("\n"):
+        assert command.poll() is None
+        time.sleep(0.02)
+    command.kill()
+    command.wait()
+    assert ends(int(log.read_text()))
 
 
 @pytest.mark.slow
