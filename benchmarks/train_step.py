@@ -31,7 +31,7 @@ from conf.schema import SftCommand, StudentConfig
 from data.records import LETTERS
 from train import backbone
 from train.collate import Collator
-from train.conversation import ASK, Sample, answer_line
+from train.conversation import Sample, answer_line, instruction
 from train.sft_trainer import token_mean
 from train.tiny import SPECIAL_TOKENS, build_processor
 
@@ -140,7 +140,7 @@ def write_random(name: str, cfg: StudentConfig, folder: Path) -> None:
     finally:
         torch.set_default_dtype(kept)
     model.save_pretrained(folder)
-    words = [ASK["reasoning"], *(answer_line(x) for x in LETTERS), rationale()] * 20
+    words = [instruction("reasoning", "cot"), *(answer_line(x) for x in LETTERS), rationale()] * 20
     build_processor(words, 1024, cfg.image_size).save_pretrained(folder)
 
 
@@ -155,7 +155,7 @@ def sample(cfg: StudentConfig) -> Sample:
     pixels = np.random.default_rng(0).integers(
         0, 256, (cfg.frames + 4, cfg.image_size, cfg.image_size, 3), dtype=np.uint8
     )
-    content = [{"type": "video"}, {"type": "text", "text": ASK["reasoning"]}]
+    content = [{"type": "video"}, {"type": "text", "text": instruction("reasoning", "cot")}]
     for letter in LETTERS:
         content += [{"type": "text", "text": f"\nCandidate {letter}: "}, {"type": "image"}]
     shown = list(range(cfg.frames))

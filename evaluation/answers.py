@@ -78,6 +78,7 @@ def ask_all(
     processor: ProcessorMixin,
     items: list[SelectionItem],
     mode: str,
+    regime: str,
     frames: Frames,
     cfg: StudentConfig,
     precision: str,
@@ -85,15 +86,15 @@ def ask_all(
     log: AnswerLog,
     control: str | None = None,
 ) -> list[Answer]:
-    """Every item's answer in `mode`, its prefix shown as a `control` asks, greedily decoded; items
-    that the log holds are not asked."""
+    """Every item's answer in `mode`, as a student of `regime` is asked, its prefix shown as a
+    `control` asks, greedily decoded; items that the log holds are not asked."""
     waiting = [i for i in items if (i.item_id, mode) not in log.answers]
     limit = cfg.max_new_tokens if mode == "reasoning" else ANSWER_TOKENS
     collator = Collator(processor, cfg.max_length)
     with tqdm(total=len(items), initial=len(items) - len(waiting), desc=mode, unit="item") as bar:
         for group in _groups(waiting, batch):
             inputs = collator(
-                [selection_sample(i, mode, frames, cfg, control=control) for i in group]
+                [selection_sample(i, mode, regime, frames, cfg, control=control) for i in group]
             )
             texts = generate(model, processor, inputs, limit, precision)
             log.append([judge(i, mode, t) for i, t in zip(group, texts, strict=True)])

@@ -20,7 +20,13 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 
     folder = Path(cfg.model) if cfg.model is not None else None
     trained = settings_of(folder, SftCommand, "student") if folder else cfg
-    student, precision = trained.student, trained.train.precision
+    student, precision, regime = trained.student, trained.train.precision, trained.train.regime
+    modes = cfg.modes or (["answer"] if regime == "answer_only" else ["reasoning", "answer"])
+    if folder is not None and regime == "answer_only" and "reasoning" in modes:
+        raise UserError(
+            f"model={folder} was trained in answer mode alone (train.regime=answer_only): give "
+            "modes=[answer]"
+        )
 
     from data.build import ensure_benchmark
 
@@ -48,13 +54,14 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     measured = f"{weights} on {store.identity}, {asked}"
     journal = answers.AnswerLog(run.folder / "answers.jsonl", measured, items)
     rows, subtypes, metrics = [], {}, {}
-    for mode in cfg.modes:
+    for mode in modes:
         log.info("asking %s in %s mode", name, mode)
         given = answers.ask_all(
             model,
             processor,
             items,
             mode,
+            regime,
             frames,
             student,
             precision,
@@ -78,7 +85,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     report = {"rows": [r.to_dict() for r in rows], "subtypes": cells}
     write_text(run.folder / "report.json", json.dumps(report, indent=1))
     figures.selection_figure(rows, run.folder / "selection.png")
-    answer = journal.answers[items[0].item_id, cfg.modes[0]]
+    answer = journal.answers[items[0].item_id, modes[0]]
     draw_item(items[0], answer.letter, Frames(store), run.folder / "item.png")
     return metrics
 

@@ -16,6 +16,15 @@ def parts(text: str) -> list[tuple[str, int, int]]:
     return [(m[1], m.end(), starts[k + 1]) for k, m in enumerate(headings)]
 
 
+def without(text: str, section: str) -> str:
+    """A text without one of its sections, heading and all."""
+    for heading in HEADING.finditer(text):
+        if heading[1] == section:
+            following = HEADING.search(text, heading.end())
+            return text[: heading.start()] + (text[following.start() :] if following else "")
+    return text
+
+
 def opening(text: str) -> str:
     """What stands before a text's first heading; nothing where there is none."""
     first = HEADING.search(text)

@@ -47,6 +47,14 @@ def describe(scene: Scene, start: int, stop: int, target: int, seed: int) -> str
     return _Voice(FULL, seed, scene.scene_id, start, stop, target).description(facts)
 
 
+def matches(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:
+    """Whether each candidate matches the predicted state and why, a line a candidate; the same
+    arguments give the same lines."""
+    voice = _Voice(SPARSE, item.item_id, "matches")
+    expected = {o.object: o.target_region for o in predicates.objects}
+    return tuple(voice.match(c, expected) for c in predicates.candidates)
+
+
 def _sentences(statements: list[str]) -> str:
     return " ".join(s[0].upper() + s[1:] + "." for s in statements)
 
@@ -215,6 +223,14 @@ class _Voice:
         if candidate.other_objects:
             return f"{name} shows other objects and {told}"
         return self.pick(f"{name} {told}", f"{name} wrongly {told}")
+
+    def match(self, candidate: CandidateFacts, expected: dict[str, str]) -> str:
+        name = f"Candidate {candidate.letter}"
+        if candidate.agrees:
+            return f"{name} matches: every object is where it should be."
+        why = ["shows other objects"] * candidate.other_objects
+        why += [self.difference(d, expected) for d in candidate.differences[:1]]
+        return f"{name} does not match: it {' and '.join(why)}."
 
     def difference(self, d: Difference, expected: dict[str, str]) -> str:
         if d.kind == "missing":

@@ -1,12 +1,14 @@
 """An item becomes a conversation: the one place that knows how a student is asked and answers.
 
 The prompt is the prefix as a video with its true times, the question, the four candidates as
-labelled images, and what to write. In reasoning mode the response is the rationale, which ends in
-the answer's line; in answer mode it is that line alone.
+labelled images, and what to write. In reasoning mode the response is the rationale as the regime
+has it, whether each candidate matches it (the match layout, where the regime has that), and the
+answer's line; in answer mode it is that line alone.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,14 +18,9 @@ from conf.schema import StudentConfig
 from data.controls import observed
 from data.frames import Frames
 from data.records import FPS, FRAMES, LETTERS, SelectionItem, shown_frames
+from teacher.sections import without
 
-ASK = {
-    "reasoning": (
-        "Reason about the scene step by step: scene parse, motion analysis, prediction, candidate "
-        'analysis and outcome. End with a line "Answer:" and the letter.'
-    ),
-    "answer": 'Reply with one line, "Answer:" and the letter.',
-}
+MODES = ("reasoning", "answer")
 DESCRIBE = "Describe the scene, how its objects move, and what will come of it."
 
 
@@ -63,23 +60,60 @@ def answer_line(letter: str) -> str:
     return f"Answer: {letter}"
 
 
+def instruction(mode: str, regime: str) -> str:
+    """What a student is told to write."""
+    if mode == "answer":
+        return 'Reply with one line, "Answer:" and the letter.'
+    steps = ["scene parse", "motion analysis", "prediction"]
+    steps += ["candidate analysis"] * has_analysis(regime)
+    layout = "Then say of each candidate, in a line of its own, whether it matches and why. "
+    return (
+        f"Reason about the scene step by step: {', '.join(steps)} and outcome. "
+        f"{layout * has_matches(regime)}"
+        'End with a line "Answer:" and the letter.'
+    )
+
+
+def response(rationale: str, matches: Sequence[str], letter: str, mode: str, regime: str) -> str:
+    """What a student of a regime answers: `rationale` in its full form, `matches` a line for each
+    candidate in order."""
+    if mode == "answer":
+        return answer_line(letter)
+    text = without(rationale, "Answer")
+    if not has_analysis(regime):
+        text = without(text, "Candidate analysis")
+    lines = matches if has_matches(regime) else ()
+    return "\n".join([text.rstrip(), *lines, answer_line(letter)])
+
+
+def has_analysis(regime: str) -> bool:
+    """Whether a regime's rationales hold their candidate analysis."""
+    return regime != "cot_no_candidate_analysis"
+
+
+def has_matches(regime: str) -> bool:
+    """Whether a regime's answers have the match layout."""
+    return regime in ("cot", "cot_no_candidate_analysis")
+
+
 def selection_sample(
     item: SelectionItem,
     mode: str,
+    regime: str,
     frames: Frames,
     cfg: StudentConfig,
     response: str | None = None,
     control: str | None = None,
 ) -> Sample:
-    """A selection item asked in `mode` ("reasoning" or "answer"), its prefix shown as a `control`
-    asks (see `data.controls`)."""
+    """A selection item asked in `mode` ("reasoning" or "answer") as a student of `regime` is, its
+    prefix shown as a `control` asks (see `data.controls`)."""
     shown = observed(item, cfg.frames, control)
     scene = frames.scene(item.scene_id)
     content: list[dict[str, Any]] = [{"type": "video"}] if shown else []
     content.append({"type": "text", "text": item.question})
     for letter in LETTERS:
         content += [{"type": "text", "text": f"\nCandidate {letter}: "}, {"type": "image"}]
-    content.append({"type": "text", "text": f"\n{ASK[mode]}"})
+    content.append({"type": "text", "text": f"\n{instruction(mode, regime)}"})
     return Sample(
         f"{item.item_id} ({mode})",
         content,

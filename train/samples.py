@@ -12,18 +12,22 @@ import numpy as np
 from torch.utils.data import Dataset
 from transformers import PreTrainedTokenizerBase
 
-from conf.schema import SftCommand, StudentConfig
+from conf.schema import SftCommand, SftTrainConfig, StudentConfig
 from data.frames import Frames
 from data.records import LETTERS, Rationale, Scene, SelectionItem
 from data.store import Store
-from teacher.predicates import OUT, region_of
-from teacher.template import describe
+from teacher.letters import relabel, reorder
+from teacher.predicates import OUT, predicates_of, region_of
+from teacher.template import describe, matches
 from train.conversation import (
-    ASK,
     DESCRIBE,
+    MODES,
     Sample,
     answer_line,
     description_sample,
+    has_matches,
+    instruction,
+    response,
     selection_sample,
 )
 
@@ -38,28 +42,74 @@ Row = TypeVar("Row")
 @dataclass(frozen=True)
 class Planned:
     """A sample to be made when it is asked for, so that pixels are not held for all of them, and
-    the text that it does not share with others of its kind."""
+    the text that it does not share with others of its kind. It may differ by epoch."""
 
     text: str
-    make: Callable[[], Sample]
+    make: Callable[[int], Sample]
 
 
 class Samples(Dataset):
-    """Planned samples as a trainer reads them."""
+    """Planned samples as a trainer reads them, as they are in `epoch`."""
 
     def __init__(self, planned: Sequence[Planned]) -> None:
         self._planned = planned
+        self.epoch = 0
 
     def __len__(self) -> int:
         return len(self._planned)
 
     def __getitem__(self, index: int) -> Sample:
-        return self._planned[index].make()
+        return self._planned[index].make(self.epoch)
 
     def longest(self, tokenizer: PreTrainedTokenizerBase) -> Sample:
         """The sample with the most tokens. Frames are alike in all of them, so the text tells."""
         encoded = tokenizer([p.text for p in self._planned], add_special_tokens=False).input_ids
         return self[max(range(len(self)), key=lambda k: len(encoded[k]))]
+
+
+def _same(make: Callable[[], Sample], epoch: int) -> Sample:
+    """A sample that no epoch changes."""
+    return make()
+
+
+@dataclass(frozen=True)
+class Supervised:
+    """An item in one mode, with what a student of `regime` is to answer. Where there is a `seed`,
+    its candidates stand in an order of their own in each epoch."""
+
+    item: SelectionItem
+    rationale: str
+    matches: tuple[str, ...]
+    mode: str
+    regime: str
+    seed: int | None = None
+
+    def text(self) -> str:
+        told = response(self.rationale, self.matches, self.item.letter, self.mode, self.regime)
+        return f"{self.item.question} {instruction(self.mode, self.regime)} {told}"
+
+    def in_epoch(self, epoch: int) -> Supervised:
+        """The same with its candidates in the epoch's order, and all letters with them."""
+        if self.seed is None:
+            return self
+        digest = hashlib.sha256(repr((self.seed, epoch, self.item.item_id)).encode()).digest()
+        rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
+        order = rng.permutation(len(LETTERS)).tolist()
+        return replace(
+            self,
+            item=reorder(self.item, order),
+            rationale=relabel(self.rationale, order),
+            # The letters again stand in their own order.
+            matches=tuple(sorted(relabel(line, order) for line in self.matches)),
+        )
+
+    def sample(self, frames: Frames, cfg: StudentConfig, epoch: int) -> Sample:
+        shown = self.in_epoch(epoch)
+        told = response(shown.rationale, shown.matches, shown.item.letter, self.mode, self.regime)
+        return selection_sample(shown.item, self.mode, self.regime, frames, cfg, told)
+
+    def planned(self, frames: Frames, cfg: StudentConfig) -> Planned:
+        return Planned(self.text(), partial(self.sample, frames, cfg))
 
 
 def held_out_scenes(store: Store) -> set[str]:
@@ -81,22 +131,30 @@ def shuffled(rows: list[Row], seed: int) -> list[Row]:
 
 
 def supervised_items(
-    items: list[SelectionItem], rationales: dict[str, Rationale], cfg: StudentConfig, frames: Frames
-) -> dict[str, list[Planned]]:
-    """Each item in reasoning mode, where it has a rationale, and in answer mode."""
-    made: dict[str, list[Planned]] = {"reasoning": [], "answer": []}
+    store: Store,
+    items: list[SelectionItem],
+    rationales: dict[str, Rationale],
+    train: SftTrainConfig,
+    seed: int | None,
+) -> dict[str, list[Supervised]]:
+    """Each item in reasoning mode, where it has a rationale, and in answer mode. A `seed` permutes
+    candidates from epoch to epoch."""
+    made: dict[str, list[Supervised]] = {mode: [] for mode in MODES}
     for item in items:
         if rationale := rationales.get(item.item_id):
-            made["reasoning"].append(_asked(item, "reasoning", frames, cfg, rationale.text))
-        made["answer"].append(_asked(item, "answer", frames, cfg, answer_line(item.letter)))
+            told = rationale.text, _matches(store, item, train.regime)
+            made["reasoning"].append(Supervised(item, *told, "reasoning", train.regime, seed))
+        made["answer"].append(Supervised(item, "", (), "answer", train.regime, seed))
     return made
 
 
-def _asked(
-    item: SelectionItem, mode: str, frames: Frames, cfg: StudentConfig, response: str
-) -> Planned:
-    text = f"{item.question} {ASK[mode]} {response}"
-    return Planned(text, partial(selection_sample, item, mode, frames, cfg, response))
+def _matches(store: Store, item: SelectionItem, regime: str) -> tuple[str, ...]:
+    if not has_matches(regime):
+        return ()
+    predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
+    # An item with too short a prefix has no rationale either.
+    assert predicates is not None
+    return matches(predicates, item)
 
 
 def descriptions(
@@ -116,8 +174,8 @@ def descriptions(
     for scene_id, start, stop, target in sorted(windows):
         text = describe(store.scene(scene_id), start, stop, target, seed)
         if text is not None:
-            make = partial(description_sample, scene_id, start, stop, target, frames, cfg, text)
-            made.append(Planned(text, make))
+            sample = partial(description_sample, scene_id, start, stop, target, frames, cfg, text)
+            made.append(Planned(text, partial(_same, sample)))
     return made
 
 
@@ -140,7 +198,8 @@ def looks(
         for letter, what in shuffled(telling, seed)[:LOOKS]:
             asked = replace(item, question=f"Which candidate shows {what}?")
             text = f"Candidate {letter} shows {what}.\n{answer_line(letter)}"
-            made.append(_asked(asked, "answer", frames, cfg, text))
+            sample = partial(selection_sample, asked, "answer", "describe", frames, cfg, text)
+            made.append(Planned(text, partial(_same, sample)))
     return made
 
 
@@ -168,14 +227,19 @@ def splits(
     items = store.selection("train")
     # The items of every family stand together: a shuffled slice measures all of them.
     kept = shuffled([i for i in items if i.scene_id in held_out], cfg.seed)[:limit]
+    seed = cfg.seed if cfg.train.permute_candidates else None
     training = supervised_items(
-        [i for i in items if i.scene_id in others], by_item, cfg.student, frames
+        store, [i for i in items if i.scene_id in others], by_item, cfg.train, seed
     )
-    validation = supervised_items(kept, by_item, cfg.student, frames)
+    validation = supervised_items(store, kept, by_item, cfg.train, None)
+
+    def planned(supervised: list[Supervised]) -> list[Planned]:
+        return [s.planned(frames, cfg.student) for s in supervised]
+
     # A CoT student learns both modes, so that it can be asked in either.
     return (
-        Samples(training["reasoning"] + training["answer"]),
-        {mode: Samples(planned) for mode, planned in validation.items() if planned},
+        Samples([sample for mode in MODES for sample in planned(training[mode])]),
+        {mode: Samples(planned(made)) for mode, made in validation.items() if made},
     )
 
 
@@ -185,5 +249,6 @@ def corpus(store: Store, rationales: list[Rationale]) -> list[str]:
     letters = [f"\nCandidate {x}: \n{answer_line(x)}" for x in LETTERS]
     # Every digit and the timestamps' frame, often enough to be worth merges.
     clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
-    prompts = [*questions, *letters, *ASK.values(), DESCRIBE, "user", "assistant", "Later: "]
+    asked = [instruction(mode, "cot") for mode in MODES]
+    prompts = [*questions, *letters, *asked, DESCRIBE, "user", "assistant", "Later: "]
     return [*prompts * 20, *clock, *(r.text for r in rationales)]

@@ -32,7 +32,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from train import backbone, loop, samples
     from train.audit import audit
     from train.collate import Collator, letter_ids
-    from train.sft_trainer import LetterChoice, token_mean
+    from train.sft_trainer import EpochOrder, LetterChoice, token_mean
 
     backbone.keep_big_blocks()
     # Adapters are drawn before the trainer sets its seed.
@@ -43,7 +43,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         cfg.student, cfg.train.precision, lambda: samples.corpus(store, rationales)
     )
     frames = Frames(store, cfg.student.image_size)
-    if cfg.train.regime == "cot":
+    if cfg.train.regime not in ("answer_only", "describe"):
         loop.check_not_empty(len(rationales), f"accepted rationales of teacher {cfg.teacher.name}")
     training, validation = samples.splits(store, rationales, cfg, frames)
     loop.check_not_empty(len(training), f"samples for train.regime={cfg.train.regime}")
@@ -69,6 +69,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         compute_loss_func=token_mean,
         preprocess_logits_for_metrics=letters and letters.shrink,
         compute_metrics=letters and letters.accuracy,
+        callbacks=[EpochOrder(training)],
     )
     loop.train_and_log(trainer, run, checkpoint)
     backbone.save(model, processor, run.folder / "student", cfg.train.precision)

@@ -1,5 +1,6 @@
-"""What differs from transformers.Trainer for a student: the loss of an accumulated batch, and the
-measure of the answer's letter. Both go in through the Trainer's own arguments."""
+"""What differs from transformers.Trainer for a student: the loss of an accumulated batch, the order
+of candidates in an epoch, and the measure of the answer's letter. All go in through the Trainer's
+own arguments."""
 
 from __future__ import annotations
 
@@ -7,9 +8,11 @@ from typing import Any
 
 import torch
 from torch.nn.functional import cross_entropy
-from transformers import EvalPrediction
+from transformers import EvalPrediction, TrainerCallback
+from transformers.trainer_callback import TrainerControl, TrainerState
 
 from train.collate import IGNORED
+from train.samples import Samples
 
 
 def token_mean(
@@ -25,6 +28,17 @@ def token_mean(
     total = cross_entropy(predicted.float(), following, ignore_index=IGNORED, reduction="sum")
     count = num_items_in_batch if num_items_in_batch is not None else (following != IGNORED).sum()
     return total / count
+
+
+class EpochOrder(TrainerCallback):
+    """Tells the training samples which epoch it is: in each, candidates may stand otherwise."""
+
+    def __init__(self, training: Samples) -> None:
+        self._training = training
+
+    def on_epoch_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        # A resumed run goes on within an epoch.
+        self._training.epoch = int(state.epoch or 0)
 
 
 class LetterChoice:

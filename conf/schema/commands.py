@@ -187,11 +187,12 @@ class SelectCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     student: StudentConfig = MISSING
     train: SftTrainConfig = field(default_factory=SftTrainConfig)
-    """The preset's recipe; a measurement takes its precision alone."""
+    """The preset's recipe; a measurement of a base takes its precision and its regime's prompt."""
     model: str | None = None
     """A run folder of train.sft, with its own student and recipe; null takes the student's base."""
-    modes: list[str] = field(default_factory=lambda: ["reasoning", "answer"])
-    """reasoning (rationale, then answer) and answer (at once), each measured by itself."""
+    modes: list[str] | None = None
+    """reasoning (rationale, then answer) and answer (at once), each measured by itself; null takes
+    those that the student was trained in."""
     batch: int = 16
     """Items that pass the model at once."""
     limit: int | None = None
@@ -213,7 +214,8 @@ class SelectCommand(CommandConfig):
             problems.append(
                 f"control={self.control}: the options are candidate_only, shuffled_prefix and null"
             )
-        if sorted(self.modes) not in (["answer"], ["reasoning"], ["answer", "reasoning"]):
+        given = sorted(self.modes or ["answer"])
+        if given not in (["answer"], ["reasoning"], ["answer", "reasoning"]):
             problems.append(f"modes={self.modes}: give reasoning, answer or both, each once")
         return problems
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 from conf.schema.checks import too_small
 
+REGIMES = ("cot", "cot_no_candidate_analysis", "cot_no_match_layout", "answer_only", "describe")
+
 
 @dataclass
 class TrainConfig:
@@ -69,15 +71,22 @@ class TrainConfig:
 @dataclass
 class SftTrainConfig(TrainConfig):
     regime: str = "cot"
-    """cot (rationale and answer), answer_only, or describe (the recipe of the tiny base)."""
+    """What a student writes: cot (the rationale, whether each candidate matches it, the answer),
+    cot_no_candidate_analysis, cot_no_match_layout, answer_only, or describe (the recipe of the
+    tiny base)."""
+    permute_candidates: bool = False
+    """Whether each epoch shows every item's candidates in an order of its own."""
     validation_items: int = 64
     """Training-split items of held-out training scenes that measure the run."""
 
     def check(self) -> list[str]:
         problems = super().check() + too_small(self, "train.", {"validation_items": 1})
-        if self.regime not in ("cot", "answer_only", "describe"):
+        if self.regime not in REGIMES:
+            problems.append(f"train.regime={self.regime}: the options are {', '.join(REGIMES)}")
+        if self.permute_candidates and self.regime == "describe":
             problems.append(
-                f"train.regime={self.regime}: the options are cot, answer_only and describe"
+                "train.permute_candidates=true with train.regime=describe: descriptions have no "
+                "candidates"
             )
         return problems
 

@@ -48,7 +48,7 @@ def test_an_evaluation_leaves_the_gradients_as_they_were(nf4_cfg, micro_store, f
     model, processor = backbone.load_student(nf4_cfg, "bf16", list)
     item = micro_store.selection("train")[0]
     batch = Collator(processor, 1500)(
-        [selection_sample(item, "answer", frames, nf4_cfg, "Answer: A")]
+        [selection_sample(item, "answer", "cot", frames, nf4_cfg, "Answer: A")]
     )
     labels = batch.pop("labels")
 
@@ -95,7 +95,7 @@ def test_a_trained_student_answers_as_it_did_when_it_was_saved(
     backbone.save(model, processor, tmp_path / "student", "fp32")
     again, reader = backbone.load_trained(nf4_cfg, "fp32", tmp_path / "student")
     item = micro_store.selection("train")[0]
-    batch = Collator(reader, 1500)([selection_sample(item, "answer", frames, nf4_cfg)])
+    batch = Collator(reader, 1500)([selection_sample(item, "answer", "cot", frames, nf4_cfg)])
     # Packed for inference, some CPUs round 4-bit products another way.
     backbone.keep_differentiable(again)
     with torch.no_grad():

@@ -25,7 +25,7 @@ def lines(micro_store, frames, student_cfg) -> list[Sample]:
         "near the top\nAnswer: C",
     ]
     return [
-        selection_sample(i, "reasoning", frames, student_cfg, t)
+        selection_sample(i, "reasoning", "cot", frames, student_cfg, t)
         for i, t in zip(items, texts, strict=True)
     ]
 
@@ -81,7 +81,7 @@ def test_the_prompt_holds_every_shown_frame_at_its_true_time(
     micro_store, frames, student_cfg, processor
 ) -> None:
     item = micro_store.selection("train")[0]
-    encoded = encode(selection_sample(item, "answer", frames, student_cfg), processor, 1500)
+    encoded = encode(selection_sample(item, "answer", "cot", frames, student_cfg), processor, 1500)
     assert encoded.media["video_grid_thw"].tolist() == [[6, 6, 6]]
     assert encoded.media["image_grid_thw"].tolist() == [[1, 6, 6]] * 4
     shown = shown_frames(item.prefix_start, item.prefix_stop, 12)
@@ -106,8 +106,8 @@ def test_the_longest_sample_is_found_without_making_them_all(
 
     def planned(item: SelectionItem, words: int) -> samples.Planned:
         text = "near the top " * words + "\nAnswer: A"
-        sample = selection_sample(item, "answer", frames, student_cfg, text)
-        return samples.Planned(text, lambda: seen.append(item.item_id) or sample)
+        sample = selection_sample(item, "answer", "cot", frames, student_cfg, text)
+        return samples.Planned(text, lambda epoch: seen.append(item.item_id) or sample)
 
     items = micro_store.selection("train")[:4]
     made = samples.Samples([planned(i, w) for i, w in zip(items, (3, 9, 27, 1), strict=True)])
@@ -123,7 +123,10 @@ def test_the_letters_logits_choose_the_answer(
 ) -> None:
     items: list[SelectionItem] = micro_store.selection("train")[:6]
     batch = Collator(processor, 1500)(
-        [selection_sample(i, "answer", frames, student_cfg, f"Answer: {i.letter}") for i in items]
+        [
+            selection_sample(i, "answer", "cot", frames, student_cfg, f"Answer: {i.letter}")
+            for i in items
+        ]
     )
     labels = batch.pop("labels")
     letters = letter_ids(processor)
@@ -140,7 +143,9 @@ def test_controls_reach_the_prompt(micro_store, frames, student_cfg, processor) 
     item = micro_store.selection("test")[0]
     plain, alone, shuffled = (
         encode(
-            selection_sample(item, "answer", frames, student_cfg, control=control), processor, 1500
+            selection_sample(item, "answer", "cot", frames, student_cfg, control=control),
+            processor,
+            1500,
         )
         for control in (None, "candidate_only", "shuffled_prefix")
     )

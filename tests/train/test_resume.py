@@ -32,7 +32,7 @@ def common(micro, store) -> dict:
 def sft_settings(micro, micro_store, nf4_cfg) -> SftCommand:
     train = SftTrainConfig(
         lr=1e-3, max_steps=4, micro_batch=2, accumulation=2, precision="fp32",
-        gradient_checkpointing=False, evaluations=2, validation_items=4,
+        gradient_checkpointing=False, evaluations=2, validation_items=4, permute_candidates=True,
     )  # fmt: skip
     teacher = TeacherConfig(name="template")
     return SftCommand(**common(micro, micro_store), teacher=teacher, student=nf4_cfg, train=train)

@@ -1,0 +1,129 @@
+"""What each regime has a student write, and that it stays right in every order of candidates."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from conf.errors import UserError
+from conf.schema import SelectCommand, SftTrainConfig, TeacherConfig
+from conf.schema.training import REGIMES
+from data.records import LETTERS
+from data.store import Store
+from evaluation import select
+from evaluation.protocol import parse_choice
+from teacher.claims import find_claims
+from teacher.narrate import ensure_rationales
+from teacher.predicates import predicates_of
+from teacher.sections import SECTIONS, parts
+from teacher.validate import validate
+from train.conversation import answer_line, instruction, response
+from train.samples import Samples, Supervised, supervised_items
+
+TEACHER = TeacherConfig(name="template")
+ASKED = [r for r in REGIMES if r not in ("answer_only", "describe")]
+
+
+def made(store: Store, regime: str, seed: int | None = None) -> dict[str, list[Supervised]]:
+    rationales = {r.item_id: r for r in ensure_rationales(store, TEACHER)}
+    train = SftTrainConfig(regime=regime)
+    return supervised_items(store, store.selection("train"), rationales, train, seed)
+
+
+def told(s: Supervised) -> str:
+    return response(s.rationale, s.matches, s.item.letter, s.mode, s.regime)
+
+
+@pytest.mark.parametrize("regime", ASKED)
+def test_a_regime_is_the_whole_without_its_part(micro_store, regime) -> None:
+    asked = made(micro_store, regime)["reasoning"]
+    assert asked
+    for s in asked:
+        text = told(s)
+        headings = [name for name, _, _ in parts(text)]
+        left_out = {"Candidate analysis"} if regime == "cot_no_candidate_analysis" else set()
+        assert headings == [*(name for name in SECTIONS if name not in left_out), "Answer"]
+        for name, start, stop in parts(s.rationale):
+            if name not in ("Answer", *left_out):
+                assert s.rationale[start:stop].strip() in text
+        lines = text.splitlines()
+        told_of = [line.split()[1] for line in lines if line.startswith("Candidate ") and
+                   not line.startswith("Candidate analysis")]  # fmt: skip
+        assert told_of == ([] if regime == "cot_no_match_layout" else list(LETTERS))
+        assert lines[-1] == answer_line(s.item.letter)
+
+
+@pytest.mark.parametrize("regime", [*ASKED, "answer_only"])
+def test_both_modes_are_trained_and_answer_alike(micro_store, regime) -> None:
+    asked = made(micro_store, regime)
+    answers = {s.item.item_id: s for s in asked["answer"]}
+    assert all(told(s) == answer_line(s.item.letter) for s in answers.values())
+    assert {i.item_id for i in micro_store.selection("train")} == answers.keys()
+    for s in asked["reasoning"]:
+        assert parse_choice(told(s)) == answers[s.item.item_id].item.letter
+        assert instruction(s.mode, regime) != instruction("answer", regime)
+
+
+def test_what_is_supervised_is_right_in_every_epochs_order(micro_store) -> None:
+    """Every item, in the orders of several epochs: the rationale stands before the validator, the
+    matches hold against the predicates, and the answer is the same frame."""
+    asked = made(micro_store, "cot", seed=0)
+    orders = set()
+    for s in asked["reasoning"] + asked["answer"]:
+        right = s.item.candidates[s.item.answer]
+        for epoch in range(4):
+            shown = s.in_epoch(epoch)
+            item = shown.item
+            assert item.candidates[item.answer] == right
+            assert sorted(item.candidates, key=repr) == sorted(s.item.candidates, key=repr)
+            assert parse_choice(told(shown)) == LETTERS[item.candidates.index(right)]
+            orders.add(tuple(s.item.candidates.index(c) for c in item.candidates))
+            if s.mode == "reasoning":
+                predicates = predicates_of(
+                    item, micro_store.scene(item.scene_id), micro_store.scene
+                )
+                assert validate(shown.rationale, predicates, item, TEACHER).reasons == ()
+                matching = [line for line in shown.matches if " matches: " in line]
+                assert [line.split()[1] for line in matching] == [item.letter]
+                assert [line.split()[1] for line in shown.matches] == list(LETTERS)
+                analysis = "Candidate analysis: " + "\n".join(shown.matches)
+                verdicts = {c.verdict for c in find_claims(analysis, predicates)}
+                assert "contradicted" not in verdicts
+                assert "supported" in verdicts
+    assert len(orders) == 24
+
+
+def test_an_order_is_of_its_seed_epoch_and_item(micro_store) -> None:
+    first, second = made(micro_store, "answer_only", seed=0)["answer"][:2]
+    orders = [first.in_epoch(e).item.candidates for e in range(8)]
+    assert orders == [first.in_epoch(e).item.candidates for e in range(8)]
+    assert len(set(orders)) > 1
+    other = replace(first, seed=1)
+    assert orders != [other.in_epoch(e).item.candidates for e in range(8)]
+    places = [[s.item.candidates.index(c) for c in s.in_epoch(0).item.candidates]
+              for s in (first, second)]  # fmt: skip
+    assert made(micro_store, "answer_only")["answer"][0].in_epoch(3).item == first.item
+    assert len(places[0]) == len(places[1]) == 4
+
+
+def test_an_epoch_reaches_the_samples(micro_store, frames, student_cfg) -> None:
+    asked = made(micro_store, "answer_only", seed=0)["answer"]
+    samples = Samples([s.planned(frames, student_cfg) for s in asked])
+    shown = []
+    for epoch in range(4):
+        samples.epoch = epoch
+        shown.append([samples[k].response for k in range(len(samples))])
+        assert shown[-1] == [told(s.in_epoch(epoch)) for s in asked]
+    assert shown[0] != shown[1]
+
+
+def test_a_mode_that_was_not_trained_is_told(tmp_path, monkeypatch) -> None:
+    from conf.schema import SftCommand
+    from evaluation import trained
+
+    settings = SftCommand(train=SftTrainConfig(regime="answer_only"))
+    monkeypatch.setattr(trained, "settings_of", lambda *_: settings)
+    cfg = SelectCommand(model=str(tmp_path), modes=["reasoning"])
+    with pytest.raises(UserError, match=r"answer mode alone .* give modes=\[answer\]"):
+        select.main.__wrapped__(cfg, None)
