@@ -276,7 +276,11 @@ class CandidateReader(Reader):
     # What is said of an object in a candidate.
 
     def on_region(self, tag: Tag) -> None:
-        if not self.objects or self.skipped:
+        if self.skipped:
+            return
+        if not self.objects:
+            if not (self.expected or self.negated):
+                self._tell_of_any("region", tag)
             return
         if self.expected or self.negated:
             affirmed = self.contrasted or not (self.expected and self.negated)
@@ -291,7 +295,10 @@ class CandidateReader(Reader):
 
     def on_direction(self, tag: Tag) -> None:
         if self.word(self.near(-1)) != "from" and not self.expected and not self.negated:
-            self._tell("displaced", str(tag.value), True, tag)
+            if self.objects:
+                self._tell("displaced", str(tag.value), True, tag)
+            elif self.near(-1).tag in ("off", "slight", "clear"):
+                self._tell_of_any("displaced", tag)
 
     def on_off(self, tag: Tag) -> None:
         if not self.expected:
@@ -368,6 +375,11 @@ class CandidateReader(Reader):
                 self.found.append(self.claim(kind, (name,), value, affirmed, TARGET, tag, letter))
         if len(self.objects) > 1 and affirmed:
             self.shared.append((kind, value, tuple(self.objects), tag))
+
+    def _tell_of_any(self, kind: str, tag: Tag) -> None:
+        """Hold what a candidate shows of an object that cannot be told apart."""
+        for letter in () if self.refused or self.skipped else self.letters:
+            self.found.append(self.claim(kind, (), str(tag.value), True, TARGET, tag, letter))
 
     # What is said of a whole candidate.
 

@@ -21,6 +21,19 @@ PLACES = {"corner", "area", "region", "part", "portion", "zone", "section"}
 """Nouns that may follow a region's words."""
 SIDES = {"side", "edge", "border", "boundary"}
 """Nouns that make "left" and its like coarse: the left side has three regions."""
+RIGHT_ONES = {"place", "places", "spot", "spots", "position", "positions", "location", "locations"}
+RIGHT_ONES |= {
+    "object",
+    "objects",
+    "layout",
+    "candidate",
+    "answer",
+    "choice",
+    "way",
+    "order",
+    "time",
+}
+"""Nouns before which "right" is no side."""
 AT = {"near", "at", "in", "on", "along", "by", "around", "within", "inside", "toward", "towards"}
 AT |= {"to", "into", "from", "onto"}
 WAYS = {"toward": "toward", "towards": "toward", "to": "into", "into": "into", "from": "from"}
@@ -165,7 +178,8 @@ _TABLE: dict[tuple[str, str], str] = {
         "strike; strikes; striking; touch; touches; touching; run into; runs into; bump into; "
         "bumps into; bump; crash; crashes; struck by; hit by; in contact; reach contact; reaches "
         "contact; crash into; crashes into; come together; comes together; knocks into; knock "
-        "into; met by; get in contact; impacts; have contact; has contact; running into"
+        "into; met by; get in contact; impacts; have contact; has contact; running into; catch; "
+        "catches"
     ),
     ("contact", ""): "contact; collision; impact; encounter; collisions; contacts",
     ("passed", ""): (

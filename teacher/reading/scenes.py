@@ -329,6 +329,9 @@ class SceneReader(PairReader):
             if self.relation:
                 self.relation.partners = [None]
             return
+        if self.word(tag).endswith("scene") and self.near(-1).tag in ("word", "across", "moves"):
+            # "Has crossed the scene."
+            return
         self.subjects, self.group_start = [None], 0
         self.finite = self.blocked = self.nobody = False
 
@@ -492,16 +495,21 @@ class SceneReader(PairReader):
     def on_leaves(self, tag: Tag) -> None:
         self.verb()
         if not self._is_bare(tag) or self.near(1).tag in BOUNDARIES:
-            self._tell("leaves", "", not self.negated, BETWEEN, tag)
+            self._event("leaves", tag)
 
     def _is_bare(self, tag: Tag) -> bool:
         """Whether "leaves" or its like stands without what is left."""
         return " " not in self.word(tag)
 
+    def _event(self, kind: str, tag: Tag) -> None:
+        # What has not happened by the cut may happen later.
+        when = CUT if self.negated and self.moment == CUT and not self.future else BETWEEN
+        self._tell(kind, "", not self.negated, when, tag)
+
     def on_enters(self, tag: Tag) -> None:
         self.verb()
         if not self._is_bare(tag) or self.near(1).tag in (*BOUNDARIES, "region"):
-            self._tell("enters", "", not self.negated, BETWEEN, tag)
+            self._event("enters", tag)
 
     def on_out(self, tag: Tag) -> None:
         self._sight("out of view", tag)

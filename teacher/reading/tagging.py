@@ -181,6 +181,9 @@ def _region(words: list[str], i: int) -> tuple[str, str, int]:
     corner = row is not None and column is not None
     noun = words[i] if i < count else ""
     named = noun in phrases.PLACES or noun in phrases.SIDES
+    if words[i - 1] == "right" and noun in phrases.RIGHT_ONES:
+        # "In the right place" is no region.
+        return "", "", i
     if i == begin or not (named or corner or (prepared and (article or middle))):
         return "", "", i
     i += named

@@ -151,10 +151,12 @@ def test_a_false_sentence_is_contradicted_and_a_true_one_is_not(truth, section, 
         # Whom a pronoun stands for is not guessed.
         (
             "P",
-            "The red metal cube is close to the blue rubber sphere and it is near the top.",
+            "The red metal cube is close to the blue rubber sphere and it is near the bottom.",
             None,
         ),
-        ("S", "It is near the top.", {"region near the top": "unknown"}),
+        ("S", "It is near the bottom.", {f"region {BOTTOM}": "unknown"}),
+        # Where there is nothing, it is not, whatever it is.
+        ("S", "It is near the top.", {"region near the top": "contradicted"}),
         ("M", "If it were struck, the gray rubber cylinder would move east.", {}),
         (
             "C",
@@ -206,12 +208,14 @@ def narrated(benchmark_store):
     return found
 
 
+@pytest.mark.slow
 def test_nothing_that_the_narrator_says_is_contradicted(narrated):
     for item, predicates, text in narrated:
         assert contradicted(text, predicates) == []
         assert contradicted(paraphrase(text, Random(item.item_id)), predicates) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_flipped_fact_is_found(narrated, kind):
     found = []
@@ -228,6 +232,7 @@ def test_nothing_that_a_language_model_rightly_says_is_contradicted():
         assert contradicted(record["text"], predicates_from(record["predicates"])) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", EDITS)
 def test_a_false_word_in_prose_is_found(kind):
     found = []
@@ -235,9 +240,10 @@ def test_a_false_word_in_prose_is_found(kind):
         predicates = predicates_from(record["predicates"])
         edits = EDITS[kind](record["text"], predicates, Random(record["item_id"]))
         found += [bool(contradicted(text, predicates)) for text, _ in edits]
-    assert sum(found) >= 0.96 * len(found) > 20
+    assert sum(found) >= 0.97 * len(found) > 20
 
 
+@pytest.mark.slow
 def test_no_text_makes_it_raise_and_the_same_text_gives_the_same():
     rng = Random(0)
     words = [*PHRASES, RED, BLUE, "the red cube", "A", "B", "Candidate D", "near the top", "both"]
@@ -251,6 +257,7 @@ def test_no_text_makes_it_raise_and_the_same_text_gives_the_same():
         find_claims(f"{section}: " + f"the {RED} and A, " * 5000, FACTS)
 
 
+@pytest.mark.slow
 def test_the_validator_rejects_what_is_contradicted_and_keeps_the_claims(narrated):
     cfg = TeacherConfig(name="template")
     item, predicates, text = narrated[0]
