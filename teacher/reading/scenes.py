@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from teacher.reading.grounding import BETWEEN, CUT, EITHER, TARGET
+from teacher.reading.nouns import COLUMNS, MIDDLE, ROWS
 from teacher.reading.pairs import RELATIONS
-from teacher.reading.phrases import COARSE, COLUMNS, MIDDLE, ROWS
+from teacher.reading.phrases import COARSE
 from teacher.reading.reader import BOUNDARIES
 from teacher.reading.subjects import SubjectReader
 from teacher.reading.tagging import Tag
