@@ -75,6 +75,8 @@ UNBOUND = {"region", "direction", "displaced", "close region", "place of either"
 """Kinds of claims that may be false of whatever they are about."""
 NAMING = {"lack", "gone", "adds", "extra", "misplace", "passed"}
 """Tags that make the object after them what a candidate lacks, adds or displaces."""
+CLOSING = {"stop", "semicolon", "break", "which", "show", "lack", "adds", "extra", "candidate"}
+"""Tags that may follow a list and leave its last object in it."""
 COMPARED = {"slight", "clear", "off", "direction"}
 """Tags after "gone" and its like that make it a verb of motion: "has gone slightly too far"."""
 
@@ -88,6 +90,7 @@ class Sentence:
         """`bound`: the names by where in the text their noun phrase begins."""
         self.text = text
         self.tags = tags
+        self.bound = bound
         self.positions = {tag.start: i for i, tag in enumerate(tags)}
         self.places: dict[str | None, list[int]] = {}
         for start, names in bound.items():
@@ -101,6 +104,8 @@ class Sentence:
             return True
         if claim.candidate is not None and not self._is_letter_plain(claim.candidate, at):
             return False
+        if claim.kind == "agrees":
+            return self._is_verdict_whole(at)
         if not claim.subjects:
             return claim.kind not in UNBOUND or self._is_general(at)
         if claim.kind in PAIRED:
@@ -109,6 +114,7 @@ class Sentence:
             return claim.candidate is None or self._is_naming_plain(at)
         return (
             self._is_complete(claim, at)
+            and not (claim.candidate and self._is_second(at))
             and self._is_subject_plain(claim.subjects[0], at)
             and self._is_negation_plain(claim, at)
         )
@@ -117,6 +123,14 @@ class Sentence:
         """Whether the sentence names the candidate that the claim is about, or none before it."""
         before = any(tag.tag == "candidate" for tag in self.tags[:at])
         return not before or any(t.tag == "candidate" and t.value == letter for t in self.tags)
+
+    def _is_verdict_whole(self, at: int) -> bool:
+        """Whether nothing qualifies an agreement ("in placing the A near the left")."""
+        ahead = at + 1
+        while ahead < len(self.tags) and self.tags[ahead].tag == "by":
+            ahead += 1
+        following = self.tags[ahead : ahead + 1]
+        return not any(_is_strange(tag) or tag.tag == "show" for tag in following)
 
     def _is_general(self, at: int) -> bool:
         """Whether what is said without a known subject is said of some object all the same."""
@@ -130,7 +144,7 @@ class Sentence:
         while self.tags[ahead].tag in ("object", "and", "comma") and ahead + 1 < len(self.tags):
             ahead += 1
         listed = any(t.tag == "object" for t in self.tags[max(0, at - 3) : at])
-        if listed and self.tags[ahead].tag in ("be", "moves", "stays", "off", "slight", "clear"):
+        if listed and self.tags[ahead].tag not in CLOSING:
             # "Lacks the A, and both the B and the C are off."
             return False
         back = at
@@ -144,7 +158,21 @@ class Sentence:
         spots = [at]
         for name in claim.subjects:
             spots += self._nearest(name, at)
-        return not any(map(_is_strange, self.tags[min(spots) : max(spots) + 1]))
+        following = self.tags[max(spots) + 1 : max(spots) + 2]
+        if len(claim.subjects) < 2 and any(map(_is_strange, following)):
+            # "Touches nothing" and its like.
+            return False
+        between = self.tags[min(spots) : max(spots) + 1]
+        told = self.tags[: max(spots) + 1]
+        return not any(map(_is_strange, between)) and not self._is_pronoun_open(claim, told)
+
+    def _is_pronoun_open(self, claim: Claim, told: Sequence[Tag]) -> bool:
+        """Whether an "it" may stand for another object than those of the claim."""
+        names = {name for t in told for name in self.bound.get(t.start, ())}
+        pronoun = any(
+            t.tag == "pronoun" and self.text[t.start : t.stop].lower() == "it" for t in told
+        )
+        return pronoun and not names <= set(claim.subjects)
 
     def _is_complete(self, claim: Claim, at: int) -> bool:
         """Whether what is said ends with its phrase ("covered", but not "covered more ground")."""
@@ -152,11 +180,18 @@ class Sentence:
         if following is None:
             return True
         if claim.kind == "lacks":
-            return following.tag not in COMPARED
+            return following.tag not in COMPARED and str(following.value) != "too"
         takes_object = claim.kind == "sight" and following.tag == "object"
         return not (claim.kind in ("region", "sight") and _is_strange(following)) and not (
             takes_object and any(i < at for i in self.places.get(claim.subjects[0], ()))
         )
+
+    def _is_second(self, at: int) -> bool:
+        """Whether the clause has placed its object before: "near the left, <...> near the top"."""
+        back = at - 1
+        while back >= 0 and self.tags[back].tag in ("break", "by", "word", "be"):
+            back -= 1
+        return self.tags[at].tag == self.tags[back].tag == "region"
 
     def _is_subject_plain(self, name: str, at: int) -> bool:
         before = [i for i in self.places.get(name, []) if i < at]
