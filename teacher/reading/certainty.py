@@ -104,6 +104,9 @@ class Sentence:
             return True
         if claim.candidate is not None and not self._is_letter_plain(claim.candidate, at):
             return False
+        if claim.kind == "other objects":
+            # "The other objects" are those of the scene.
+            return not self.text[: claim.span[0]].lower().endswith("the ")
         if claim.kind == "agrees":
             return self._is_verdict_whole(at)
         if not claim.subjects:
@@ -144,7 +147,7 @@ class Sentence:
         while self.tags[ahead].tag in ("object", "and", "comma") and ahead + 1 < len(self.tags):
             ahead += 1
         listed = any(t.tag == "object" for t in self.tags[max(0, at - 3) : at])
-        if listed and self.tags[ahead].tag not in CLOSING:
+        if self.tags[ahead].tag in COMPARED or (listed and self.tags[ahead].tag not in CLOSING):
             # "Lacks the A, and both the B and the C are off."
             return False
         back = at
@@ -210,9 +213,10 @@ class Sentence:
     def _is_told_ahead(self, at: int, spot: int) -> bool:
         """Whether what is said opens the clause of a subject that comes late."""
         between = self.tags[at + 1 : spot]
-        return not any(_is_strange(t) or t.tag in ("semicolon", "stop") for t in between) and (
-            _is_one_list(between)
-        )
+        first = next((i for i, t in enumerate(between) if t.tag == "object"), len(between))
+        if any(t.tag in ("semicolon", "stop", "and", "break") for t in between[:first]):
+            return False
+        return not any(map(_is_strange, between)) and _is_one_list(between)
 
     def _is_negation_plain(self, claim: Claim, at: int) -> bool:
         if claim.affirmed:

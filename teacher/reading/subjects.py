@@ -116,8 +116,13 @@ class SubjectReader(ClauseReader):
         self.relative = True
         if self.near(-1).tag == "object" or self.near(-2).tag == "object":
             self.flush()
-            several = len(self.subjects) - self.group_start > 1 and not self.complement
-            self.subjects = [None] if several else self.last
+            listed = self.subjects[self.group_start :]
+            several = len(listed) > 1 and not self.complement
+            if several and self.word(self.near(1)) in ("both", "are"):
+                # "The A and the B, which both move east."
+                self.subjects = listed
+            else:
+                self.subjects = [None] if several else self.last
             self.finite = self.blocked = False
             self.group_start = 0
 
@@ -138,12 +143,23 @@ class SubjectReader(ClauseReader):
         possessive = self.word(tag) in ("its", "their") or self.near(1).tag == "object"
         if previous.tag == "object" or possessive or (previous.tag in VERBS and self.subjects):
             return
+        listed = self._listed(previous) if self.word(tag) == "both" else []
+        if listed:
+            self.subjects, self.group_start, self.blocked = listed, 0, False
+            return
         self.verbal |= self.finite
         self.subjects = [None] if self._is_ahead() else self._antecedent(str(tag.value))
         self.pronominal, self.gapped = True, False
         self.group_start = 0
         self.finite = self.blocked = self.nobody = False
         self._settle(places=False)
+
+    def _listed(self, previous: Tag) -> Names:
+        """The two just listed, which "both" stands for: "the A and the B, both near the left"."""
+        listed = self.subjects[self.group_start :]
+        beside = previous.tag == "comma" and self.near(-2).tag == "object"
+        safe = len(listed) == 2 and None not in listed and (beside or previous.tag == "which")
+        return listed if safe else []
 
     def _antecedent(self, pronoun: str) -> Names:
         """Whom a pronoun stands for where that is safe to say, else None."""
