@@ -13,56 +13,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from teacher.reading.grounding import Claim
 from teacher.reading.tagging import Tag
 
-PLAIN = {
-    *("still", "all", "only", "now", "too", "both", "back", "there", "again", "also", "just"),
-    *("already", "simply", "then", "same", "together", "well", "here", "alike", "thus", "ever"),
-    *(
-        "straight",
-        "directly",
-        "hand",
-        "other",
-        "contrast",
-        "thereby",
-        "newly",
-        "later",
-        "turn",
-        "expect",
-    ),
-    *("pushed", "driven", "nudged", "carried", "sent", "turned", "knocked", "set", "gathered"),
-    *("crossed", "comes", "came", "crawls", "charges", "closing", "bearing", "stayed", "rested"),
-    *(
-        "shown",
-        "arrived",
-        "slipped",
-        "stayed",
-        "unmoved",
-        "view",
-        "area",
-        "region",
-        "course",
-        "way",
-        "direction",
-        "got",
-        "reached",
-        "we",
-        "see",
-        "closes",
-    ),
-    *(
-        "down",
-        "up",
-        "come",
-        "joins",
-        "even",
-        "gets",
-        "farthest",
-        "somewhere",
-        "where",
-        "lead",
-        "leads",
-    ),
-}
-"""Words outside the vocabulary that leave a clause plain: adverbs, and verbs of being moved."""
+PLAIN_WORDS = """
+all back both just only quite same too very we see straight directly simply well alike
+again already also ever here later now still then there thus where thereby newly expect
+hand other contrast turn along down up together even somewhere right farthest area
+course direction region time view way lead leads arrived bearing came carried charges
+closes closing come comes crawls crossed driven gathered gets got joins knocked nudged
+pushed reached rested sent set shown slipped stayed turned unmoved
+"""
+PLAIN = frozenset(PLAIN_WORDS.split())
+"""Words outside the vocabulary that leave a clause plain: adverbs, nouns of place and way, verbs of
+moving and of being moved."""
 LISTING = {"and", "comma", "object", "region", "not", "all"}
 """Tags between the objects of a list, each with its place at most."""
 BESIDE_NOT = {"be", "future", "moves", "moving", "show", "pronoun", "stays", "past", "by", "close"}
@@ -108,7 +69,7 @@ class Sentence:
             # "The other objects" are those of the scene.
             return not self.text[: claim.span[0]].lower().endswith("the ")
         if claim.kind == "agrees":
-            return self._is_verdict_whole(at)
+            return self._is_verdict_whole(claim, at)
         if not claim.subjects:
             return claim.kind not in UNBOUND or self._is_general(at)
         if claim.kind in PAIRED:
@@ -127,13 +88,27 @@ class Sentence:
         before = any(tag.tag == "candidate" for tag in self.tags[:at])
         return not before or any(t.tag == "candidate" and t.value == letter for t in self.tags)
 
-    def _is_verdict_whole(self, at: int) -> bool:
-        """Whether nothing qualifies an agreement ("in placing the A near the left")."""
+    def _is_verdict_whole(self, claim: Claim, at: int) -> bool:
+        """Whether an agreement is of the candidate named last, and nothing qualifies it ("in
+        placing the A near the left")."""
+        if not self._is_named_last(claim.candidate, at):
+            return False
         ahead = at + 1
         while ahead < len(self.tags) and self.tags[ahead].tag == "by":
             ahead += 1
         following = self.tags[ahead : ahead + 1]
         return not any(_is_strange(tag) or tag.tag == "show" for tag in following)
+
+    def _is_named_last(self, letter: str | None, at: int) -> bool:
+        last = at
+        while last >= 0 and self.tags[last].tag != "candidate":
+            last -= 1
+        named = set()
+        while last >= 0 and self.tags[last].tag in ("candidate", "and", "comma"):
+            named.add(self.tags[last].value)
+            last -= 1
+        later = {tag.value for tag in self.tags[at:] if tag.tag == "candidate"}
+        return not named or letter in named | later
 
     def _is_general(self, at: int) -> bool:
         """Whether what is said without a known subject is said of some object all the same."""

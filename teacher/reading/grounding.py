@@ -108,14 +108,12 @@ class Ground:
             if claim.value.lstrip(COARSE) not in COMPASS or any(d.kind == "region" for d in found):
                 return None
             told = [_same(claim.value, d.heading) for d in found if d.heading]
-            return None if set(told) - {False} else False
-        # Words may also tell of where an object should be.
-        one = [
-            claim._replace(subjects=(name,)) for name in {*self.objects, *(d.object for d in found)}
-        ]
-        told = [_shown_region(self, c) for c in one]
-        told += [_region(o, claim.value, EITHER) for o in self.objects.values()]
-        return None if set(told) - {False} else False
+        else:
+            # Words may also tell of where an object should be.
+            told = [_region(o, claim.value, EITHER) for o in self.objects.values()]
+            told += [_same(claim.value, d.region) for d in found if d.region]
+            told += [None for d in found if d.kind == "extra"]
+        return False if set(told) <= {False} else None
 
 
 def _mention(ground: Ground, claim: Claim) -> bool:

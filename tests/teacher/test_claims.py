@@ -182,6 +182,25 @@ def test_claims_are_read_with_their_subject_and_their_polarity(section, sentence
         assert found == claims
 
 
+@pytest.mark.parametrize(
+    ("section", "plain", "unsure"),
+    [
+        ("S", "The {0} is near the top.", "The {0} recalls somebody near the top."),
+        ("S", "The {0} heads west.", "The {0} meets the {1} and heads west."),
+        ("C", "Candidate B lacks the {0}.", "Candidate B lacks others, ones unlike the {0}."),
+        (
+            "C",
+            "Candidate D agrees.",
+            "Candidate D is off; with candidate B, everything agrees.",
+        ),
+    ],
+)
+def test_only_what_is_certain_is_contradicted(section, plain, unsure):
+    found = verdicts(section, plain.format(RED, BLUE))
+    assert "contradicted" in found.values()
+    assert "contradicted" not in verdicts(section, unsure.format(RED, BLUE)).values()
+
+
 def test_most_of_what_true_sentences_say_is_supported():
     found = [v for truth, s, text in CASES if truth == "true" for v in verdicts(s, text).values()]
     assert found.count("supported") > 0.9 * len(found) > 200
