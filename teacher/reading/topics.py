@@ -120,17 +120,7 @@ class TopicReader(Reader):
         elif before in PARTED and self.skipped:
             self.letters = ()
         elif before in PARTED and len(self.found) > self.clause:
-            kept, moved = self.found[: self.clause], self.found[self.clause :]
-            seen = dict.fromkeys((c.kind, c.subjects, c.value, c.affirmed, c.span) for c in moved)
-            whole = [c for c in moved if c.candidate is None and c.kind != "agrees"]
-            self.found = kept + whole
-            for kind, subjects, value, affirmed, span in seen:
-                if any(c.span == span and c.kind == kind for c in whole):
-                    continue
-                self.found += [
-                    Claim(kind, subjects, value, affirmed, TARGET, letter, span)
-                    for letter in letters
-                ]
+            self._put_down_to(letters)
             # Where another candidate was spoken of, what follows may be about either.
             self.letters = () if named else letters
         else:
@@ -143,6 +133,19 @@ class TopicReader(Reader):
             if self.passing:
                 self.whole("agrees", not self.refused, tag)
                 self.passing = False
+
+    def _put_down_to(self, letters: tuple[str, ...]) -> None:
+        """Hold what the clause has said so far of the candidates that it names only now."""
+        kept, moved = self.found[: self.clause], self.found[self.clause :]
+        seen = dict.fromkeys((c.kind, c.subjects, c.value, c.affirmed, c.span) for c in moved)
+        whole = [c for c in moved if c.candidate is None and c.kind != "agrees"]
+        self.found = kept + whole
+        for kind, subjects, value, affirmed, span in seen:
+            if any(c.span == span and c.kind == kind for c in whole):
+                continue
+            self.found += [
+                Claim(kind, subjects, value, affirmed, TARGET, letter, span) for letter in letters
+            ]
 
     def is_compared(self, start: int) -> bool:
         """Whether the candidate at `start` is only compared with the one that its clause is about
