@@ -19,7 +19,7 @@ from collections import Counter
 from pathlib import Path
 from random import Random
 
-from benchmarks.mutations import KINDS, mutations, predicates_from
+from benchmarks.mutations import KINDS, falsehoods, predicates_from
 from benchmarks.paraphrases import paraphrase
 from benchmarks.prose import EDITS
 from data.store import open_store
@@ -83,17 +83,13 @@ def measure_narrator(folder: Path, limit: int | None) -> None:
         ]
         passed.add("paraphrased", not false, f"{item.item_id}: {false}")
         for kind in KINDS:
-            options = mutations(predicates, kind, rng)
-            rng.shuffle(options)
-            for mutation in options:
-                false_text = narrate(mutation.predicates, item, 0)
-                if false_text != text and mutation.is_told(false_text):
-                    good = is_contradicted(false_text, predicates)
-                    caught.add(kind, good, f"{item.item_id}: {mutation.told}")
-                    told = paraphrase(false_text, rng)
-                    good = is_contradicted(told, predicates)
-                    caught.add(f"{kind}, par.", good, f"{item.item_id}: {mutation.told}\n{told}")
-                    break
+            for false_text, mutation in falsehoods(predicates, item, kind, rng):
+                good = is_contradicted(false_text, predicates)
+                caught.add(kind, good, f"{item.item_id}: {mutation.told}")
+                told = paraphrase(false_text, rng)
+                good = is_contradicted(told, predicates)
+                caught.add(f"{kind}, par.", good, f"{item.item_id}: {mutation.told}\n{told}")
+                break
             else:
                 caught.untold[kind] += 1
     print(f"{folder}: {narrated} rationales, {seconds / narrated * 1e3:.2f} ms each")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from random import Random
 from typing import Any
 
-from data.records import COLORS
+from data.records import COLORS, SelectionItem
 from teacher.predicates import (
     COMPASS,
     REGIONS,
@@ -22,6 +22,7 @@ from teacher.predicates import (
     ObjectFacts,
     Predicates,
 )
+from teacher.template import narrate
 
 ALL_REGIONS = [region for row in REGIONS for region in row]
 ALL_SPEEDS = ["stationary", *(word for _, word in SPEEDS), VERY_FAST]
@@ -68,6 +69,19 @@ def predicates_from(record: dict[str, Any]) -> Predicates:
 def mutations(predicates: Predicates, kind: str, rng: Random) -> list[Mutation]:
     """Every place's flip of a kind, each to a false value drawn at random."""
     return KINDS[kind](predicates, rng)
+
+
+def falsehoods(
+    predicates: Predicates, item: SelectionItem, kind: str, rng: Random, seed: int = 0
+) -> Iterator[tuple[str, Mutation]]:
+    """Rationales that the built-in narrator tells of flipped facts, each of which it does tell."""
+    text = narrate(predicates, item, seed)
+    options = mutations(predicates, kind, rng)
+    rng.shuffle(options)
+    for mutation in options:
+        false = narrate(mutation.predicates, item, seed)
+        if false != text and mutation.is_told(false):
+            yield false, mutation
 
 
 def _other(rng: Random, words: list[str] | tuple[str, ...], *but: str | None) -> str:

@@ -23,8 +23,18 @@ def _words(words: list[str] | tuple[str, ...]) -> re.Pattern[str]:
     return re.compile(rf"\b(?:{'|'.join(sorted(words, key=len, reverse=True))})\b(?!-)")
 
 
+def _is_known(text: str, at: int, predicates: Predicates) -> bool:
+    """Whether the predicates tell how the object named last in a sentence moves: of one out of
+    view at the cut they do not, so that no word for its motion is false."""
+    before = text[text.rfind(".", 0, at) + 1 : at].lower()
+    last = max(predicates.objects, key=lambda o: before.rfind(o.object))
+    return last.object not in before or last.speed is not None
+
+
 def directions(text: str, predicates: Predicates, rng: Random) -> Iterator[Edit]:
     for match in _words(COMPASS).finditer(text):
+        if not _is_known(text, match.start(), predicates):
+            continue
         yield _swap(text, match, rng.choice([w for w in COMPASS if w != match[0]]))
 
 
@@ -36,6 +46,8 @@ def regions(text: str, predicates: Predicates, rng: Random) -> Iterator[Edit]:
 def speeds(text: str, predicates: Predicates, rng: Random) -> Iterator[Edit]:
     moving = ALL_SPEEDS[1:]
     for match in _words(moving).finditer(text):
+        if not _is_known(text, match.start(), predicates):
+            continue
         yield _swap(text, match, rng.choice([w for w in moving if w != match[0]]))
 
 
@@ -48,7 +60,7 @@ def colors(text: str, predicates: Predicates, rng: Random) -> Iterator[Edit]:
 
 
 def pairs(text: str, predicates: Predicates, rng: Random) -> Iterator[Edit]:
-    """A partner exchanged in each sentence of the motion analysis that names exactly a pair."""
+    """A partner exchanged in each sentence of the motion analysis that tells of exactly a pair."""
     names = [o.object for o in predicates.objects]
     met = {frozenset(m.objects) for m in (*predicates.courses, *predicates.contacts)}
     start, stop = text.find("Motion analysis:"), text.find("Prediction:")
@@ -56,7 +68,8 @@ def pairs(text: str, predicates: Predicates, rng: Random) -> Iterator[Edit]:
         inside = list(_words(names).finditer(text, start + found.start(), start + found.end()))
         pair = frozenset(m[0] for m in inside)
         denied = re.search(r"\b(?:not?|never|without|avoid|misse?s?|clear)\b", found[0])
-        if len(inside) == 2 and pair in met and not denied:
+        told = re.search(r"contact|colli|meet|hit|strik|struck|touch|run|course|path", found[0])
+        if len(inside) == 2 and pair in met and told and not denied:
             kept = inside[0][0]
             free = [n for n in names if n not in pair and frozenset((kept, n)) not in met]
             if free:

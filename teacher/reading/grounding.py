@@ -22,7 +22,7 @@ class Claim(NamedTuple):
     `value` is a word of the predicates, "" where the kind says all; a leading "~" marks one that
     need only roughly hold. `when` is the moment it speaks of, `candidate` the letter of the
     candidate that is said to show it, `span` where it stands in the text. `verdict` is
-    "supported", "contradicted" or "unknown".
+    "supported", "contradicted" or "unknown"; `certain` says whether it may be contradicted.
     """
 
     kind: str
@@ -33,6 +33,7 @@ class Claim(NamedTuple):
     candidate: str | None
     span: tuple[int, int]
     verdict: str = "unknown"
+    certain: bool = True
 
     def __str__(self) -> str:
         told = [self.kind, *([] if self.affirmed else ["not"]), self.value.lstrip(COARSE)]
@@ -66,21 +67,53 @@ class Ground:
         truth = self.truth(claim)
         if truth is None:
             return "unknown"
-        return "supported" if truth == claim.affirmed else "contradicted"
+        if truth == claim.affirmed:
+            return "supported"
+        return "contradicted" if claim.certain else "unknown"
 
     def truth(self, claim: Claim) -> bool | None:
         """Whether what a claim says, its negation aside, holds."""
         if claim.candidate is not None:
-            told = claim.subjects or claim.kind in ("agrees", "other objects")
-            if claim.candidate not in self.candidates or not told:
+            if claim.candidate not in self.candidates:
                 return None
+            if not claim.subjects and claim.kind not in ("agrees", "other objects"):
+                return self._of_none_shown(claim)
             return CANDIDATE[claim.kind](self, claim)
+        if claim.kind in PLACES and not claim.subjects:
+            return self._of_none(claim._replace(kind="region"))
         if claim.kind in PAIRS:
             return PAIRS[claim.kind](self, claim)
         if claim.kind == "mention":
             return _mention(self, claim)
-        facts = self.objects.get(claim.subjects[0]) if claim.subjects else None
+        if not claim.subjects:
+            return self._of_none(claim)
+        facts = self.objects.get(claim.subjects[0])
         return None if facts is None else OBJECTS[claim.kind](facts, claim.value, claim.when)
+
+    def _of_none(self, claim: Claim) -> bool | None:
+        """False for a region or a direction that no object of the scene is in or goes: whatever
+        the claim is about, it does not hold."""
+        if claim.kind not in ("region", "direction") or not claim.affirmed:
+            return None
+        told = [OBJECTS[claim.kind](o, claim.value, EITHER) for o in self.objects.values()]
+        near = claim.kind == "region" and any(_same(claim.value, r) for r in self.close.values())
+        return False if set(told) == {False} and not near else None
+
+    def _of_none_shown(self, claim: Claim) -> bool | None:
+        """False for a region or a displacement that a candidate shows no object in or by."""
+        if claim.kind not in ("region", "displaced") or not claim.affirmed:
+            return None
+        found = self.differences[claim.candidate].values()
+        if claim.kind == "displaced":
+            if claim.value.lstrip(COARSE) not in COMPASS or any(d.kind == "region" for d in found):
+                return None
+            told = [_same(claim.value, d.heading) for d in found if d.heading]
+        else:
+            # Words may also tell of where an object should be.
+            told = [_region(o, claim.value, EITHER) for o in self.objects.values()]
+            told += [_same(claim.value, d.region) for d in found if d.region]
+            told += [None for d in found if d.kind == "extra"]
+        return False if set(told) <= {False} else None
 
 
 def _mention(ground: Ground, claim: Claim) -> bool:
@@ -160,11 +193,11 @@ def _sight(o: ObjectFacts, value: str, when: str) -> bool | None:
 
 
 def _leaves(o: ObjectFacts, value: str, when: str) -> bool | None:
-    return o.leaves
+    return None if when == CUT else o.leaves
 
 
 def _enters(o: ObjectFacts, value: str, when: str) -> bool | None:
-    return o.enters
+    return None if when == CUT else o.enters
 
 
 OBJECTS: dict[str, Callable[[ObjectFacts, str, str], bool | None]] = {
@@ -203,6 +236,9 @@ def _meeting(ground: Ground, claim: Claim) -> bool | None:
     if not _known(ground, claim):
         return None
     met = [when for pair, when in ground.courses.items() if set(claim.subjects) <= pair]
+    if not claim.affirmed and claim.when != BETWEEN:
+        # "They have not met yet" tells nothing of later meetings.
+        return None if claim.when == CUT else _any_pair(claim, ground.contacts)
     if _any_pair(claim, ground.contacts) or any(when not in (None, "unseen") for when in met):
         return True
     return None if "unseen" in met else False
@@ -229,12 +265,23 @@ def _close_region(ground: Ground, claim: Claim) -> bool | None:
     return None if region is None or claim.when != TARGET else _same(claim.value, region)
 
 
+def _place_of_either(ground: Ground, claim: Claim) -> bool | None:
+    partner = ground.objects.get(claim.subjects[-1])
+    if partner is None:
+        return None
+    region = ground.close.get(frozenset(claim.subjects))
+    return _either(_same(claim.value, region), _region(partner, claim.value, EITHER))
+
+
+PLACES = ("close region", "place of either")
+"""Kinds of claims that place a pair."""
 PAIRS: dict[str, Callable[[Ground, Claim], bool | None]] = {
     "course": _course,
     "meeting": _meeting,
     "time": _time,
     "close": _close,
     "close region": _close_region,
+    "place of either": _place_of_either,
 }
 """How a claim about a pair is held against the courses, the contacts and the close pairs."""
 

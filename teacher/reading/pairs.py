@@ -9,6 +9,8 @@ from teacher.reading.reader import BOUNDARIES, END, Names, Reader
 from teacher.reading.tagging import Tag
 
 RELATIONS = {"course", "meet", "contact", "passed", "close"}
+LIMITS = {"moment", "yet", "then", "before", "until", "far"}
+"""Last words of phrases that a denied event is denied up to."""
 
 
 @dataclass
@@ -87,6 +89,11 @@ class PairReader(Reader):
                 if self.relation:
                     self.relation.partners, self.relation.between = list(pair), True
 
+    def is_limited(self) -> bool:
+        """Whether the sentence tells of events up to the target alone: "do not touch by then"."""
+        marked = any(self.last_word(t) in LIMITS for t in self.sentence)
+        return self.moment == TARGET or marked
+
     def _ahead(self, wanted: set[str]) -> bool:
         """Whether one of the tags follows in the clause."""
         step = 1
@@ -133,7 +140,9 @@ class PairReader(Reader):
             return
         if relation.partners or self.near(-1).tag in ("close", "ignore"):
             when = TARGET if self.moment == TARGET or self.future else EITHER
-            self.claims.append(self.claim("close region", pair[0], str(tag.value), True, when, tag))
+            # "Close to the A near the top" may place the A alone.
+            kind = "place of either" if self.near(-1).tag == "object" else "close region"
+            self.claims.append(self.claim(kind, pair[0], str(tag.value), True, when, tag))
 
     def _pairs(self, relation: Relation) -> list[tuple[str | None, ...]]:
         if relation.between:
@@ -158,6 +167,8 @@ class PairReader(Reader):
         when = CUT if self.moment == CUT else TARGET if relation.kind == "close" else BETWEEN
         if relation.kind == "close" and self.moment == EITHER and not self.future:
             when = EITHER
+        if not affirmed and when == BETWEEN and self.is_limited():
+            when = TARGET
         pairs = self._pairs(relation)
         if relation.nobody and not pairs and relation.kind == "course":
             pairs = [()]

@@ -2,30 +2,9 @@
 
 from __future__ import annotations
 
-from data.records import COLORS, MATERIALS, SHAPES
 from teacher.predicates import COMPASS, SPEEDS, VERY_FAST
 
 SLOW, STEADY, QUICK = (word for _, word in SPEEDS)
-
-COLOR_WORDS = {**{c: c for c in COLORS}, "grey": "gray"}
-MATERIAL_WORDS = {**{m: m for m in MATERIALS}, "metallic": "metal", "rubbery": "rubber"}
-SHAPE_WORDS = {**{s: s for s in SHAPES}, "ball": "sphere", "block": "cube"}
-ANY_SHAPE = ("object", "one", "body", "item", "thing", "solid")
-"""Nouns that stand for an object of any shape."""
-PLURALS = {**{f"{word}s": shape for word, shape in SHAPE_WORDS.items()}, "objects": ""}
-
-ROWS = {"top": 0, "upper": 0, "bottom": 2, "lower": 2}
-COLUMNS = {"left": 0, "right": 2}
-MIDDLE = {"center", "centre", "middle", "central"}
-PLACES = {"corner", "area", "region", "part", "portion", "zone", "section"}
-"""Nouns that may follow a region's words."""
-SIDES = {"side", "edge", "border", "boundary"}
-"""Nouns that make "left" and its like coarse: the left side has three regions."""
-AT = {"near", "at", "in", "on", "along", "by", "around", "within", "inside", "toward", "towards"}
-AT |= {"to", "into", "from", "onto"}
-WAYS = {"toward": "toward", "towards": "toward", "to": "into", "into": "into", "from": "from"}
-"""Prepositions that tell a region that an object is bound for, ends in or comes from."""
-IMAGE = {"view", "scene", "image", "frame", "picture", "screen", "field"}
 
 _COMPASS = {
     word + ending: word
@@ -165,7 +144,8 @@ _TABLE: dict[tuple[str, str], str] = {
         "strike; strikes; striking; touch; touches; touching; run into; runs into; bump into; "
         "bumps into; bump; crash; crashes; struck by; hit by; in contact; reach contact; reaches "
         "contact; crash into; crashes into; come together; comes together; knocks into; knock "
-        "into; met by; get in contact; impacts; have contact; has contact; running into"
+        "into; met by; get in contact; impacts; have contact; has contact; running into; catch; "
+        "catches"
     ),
     ("contact", ""): "contact; collision; impact; encounter; collisions; contacts",
     ("passed", ""): (

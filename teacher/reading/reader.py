@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
+from teacher.reading.certainty import Sentence
 from teacher.reading.grounding import CUT, EITHER, Claim, Ground
 from teacher.reading.tagging import Noun, Tag
 
@@ -32,6 +33,7 @@ class Reader:
         self.claims = []
         self.sentence, self.at, self.shared = sentence, 0, []
         self.mentioned: list[str | None] = []
+        self.bound: dict[int, Names] = {}
         self.begin()
         while self.at < len(sentence):
             tag = sentence[self.at]
@@ -40,7 +42,8 @@ class Reader:
                 handler(self, tag)
             self.at += 1
         self.end()
-        return self.distributed(self.claims)
+        whole = Sentence(self.text, sentence, self.bound)
+        return [c._replace(certain=whole.is_certain(c)) for c in self.distributed(self.claims)]
 
     def begin(self) -> None:
         raise NotImplementedError
@@ -91,7 +94,9 @@ class Reader:
         names: list[str | None] = []
         for index in ends:
             self.at = index
-            names += self.named(self.sentence[index])
+            names += self.bound.setdefault(
+                self.sentence[index].start, self.named(self.sentence[index])
+            )
         return names, self.sentence[self.at]
 
     def _tag(self, index: int) -> Tag:

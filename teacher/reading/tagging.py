@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from data.records import LETTERS
 from teacher.predicates import REGIONS
-from teacher.reading import phrases
+from teacher.reading import nouns, phrases
 
 WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)?|[.,;:!?()—–]")
 ARTICLES = {"the", "a", "an", "its", "their", "that", "this", "some", "any", "another", "such"}
@@ -137,18 +137,18 @@ def _noun(words: list[str], i: int) -> tuple[Noun | None, int]:
         i += 1
     if i < count and words[i] in ("two", "both"):
         i += 1
-    color = phrases.COLOR_WORDS.get(words[i], "") if i < count else ""
+    color = nouns.COLOR_WORDS.get(words[i], "") if i < count else ""
     i += bool(color)
-    material = phrases.MATERIAL_WORDS.get(words[i], "") if i < count else ""
+    material = nouns.MATERIAL_WORDS.get(words[i], "") if i < count else ""
     i += bool(material)
     if i >= count:
         return None, i
     word = words[i]
-    if word in phrases.SHAPE_WORDS:
-        return Noun(color, material, phrases.SHAPE_WORDS[word], False, still, others), i + 1
-    if word in phrases.PLURALS and (color or material or phrases.PLURALS[word]):
-        return Noun(color, material, phrases.PLURALS[word], True, still, others), i + 1
-    if word in phrases.ANY_SHAPE and (color or material):
+    if word in nouns.SHAPE_WORDS:
+        return Noun(color, material, nouns.SHAPE_WORDS[word], False, still, others), i + 1
+    if word in nouns.PLURALS and (color or material or nouns.PLURALS[word]):
+        return Noun(color, material, nouns.PLURALS[word], True, still, others), i + 1
+    if word in nouns.ANY_SHAPE and (color or material):
         return Noun(color, material, "", False, still, others), i + 1
     return None, i
 
@@ -158,8 +158,8 @@ def _region(words: list[str], i: int) -> tuple[str, str, int]:
     the upper left corner", "the center"."""
     count, way = len(words), ""
     prepared = False
-    while i < count and words[i] in phrases.AT:
-        way = phrases.WAYS.get(words[i], way)
+    while i < count and words[i] in nouns.AT:
+        way = nouns.WAYS.get(words[i], way)
         prepared = True
         i += 1
     article = False
@@ -169,46 +169,49 @@ def _region(words: list[str], i: int) -> tuple[str, str, int]:
     row, column, middle, begin = None, None, False, i
     while i < count:
         word = words[i]
-        if word in phrases.ROWS and row is None:
-            row = phrases.ROWS[word]
-        elif word in phrases.COLUMNS and column is None:
-            column = phrases.COLUMNS[word]
-        elif word in phrases.MIDDLE and not middle:
+        if word in nouns.ROWS and row is None:
+            row = nouns.ROWS[word]
+        elif word in nouns.COLUMNS and column is None:
+            column = nouns.COLUMNS[word]
+        elif word in nouns.MIDDLE and not middle:
             middle = True
         else:
             break
         i += 1
     corner = row is not None and column is not None
     noun = words[i] if i < count else ""
-    named = noun in phrases.PLACES or noun in phrases.SIDES
+    named = noun in nouns.PLACES or noun in nouns.SIDES
+    if words[i - 1] == "right" and noun in nouns.RIGHT_ONES:
+        # "In the right place" is no region.
+        return "", "", i
     if i == begin or not (named or corner or (prepared and (article or middle))):
         return "", "", i
     i += named
     if words[i : i + 1] == ["of"]:
         end = i + 2 if words[i + 1 : i + 2] == ["the"] else i + 1
-        if words[end : end + 1] and words[end] in phrases.IMAGE:
+        if words[end : end + 1] and words[end] in nouns.IMAGE:
             i = end + 1
         elif not named:
             # "to the left of the cube" is no region.
             return "", "", i
     region = REGIONS[1 if row is None else row][1 if column is None else column]
-    coarse = noun in phrases.SIDES and not corner
+    coarse = noun in nouns.SIDES and not corner
     return way or "region", (phrases.COARSE if coarse else "") + region, i
 
 
 REGION_FILLERS = {"the", "its", "very", "far", "area", "region", "near", "same", "around", "of"}
 REGION_STARTS = {
-    *phrases.AT,
-    *phrases.ROWS,
-    *phrases.COLUMNS,
-    *phrases.MIDDLE,
+    *nouns.AT,
+    *nouns.ROWS,
+    *nouns.COLUMNS,
+    *nouns.MIDDLE,
     "the",
 }
 LOOKS = {
-    *phrases.COLOR_WORDS,
-    *phrases.MATERIAL_WORDS,
-    *phrases.SHAPE_WORDS,
-    *phrases.PLURALS,
+    *nouns.COLOR_WORDS,
+    *nouns.MATERIAL_WORDS,
+    *nouns.SHAPE_WORDS,
+    *nouns.PLURALS,
 }
 NOUN_STARTS = ARTICLES | QUALITIES | LOOKS
 ADJECTIVES = LOOKS | QUALITIES - {"still", "only", "same"}

@@ -10,7 +10,7 @@ from random import Random
 
 import pytest
 
-from benchmarks.mutations import KINDS, mutations, predicates_from
+from benchmarks.mutations import KINDS, falsehoods, predicates_from
 from benchmarks.paraphrases import paraphrase
 from benchmarks.prose import EDITS
 from conf.schema import TeacherConfig
@@ -151,10 +151,12 @@ def test_a_false_sentence_is_contradicted_and_a_true_one_is_not(truth, section, 
         # Whom a pronoun stands for is not guessed.
         (
             "P",
-            "The red metal cube is close to the blue rubber sphere and it is near the top.",
+            "The red metal cube is close to the blue rubber sphere and it is near the bottom.",
             None,
         ),
-        ("S", "It is near the top.", {"region near the top": "unknown"}),
+        ("S", "It is near the bottom.", {f"region {BOTTOM}": "unknown"}),
+        # Where there is nothing, it is not, whatever it is.
+        ("S", "It is near the top.", {"region near the top": "contradicted"}),
         ("M", "If it were struck, the gray rubber cylinder would move east.", {}),
         (
             "C",
@@ -178,6 +180,25 @@ def test_claims_are_read_with_their_subject_and_their_polarity(section, sentence
         assert "contradicted" not in found.values()
     else:
         assert found == claims
+
+
+@pytest.mark.parametrize(
+    ("section", "plain", "unsure"),
+    [
+        ("S", "The {0} is near the top.", "The {0} recalls somebody near the top."),
+        ("S", "The {0} heads west.", "The {0} meets the {1} and heads west."),
+        ("C", "Candidate B lacks the {0}.", "Candidate B lacks others, ones unlike the {0}."),
+        (
+            "C",
+            "Candidate D agrees.",
+            "Candidate D is off; with candidate B, everything agrees.",
+        ),
+    ],
+)
+def test_only_what_is_certain_is_contradicted(section, plain, unsure):
+    found = verdicts(section, plain.format(RED, BLUE))
+    assert "contradicted" in found.values()
+    assert "contradicted" not in verdicts(section, unsure.format(RED, BLUE)).values()
 
 
 def test_most_of_what_true_sentences_say_is_supported():
@@ -206,20 +227,20 @@ def narrated(benchmark_store):
     return found
 
 
+@pytest.mark.slow
 def test_nothing_that_the_narrator_says_is_contradicted(narrated):
     for item, predicates, text in narrated:
         assert contradicted(text, predicates) == []
         assert contradicted(paraphrase(text, Random(item.item_id)), predicates) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_flipped_fact_is_found(narrated, kind):
     found = []
-    for item, predicates, text in narrated:
-        for mutation in mutations(predicates, kind, Random(item.item_id)):
-            false = narrate(mutation.predicates, item, seed=1)
-            if false != text and mutation.is_told(false):
-                found.append(bool(contradicted(false, predicates)))
+    for item, predicates, _ in narrated:
+        for false, _ in falsehoods(predicates, item, kind, Random(item.item_id), seed=1):
+            found.append(bool(contradicted(false, predicates)))
     assert sum(found) >= 0.97 * len(found) > 20
 
 
@@ -228,6 +249,7 @@ def test_nothing_that_a_language_model_rightly_says_is_contradicted():
         assert contradicted(record["text"], predicates_from(record["predicates"])) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", EDITS)
 def test_a_false_word_in_prose_is_found(kind):
     found = []
@@ -235,9 +257,10 @@ def test_a_false_word_in_prose_is_found(kind):
         predicates = predicates_from(record["predicates"])
         edits = EDITS[kind](record["text"], predicates, Random(record["item_id"]))
         found += [bool(contradicted(text, predicates)) for text, _ in edits]
-    assert sum(found) >= 0.96 * len(found) > 20
+    assert sum(found) >= 0.97 * len(found) > 20
 
 
+@pytest.mark.slow
 def test_no_text_makes_it_raise_and_the_same_text_gives_the_same():
     rng = Random(0)
     words = [*PHRASES, RED, BLUE, "the red cube", "A", "B", "Candidate D", "near the top", "both"]
@@ -251,6 +274,7 @@ def test_no_text_makes_it_raise_and_the_same_text_gives_the_same():
         find_claims(f"{section}: " + f"the {RED} and A, " * 5000, FACTS)
 
 
+@pytest.mark.slow
 def test_the_validator_rejects_what_is_contradicted_and_keeps_the_claims(narrated):
     cfg = TeacherConfig(name="template")
     item, predicates, text = narrated[0]
@@ -258,7 +282,7 @@ def test_the_validator_rejects_what_is_contradicted_and_keeps_the_claims(narrate
     assert verdict.accepted
     assert {c.verdict for c in verdict.claims} <= {"supported", "unknown"}
     assert sum(c.verdict == "supported" for c in verdict.claims) > 20
-    (mutation, *_) = mutations(predicates, "color", Random(0))
-    false = validate(narrate(mutation.predicates, item, seed=1), predicates, item, cfg)
+    told, _ = next(falsehoods(predicates, item, "color", Random(0), seed=1))
+    false = validate(told, predicates, item, cfg)
     assert not false.accepted
     assert {reason.split(":")[0] for reason in false.reasons} == {"contradicts"}

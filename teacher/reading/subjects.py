@@ -1,0 +1,221 @@
+"""Follows whom a sentence about the scene speaks of: its subjects, its partners, its pronouns."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from teacher.reading.clauses import ClauseReader
+from teacher.reading.pairs import RELATIONS
+from teacher.reading.reader import BOUNDARIES, END, MOST, Names
+from teacher.reading.tagging import Tag
+
+VERBS = {"be", "moves", "stays", "rest", "future", "across", "leaves", "enters", "still", "past"}
+"""Tags of words that may be a clause's verb."""
+INVERTED = {"be", "still", "rest", "future", "expected", "word"}
+"""Tags of a verb before its subject: "near the top is the A"."""
+TAKERS = {"by", "close", "meet", "passed", "contact", "between", "course", "show"}
+"""Tags before a noun phrase that is no subject."""
+ASIDE = {"unlike", "besides", "despite", "except", "excepting", "apart", "beside", "given"}
+"""Words before a noun phrase that is only set against the subject."""
+
+
+class SubjectReader(ClauseReader):
+    """Tells the subject of a clause from what stands beside it, where that is safe to say."""
+
+    def on_object(self, tag: Tag) -> None:
+        previous = self.near(-1)
+        relation = self.relation
+        if relation and relation.between and len(relation.partners) < 2:
+            names, _ = self.group(2)
+            relation.partners += names
+            self.last = names[-1:]
+            return
+        if self._is_complement(previous):
+            self._complement()
+            return
+        self.verbal |= self.finite
+        if self._is_relative(previous):
+            self.flush()
+            self.last = self.group()[0]
+            self.inner = previous.tag != "which"
+            # What is done to "the A, which the B hits" is not told apart.
+            self.subjects, self.group_start = self.last if self.inner else [None], 0
+            self.finite = self.blocked = self.nobody = self.gapped = False
+            self.pending = []
+            return
+        fresh = self.finite or not self.subjects or self.nobody
+        fresh |= self.pronominal or self.gapped
+        # "Near the top is the A, and the B ..." places the A alone.
+        names, _ = self.group(1 if self.pending and self._parted() else MOST)
+        self.subjects = names if fresh else [*self.subjects, *names][-MOST:]
+        self.group_start = 0 if fresh else max(0, len(self.subjects) - len(names))
+        self.last = names[-1:]
+        # "With the A at rest, the B ...": the A's part ends with the comma.
+        self.absolute = previous.tag == "with"
+        inverted = bool(self.pending) and previous.tag in INVERTED
+        self.finite, self.blocked, self.nobody, self.complement = inverted, False, False, False
+        self.pronominal = self.gapped = False
+        if relation and not relation.subjects:
+            relation.subjects = self.subjects
+        # "Near the top, the A and the B are close" places the pair, not its objects.
+        self._settle(places=not self._is_pair_ahead())
+
+    def _is_relative(self, previous: Tag) -> bool:
+        """Whether the noun phrase is the subject of a clause about another object or a place:
+        "the A, which the B hits", "where the B was"."""
+        if self.word(previous) == "where":
+            return True
+        step = -2
+        while self.near(step).tag in ("by", "comma"):
+            step -= 1
+        places = ("object", "region", "into", "from")
+        return previous.tag == "which" and self.near(step).tag in places
+
+    def _settle(self, places: bool) -> None:
+        """Tell of the subject what was said before it was named."""
+        for pending in self.pending:
+            if places or pending[0] != "region":
+                self.tell(*pending, subjects=self.subjects)
+        self.pending = []
+
+    def _is_pair_ahead(self) -> bool:
+        step = 1
+        while self.near(step).tag not in ("comma", "semicolon", "break", "stop", "close"):
+            step += 1
+        return self.near(step).tag == "close"
+
+    def _parted(self) -> bool:
+        return self.near(1).tag == "comma" and self.near(2).tag == "and"
+
+    def _is_complement(self, previous: Tag) -> bool:
+        if previous.tag == "with":
+            # "With the A near the top, ..." tells of the A.
+            return self.near(-2) is not END and self.near(-2).tag not in BOUNDARIES
+        if previous.tag == "contrast" and self.subjects:
+            # "The A, rather than the B, ..."
+            return True
+        return previous.tag in TAKERS or self.word(previous) in ASIDE
+
+    def _complement(self) -> None:
+        start = self.at
+        # "Meets the A, and the B ...": the B begins a clause.
+        names, _ = self.group(1 if self._parted() else MOST)
+        if len(names) > 1 and self.near(1).tag in VERBS | {"not", "word", "show", "speed"}:
+            # "meets the A and the B stays": the B is a subject of its own.
+            self.at = start
+            names, _ = self.group(1)
+        if self.relation and not self.relation.partners:
+            self.relation.partners = names
+        elif self.near(-1).tag == "with" or self.sentence[start - 1].tag == "with":
+            self.companions = names
+        if self.sentence[start - 1].tag != "contrast":
+            self.last = names[-1:]
+        self.blocked, self.crossed, self.complement = True, False, True
+
+    def on_which(self, tag: Tag) -> None:
+        self.relative = True
+        if self.near(-1).tag == "object" or self.near(-2).tag == "object":
+            self.flush()
+            listed = self.subjects[self.group_start :]
+            several = len(listed) > 1 and not self.complement
+            if several and self.word(self.near(1)) in ("both", "are"):
+                # "The A and the B, which both move east."
+                self.subjects = listed
+            else:
+                self.subjects = [None] if several else self.last
+            self.finite = self.blocked = False
+            self.group_start = 0
+
+    def on_pronoun(self, tag: Tag) -> None:
+        previous = self.near(-1)
+        if previous.tag in ("by", "with", "close", "meet", "passed", "between", "course"):
+            self._refer(previous, tag)
+            return
+        if self.word(tag) in ("itself", "themselves") and previous.tag == "comma":
+            # "Pushes the B east, itself going west."
+            self.subjects, self.group_start = [None], 0
+            return
+        done = previous.tag == "word" and self.word(previous).endswith(("s", "ed", "ing"))
+        if done and self.word(previous) not in ("joins", "joining"):
+            # "The A pushes it east": what follows is of another than the A.
+            self.subjects, self.group_start = [None], 0
+            return
+        possessive = self.word(tag) in ("its", "their") or self.near(1).tag == "object"
+        if previous.tag == "object" or possessive or (previous.tag in VERBS and self.subjects):
+            return
+        listed = self._listed(previous) if self.word(tag) == "both" else []
+        if listed:
+            self.subjects, self.group_start, self.blocked = listed, 0, False
+            return
+        self.verbal |= self.finite
+        self.subjects = [None] if self._is_ahead() else self._antecedent(str(tag.value))
+        self.pronominal, self.gapped = True, False
+        self.group_start = 0
+        self.finite = self.blocked = self.nobody = False
+        self._settle(places=False)
+
+    def _listed(self, previous: Tag) -> Names:
+        """The two just listed, which "both" stands for: "the A and the B, both near the left"."""
+        listed = self.subjects[self.group_start :]
+        beside = previous.tag == "comma" and self.near(-2).tag == "object"
+        safe = len(listed) == 2 and None not in listed and (beside or previous.tag == "which")
+        return listed if safe else []
+
+    def _antecedent(self, pronoun: str) -> Names:
+        """Whom a pronoun stands for where that is safe to say, else None."""
+        subjects = self.subjects or self.before
+        if pronoun == "it":
+            return list(subjects) if len(subjects) == 1 and not self.complement else [None]
+        if pronoun in ("former", "latter"):
+            pair = self.both()
+            return [pair[pronoun == "latter"]] if len(pair) == 2 else [None]
+        return self.both()
+
+    def _is_ahead(self) -> bool:
+        """Whether a pronoun may stand for whom the next clause names: "although it was at rest,
+        the A moves"."""
+        opening = self.sentence[: self.at]
+        subordinate = any(t.tag in ("break", "maybe", "by") for t in opening)
+        return subordinate and all(t.tag != "object" for t in opening)
+
+    def _refer(self, previous: Tag, tag: Tag) -> None:
+        """A pronoun that is no subject."""
+        relation = self.relation
+        self.complement = True
+        if relation and not relation.partners:
+            relation.partners = [None]
+            if previous.tag == "between":
+                pair = self.both()
+                relation.partners = pair if len(pair) == 2 else [None, None]
+
+    def on_rest_of(self, tag: Tag) -> None:
+        if self._is_complement(self.near(-1)):
+            if self.relation:
+                self.relation.partners = [None]
+            return
+        if self.word(tag).endswith("scene") and self.near(-1).tag in ("word", "across", "moves"):
+            # "Has crossed the scene."
+            return
+        self.subjects, self.group_start = [None], 0
+        self.finite = self.blocked = self.nobody = False
+
+    def on_all(self, tag: Tag) -> None:
+        self.on_rest_of(tag)
+        names = list(dict.fromkeys(self.mentioned))
+        taken = any(
+            t.tag in TAKERS and following.tag == "object"
+            for t, following in pairwise(self.sentence)
+        )
+        if self.word(tag) == "all of them" and None not in names and len(names) > 1 and not taken:
+            self.subjects = names
+
+    on_no_other = on_rest_of
+
+    def on_none(self, tag: Tag) -> None:
+        if self.near(-1).tag in RELATIONS | {"by", "with"}:
+            self.relation = None
+            return
+        self.subjects, self.nobody, self.finite, self.pending = [], True, False, []
+
+    def on_candidate(self, tag: Tag) -> None:
+        self.subjects = [None]
