@@ -46,7 +46,8 @@ test: setup vllm-env ## Run every test
 
 # What the tests of trainers and of their evaluation import takes longer than all quick tests.
 check: setup lint ## Lint, then run the quick tests
-	$(BIN)/python -m pytest -m "not slow" --ignore tests/train --ignore tests/evaluation/test_commands.py
+	$(BIN)/python -m pytest -m "not slow" -n logical --maxprocesses 4 --dist loadfile \
+		--ignore tests/train --ignore tests/evaluation/test_commands.py
 
 lint: setup ## Check format and style
 	$(BIN)/ruff format --check .

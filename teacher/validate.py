@@ -15,7 +15,7 @@ from teacher.predicates import Predicates
 from teacher.reading.grounding import Claim
 from teacher.sections import SECTIONS, opening, parts
 
-VALIDATOR_VERSION = "3"
+VALIDATOR_VERSION = "4"
 SMALL_LETTER = re.compile(r"\b[Cc]andidates? [a-d]\b")
 WORD = re.compile(r"[^\W_]+(?:['’-][^\W_]+)*")
 
