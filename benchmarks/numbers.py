@@ -4,7 +4,7 @@
 
 The prose is what the built-in narrator tells of random scenes. Hostile texts repeat a piece to
 4 KB, 64 KB and 1 MB: a figure that does not grow from column to column is linear time. Each is the
-best of three runs, in processor time.
+best of five runs, in processor time.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def hostile(piece: str, size: int) -> str:
 
 def ms_per_kilobyte(texts: list[str]) -> float:
     best = float("inf")
-    for _ in range(3):
+    for _ in range(5):
         start = time.process_time()
         for text in texts:
             find_numbers(text)

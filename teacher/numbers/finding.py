@@ -65,11 +65,12 @@ class Prose:
     def __init__(self, text: str) -> None:
         pieces = (ASCII_WORD if text.isascii() else WORD).split(text)
         self.words, self.gaps = pieces[1::2], pieces[::2]
+        self.lower = list(map(str.casefold, self.words))
         self.bounds = [0, *accumulate(map(len, pieces))]
 
     def word(self, index: int) -> str:
         """A word in lower case; empty outside the text."""
-        return self.words[index].casefold() if 0 <= index < len(self.words) else ""
+        return self.lower[index] if 0 <= index < len(self.lower) else ""
 
     def before(self, index: int, by: int = 1) -> str:
         """The word `by` words before, in lower case; "" unless space or hyphens part them all."""
@@ -77,7 +78,7 @@ class Prose:
             index -= 1
             by -= 1
             if not by:
-                return self.words[index].casefold()
+                return self.lower[index]
         return ""
 
     def after(self, index: int, by: int = 1) -> str:
@@ -86,7 +87,7 @@ class Prose:
             index += 1
             by -= 1
             if not by:
-                return self.words[index].casefold()
+                return self.lower[index]
         return ""
 
     def opens_clause(self, index: int) -> bool:
@@ -198,12 +199,13 @@ def _itself(prose: Prose, index: int) -> tuple[int, int] | None:
 
 def _assembled(prose: Prose, index: int) -> tuple[int, int] | None:
     """A number word whose letters are spaced ("t w o") or that is split ("tw-o", "th ree")."""
-    joined, last = prose.word(index), index
-    while joined in PREFIXES and last + 1 < len(prose.words):
+    words, gaps = prose.lower, prose.gaps
+    joined, last = words[index], index
+    while joined in PREFIXES and last + 1 < len(words):
         last += 1
-        if len(prose.gaps[last]) > 3:
+        if len(gaps[last]) > 3:
             return None
-        joined += prose.word(last)
+        joined += words[last]
         if joined in PIECED and _is_split(prose, index, last):
             return index, last
     return None
