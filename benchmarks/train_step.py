@@ -31,7 +31,7 @@ from conf.schema import SftCommand, StudentConfig
 from data.records import LETTERS
 from train import backbone
 from train.collate import Collator
-from train.conversation import Sample, answer_line, instruction
+from train.conversation import Clip, Sample, answer_line, conversation, instruction
 from train.sft_trainer import token_mean
 from train.tiny import SPECIAL_TOKENS, build_processor
 
@@ -155,12 +155,11 @@ def sample(cfg: StudentConfig) -> Sample:
     pixels = np.random.default_rng(0).integers(
         0, 256, (cfg.frames + 4, cfg.image_size, cfg.image_size, 3), dtype=np.uint8
     )
-    content = [{"type": "video"}, {"type": "text", "text": instruction("reasoning", "cot")}]
-    for letter in LETTERS:
-        content += [{"type": "text", "text": f"\nCandidate {letter}: "}, {"type": "image"}]
-    shown = list(range(cfg.frames))
-    candidates = list(pixels[cfg.frames :])
-    return Sample("noise", content, pixels[: cfg.frames], shown, candidates, rationale())
+    parts: list[str | np.ndarray] = [instruction("reasoning", "cot")]
+    for letter, candidate in zip(LETTERS, pixels[cfg.frames :], strict=True):
+        parts += [f"\nCandidate {letter}: ", candidate]
+    clip = Clip(pixels[: cfg.frames], list(range(cfg.frames)))
+    return conversation("noise", parts, rationale(), clip)
 
 
 def switch(model: torch.nn.Module, recompute: bool) -> None:

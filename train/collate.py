@@ -47,8 +47,8 @@ def encode(sample: Sample, processor: ProcessorMixin, max_length: int) -> Encode
     prompt = processor(
         text=[text],
         images=sample.images or None,
-        videos=None if sample.video is None else [sample.video],
-        video_metadata=None if sample.video is None else [VideoMetadata(**sample.metadata)],
+        videos=[sample.clip.pixels] if sample.clip else None,
+        video_metadata=[VideoMetadata(**sample.clip.metadata)] if sample.clip else None,
         do_sample_frames=False,
         return_tensors="pt",
     )

@@ -17,32 +17,19 @@ import numpy as np
 from conf.schema import StudentConfig
 from data.controls import observed
 from data.frames import Frames
-from data.records import FPS, FRAMES, LETTERS, SelectionItem, shown_frames
+from data.records import FPS, FRAMES, LETTERS, SelectionItem
 from teacher.sections import without
 
 MODES = ("reasoning", "answer")
-DESCRIBE = "Describe the scene, how its objects move, and what will come of it."
 
 
 @dataclass(frozen=True)
-class Sample:
-    """A conversation with its media, before any tokenizer has seen it.
+class Clip:
+    """(T, S, S, 3) uint8 pixels of a prefix, shown at the times of the scene's frames `indices`;
+    the scene's frames a second, and how many it has."""
 
-    Attributes:
-        content: the user message's parts in the chat template's form; media as bare placeholders.
-        video: (T, S, S, 3) uint8 frames of the prefix, shown at the times of the scene's frames
-            `video_frames`; None where no prefix is shown.
-        fps, total: the scene's frames a second, and how many it has.
-        images: the candidates' (S, S, 3) uint8 pixels in order.
-        response: what the assistant should say, or None where it is to be generated.
-    """
-
-    sample_id: str
-    content: list[dict[str, Any]]
-    video: np.ndarray | None
-    video_frames: list[int]
-    images: list[np.ndarray]
-    response: str | None = None
+    pixels: np.ndarray
+    indices: list[int]
     fps: float = FPS
     total: int = FRAMES
 
@@ -52,8 +39,26 @@ class Sample:
         return {
             "fps": float(self.fps),
             "total_num_frames": self.total,
-            "frames_indices": list(self.video_frames),
+            "frames_indices": list(self.indices),
         }
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A conversation with its media, before any tokenizer has seen it.
+
+    Attributes:
+        content: the user message's parts in the chat template's form; media as bare placeholders.
+        clip: the prefix; None where none is shown.
+        images: (S, S, 3) uint8 pixels of each image in order, such as the candidates.
+        response: what the assistant should say, or None where it is to be generated.
+    """
+
+    sample_id: str
+    content: list[dict[str, Any]]
+    clip: Clip | None
+    images: list[np.ndarray]
+    response: str | None = None
 
 
 def answer_line(letter: str) -> str:
@@ -109,44 +114,27 @@ def selection_sample(
     prefix shown as a `control` asks (see `data.controls`)."""
     shown = observed(item, cfg.frames, control)
     scene = frames.scene(item.scene_id)
-    content: list[dict[str, Any]] = [{"type": "video"}] if shown else []
-    content.append({"type": "text", "text": item.question})
-    for letter in LETTERS:
-        content += [{"type": "text", "text": f"\nCandidate {letter}: "}, {"type": "image"}]
-    content.append({"type": "text", "text": f"\n{instruction(mode, regime)}"})
-    return Sample(
-        f"{item.item_id} ({mode})",
-        content,
-        frames.stack(item.scene_id, shown) if shown else None,
-        sorted(shown),
-        [frames.array(c.scene_id, c.frame) for c in item.candidates],
-        response,
-        scene.fps,
-        scene.frames,
-    )
+    parts: list[str | np.ndarray] = [item.question]
+    for letter, c in zip(LETTERS, item.candidates, strict=True):
+        parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
+    clip = None
+    if shown:
+        clip = Clip(frames.stack(item.scene_id, shown), sorted(shown), scene.fps, scene.frames)
+    asked = f"\n{instruction(mode, regime)}"
+    return conversation(f"{item.item_id} ({mode})", [*parts, asked], response, clip)
 
 
-def description_sample(
-    scene_id: str,
-    start: int,
-    stop: int,
-    target: int,
-    frames: Frames,
-    cfg: StudentConfig,
-    response: str,
+def conversation(
+    sample_id: str,
+    parts: Sequence[str | np.ndarray],
+    response: str | None,
+    clip: Clip | None = None,
 ) -> Sample:
-    """A prefix and its future frame, to be described in words."""
-    shown = shown_frames(start, stop, cfg.frames)
-    return Sample(
-        f"{scene_id} {start} to {stop}, then {target}",
-        [
-            {"type": "video"},
-            {"type": "text", "text": "Later: "},
-            {"type": "image"},
-            {"type": "text", "text": f"\n{DESCRIBE}"},
-        ],
-        frames.stack(scene_id, shown),
-        shown,
-        [frames.array(scene_id, target)],
-        response,
-    )
+    """A clip, if there is one, and then `parts`: texts and (S, S, 3) uint8 pixels of images."""
+    content: list[dict[str, Any]] = [{"type": "video"}] if clip else []
+    content += [
+        {"type": "text", "text": part} if isinstance(part, str) else {"type": "image"}
+        for part in parts
+    ]
+    images = [part for part in parts if not isinstance(part, str)]
+    return Sample(sample_id, content, clip, images, response)

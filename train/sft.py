@@ -26,13 +26,14 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     if cfg.train.regime != "answer_only":
         rationales = ensure_rationales(store, cfg.teacher)
 
-    from transformers import Trainer, TrainingArguments, set_seed
+    from transformers import TrainingArguments, set_seed
 
     from data.frames import Frames
     from train import backbone, loop, samples
     from train.audit import audit
     from train.collate import Collator, letter_ids
-    from train.sft_trainer import EpochOrder, LetterChoice, token_mean
+    from train.planned import ByLength
+    from train.sft_trainer import Epochs, LetterChoice, StudentTrainer, TokenChoice, token_mean
 
     backbone.keep_big_blocks()
     # Adapters are drawn before the trainer sets its seed.
@@ -49,13 +50,16 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     loop.check_not_empty(len(training), f"samples for train.regime={cfg.train.regime}")
     loop.check_not_empty(sum(map(len, validation.values())), "items of held-out training scenes")
     collator = Collator(processor, cfg.student.max_length)
-    longest = training.longest(processor.tokenizer)
+    lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
+    longest = training[lengths.index(max(lengths))]
     log.info(audit(model, processor, cfg.student, longest, collator))
+    order = ByLength(lengths, cfg.train.micro_batch, cfg.seed)
 
     # Descriptions end in no answer whose letter could be measured.
-    letters = None if cfg.train.regime == "describe" else LetterChoice(letter_ids(processor))
+    describes = cfg.train.regime == "describe"
+    choice = TokenChoice() if describes else LetterChoice(letter_ids(processor))
     checkpoint = loop.newest_checkpoint(run.folder)
-    trainer = Trainer(
+    trainer = StudentTrainer(
         model=model,
         args=TrainingArguments(
             **loop.arguments(cfg.train, run, cfg.seed, checkpoint),
@@ -67,9 +71,10 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         train_dataset=training,
         eval_dataset=validation,
         compute_loss_func=token_mean,
-        preprocess_logits_for_metrics=letters and letters.shrink,
-        compute_metrics=letters and letters.accuracy,
-        callbacks=[EpochOrder(training)],
+        preprocess_logits_for_metrics=choice.shrink,
+        compute_metrics=choice.accuracy,
+        callbacks=[Epochs(training, order)],
+        order=order,
     )
     loop.train_and_log(trainer, run, checkpoint)
     backbone.save(model, processor, run.folder / "student", cfg.train.precision)

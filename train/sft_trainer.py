@@ -1,6 +1,5 @@
 """What differs from transformers.Trainer for a student: the loss of an accumulated batch, the order
-of candidates in an epoch, and the measure of the answer's letter. All go in through the Trainer's
-own arguments."""
+of samples and of their candidates in an epoch, and the measure of the answer's letter."""
 
 from __future__ import annotations
 
@@ -8,11 +7,11 @@ from typing import Any
 
 import torch
 from torch.nn.functional import cross_entropy
-from transformers import EvalPrediction, TrainerCallback
+from transformers import EvalPrediction, Trainer, TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
 
 from train.collate import IGNORED
-from train.samples import Samples
+from train.planned import ByLength, Samples
 
 
 def token_mean(
@@ -30,15 +29,44 @@ def token_mean(
     return total / count
 
 
-class EpochOrder(TrainerCallback):
-    """Tells the training samples which epoch it is: in each, candidates may stand otherwise."""
+class StudentTrainer(Trainer):
+    """A Trainer whose micro-batches are made of samples of about one length."""
 
-    def __init__(self, training: Samples) -> None:
-        self._training = training
+    def __init__(self, *args: Any, order: ByLength, **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        self._order = order
+
+    def _get_train_sampler(self, *_: Any) -> ByLength:
+        return self._order
+
+
+class Epochs(TrainerCallback):
+    """Tells the training samples and their order which epoch it is."""
+
+    def __init__(self, training: Samples, order: ByLength) -> None:
+        self._training, self._order = training, order
 
     def on_epoch_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
         # A resumed run goes on within an epoch.
-        self._training.epoch = int(state.epoch or 0)
+        epoch = int(state.epoch or 0)
+        self._training.epoch = epoch
+        self._order.set_epoch(epoch)
+
+
+class TokenChoice:
+    """The share of supervised tokens that a model would write, all before each being given."""
+
+    @staticmethod
+    def shrink(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+        """(B, 2) counts of the tokens that are right and of all."""
+        chosen, following = logits[:, :-1].argmax(dim=-1), labels[:, 1:]
+        right = (chosen == following).sum(dim=-1)
+        return torch.stack([right, (following != IGNORED).sum(dim=-1)], dim=-1)
+
+    @staticmethod
+    def accuracy(prediction: EvalPrediction) -> dict[str, float]:
+        right, counted = prediction.predictions.sum(axis=0)
+        return {"token_accuracy": float(right / counted)}
 
 
 class LetterChoice:

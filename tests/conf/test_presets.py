@@ -74,7 +74,8 @@ def test_a_typed_value_and_an_overlay_win_over_a_recipe():
     assert settings("python -m train.sft student=qwen3_vl_8b train.lr=3e-4").train.lr == 3e-4
     base = settings("python -m train.sft +exp=base")
     assert base.student.name == "tiny_scratch"
-    assert base.student.architecture == schema.ArchitectureConfig()
+    assert base.student.architecture.vision_layers == 4
+    assert base.benchmark.name == "eyes"
     assert base.train.regime == "describe"
 
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from transformers import EvalPrediction
 
 from conf.errors import UserError
 from data.records import FPS, SelectionItem, shown_frames
-from train import samples
 from train.collate import IGNORED, Collator, encode, letter_ids, pad
 from train.conversation import Sample, selection_sample
-from train.sft_trainer import LetterChoice, token_mean
+from train.planned import ByLength, Planned, Samples
+from train.sft_trainer import LetterChoice, TokenChoice, token_mean
 
 
 @pytest.fixture
@@ -99,23 +101,22 @@ def test_a_sample_over_the_limit_is_refused_with_its_length(lines, processor) ->
         encode(lines[1], processor, length - 1)
 
 
-def test_the_longest_sample_is_found_without_making_them_all(
+def test_lengths_rank_samples_without_making_them(
     micro_store, frames, student_cfg, processor
 ) -> None:
-    seen = []
-
-    def planned(item: SelectionItem, words: int) -> samples.Planned:
-        text = "near the top " * words + "\nAnswer: A"
-        sample = selection_sample(item, "answer", "cot", frames, student_cfg, text)
-        return samples.Planned(text, lambda epoch: seen.append(item.item_id) or sample)
+    def refuse(epoch: int) -> Sample:
+        raise AssertionError("a sample was made")
 
     items = micro_store.selection("train")[:4]
-    made = samples.Samples([planned(i, w) for i, w in zip(items, (3, 9, 27, 1), strict=True)])
-    lengths = [len(encode(made[k], processor, 1500).input_ids) for k in range(4)]
-    seen.clear()
-    longest = made.longest(processor.tokenizer)
-    assert seen == [items[2].item_id]
-    assert len(encode(longest, processor, 1500).input_ids) == max(lengths)
+    texts = ["near the top " * words + "\nAnswer: A" for words in (3, 9, 27, 1)]
+    made = Samples([Planned(text, 10, refuse) for text in texts])
+    guessed = made.lengths(processor.tokenizer, 96)
+    real = [
+        len(encode(selection_sample(i, "answer", "cot", frames, student_cfg, t), processor, 1500)
+            .input_ids)
+        for i, t in zip(items, texts, strict=True)
+    ]  # fmt: skip
+    assert np.argsort(guessed).tolist() == np.argsort(real).tolist()
 
 
 def test_the_letters_logits_choose_the_answer(
@@ -156,3 +157,31 @@ def test_controls_reach_the_prompt(micro_store, frames, student_cfg, processor) 
     pixels = [e.media["pixel_values_videos"] for e in (plain, shuffled)]
     assert pixels[0].shape == pixels[1].shape
     assert not torch.equal(*pixels)
+
+
+@pytest.mark.parametrize("count", [1, 7, 64, 1000])
+def test_an_order_is_of_its_epoch_and_keeps_lengths_together(count) -> None:
+    lengths = np.random.default_rng(0).integers(1, 1000, count).tolist()
+    order = ByLength(lengths, 8, seed=0)
+    first = list(order)
+    assert sorted(first) == list(range(count))
+    assert first == list(order)
+    order.set_epoch(1)
+    second = list(order)
+    assert sorted(second) == list(range(count))
+    assert first != second or count <= 8
+    assert second != list(ByLength(lengths, 8, seed=1)) or count <= 8
+    if count == 1000:
+        spread = [np.ptp(np.asarray(lengths)[first[k : k + 8]]) for k in range(0, count, 8)]
+        # A block holds 256 of 1,000 lengths: neighbours in it differ by four or so.
+        assert np.median(spread) < 60
+
+
+def test_the_right_tokens_are_counted() -> None:
+    labels = torch.tensor([[5, 6, 7, 8], [IGNORED, IGNORED, 7, 8]])
+    logits = torch.nn.functional.one_hot(torch.tensor([[6, 7, 0, 0], [3, 7, 8, 0]]), 10).float()
+    counts = TokenChoice.shrink(logits, labels)
+    # A position's logits tell the next one's token; what is not supervised is not counted.
+    assert counts.tolist() == [[2, 3], [2, 2]]
+    told = TokenChoice.accuracy(EvalPrediction(counts.numpy(), None))
+    assert told["token_accuracy"] == pytest.approx(4 / 5)

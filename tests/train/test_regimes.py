@@ -19,7 +19,8 @@ from teacher.predicates import predicates_of
 from teacher.sections import SECTIONS, parts
 from teacher.validate import validate
 from train.conversation import answer_line, instruction, response
-from train.samples import Samples, Supervised, supervised_items
+from train.planned import Samples
+from train.samples import Supervised, supervised_items
 
 TEACHER = TeacherConfig(name="template")
 ASKED = [r for r in REGIMES if r not in ("answer_only", "describe")]

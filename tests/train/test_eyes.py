@@ -1,0 +1,89 @@
+"""What the tiny base is asked is true of the oracle, and one answer alone is right."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from data.records import LETTERS
+from data.store import Store
+from teacher.predicates import region_of
+from train import eyes
+from train.planned import Planned
+
+
+@pytest.fixture
+def kinds(micro_store, frames, student_cfg) -> dict[str, list[Planned]]:
+    scenes = set(micro_store.scene_ids("train"))
+    return eyes.kinds(micro_store, scenes, student_cfg, frames, 0)
+
+
+def shown(store: Store, scene_id: str, frame: int) -> dict[str, str]:
+    scene = store.scene(scene_id)
+    return {
+        o.phrase: region_of(scene, frame, k)
+        for k, o in enumerate(scene.objects)
+        if scene.in_view[frame, k] and scene.visible_fraction[frame, k] > 0.05
+    }
+
+
+def asked_and_answered(planned: Planned, epoch: int = 0) -> tuple[str, str]:
+    sample = planned.make(epoch)
+    return sample.content[-1]["text"], sample.response
+
+
+def test_a_frame_is_told_object_by_object(micro_store, kinds) -> None:
+    for planned in kinds["frame"]:
+        sample = planned.make(0)
+        scene_id, frame = sample.sample_id.rsplit(" ", 1)
+        there = shown(micro_store, scene_id, int(frame))
+        told = re.findall(r"The (\w+ \w+ \w+) is (near the [\w-]+)\.", sample.response)
+        assert dict(told) == there
+        assert len(told) == len(there)
+
+
+def test_one_candidate_alone_fits_a_description(micro_store, kinds) -> None:
+    items = {item.item_id: item for item in micro_store.selection("train")}
+    assert kinds["match"]
+    for planned in kinds["match"]:
+        sample = planned.make(0)
+        item = items[sample.sample_id.removesuffix(" (match)")]
+        wanted = re.findall(r"the (\w+ \w+ \w+) (near the [\w-]+)", sample.content[-1]["text"])
+        assert wanted
+        fitting = [
+            letter
+            for letter, c in zip(LETTERS, item.candidates, strict=True)
+            if dict(wanted).items() <= shown(micro_store, c.scene_id, c.frame).items()
+        ]
+        assert fitting == [item.letter]
+        assert sample.response.endswith(f"\nAnswer: {item.letter}")
+        assert f"Candidate {item.letter} matches: " in sample.response
+        assert len(sample.images) == 4
+        assert sample.clip is None
+
+
+def test_the_later_frame_is_the_answer(frames, kinds) -> None:
+    letters = set()
+    for planned in kinds["later"]:
+        for epoch in range(3):
+            sample = planned.make(epoch)
+            assert len(sample.images) == 2
+            letters.add(sample.response)
+            wrong = sample.images[sample.response == "Answer: A"]
+            # The earlier one is the clip's last frame.
+            assert (wrong == sample.clip.pixels[-1]).all()
+    assert letters == {"Answer: A", "Answer: B"}
+
+
+def test_a_clip_is_told_with_its_outcome_shown_and_without(kinds) -> None:
+    with_it, without = (planned.make(0) for planned in kinds["clip"][:2])
+    assert (len(with_it.images), len(without.images)) == (1, 0)
+    assert with_it.response == without.response
+    assert with_it.response.startswith("Scene parse: ")
+
+
+def test_each_epoch_shows_other_frames_and_the_same_again(kinds) -> None:
+    told = [[asked_and_answered(p, epoch)[1] for p in kinds["frame"]] for epoch in (0, 1, 0)]
+    assert told[0] == told[2]
+    assert told[0] != told[1]

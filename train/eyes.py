@@ -1,0 +1,166 @@
+"""What the tiny base learns from: questions whose answers the oracle holds, so that it can see and
+write before it is ever asked to choose.
+
+A frame is described by its objects and their places; a clip by the built-in narrator, with the
+frame that comes of it shown or not; of several frames the one is named that is the later, or that
+fits a description. None of it is the selection task itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from conf.schema import StudentConfig
+from data.frames import Frames
+from data.records import LETTERS, Scene, SelectionItem, shown_frames
+from data.store import Store
+from teacher.predicates import REGIONS, Predicates, predicates_of, region_of
+from teacher.template import describe, matches
+from train.conversation import Clip, Sample, answer_line, conversation
+from train.planned import Planned, rng_of
+
+FRAME = "Describe the frame."
+CLIP = "Describe the scene, how its objects move, and what will come of it."
+LATER = 'Which candidate comes later? End with a line "Answer:" and the letter.'
+MATCH = (
+    "Which candidate shows {}? Say of each candidate, in a line of its own, whether it matches and "
+    'why. End with a line "Answer:" and the letter.'
+)
+ASKED = (FRAME, CLIP, LATER, MATCH)
+FRAMES = 4
+"""Frames described for each item in an epoch."""
+HALF_SECOND = 12
+"""Frames at least between two of which one is the later: what has not moved tells nothing."""
+HIDDEN = 0.05
+"""Share of an object's pixels under which it is not said to be seen."""
+NAMED = 4
+"""Objects at most that a description to be matched names."""
+
+
+def kinds(
+    store: Store, scenes: set[str], cfg: StudentConfig, frames: Frames, seed: int
+) -> dict[str, list[Planned]]:
+    """Samples of each kind from the training items of some scenes; an epoch chooses anew."""
+    items = [item for item in store.selection("train") if item.scene_id in scenes]
+    make = _Maker(store, cfg, frames, seed)
+    return {
+        "frame": [make.frame(item, k) for item in items for k in range(FRAMES)],
+        "clip": [clip for item in items for clip in make.clips(item)],
+        "later": [make.later(item) for item in items],
+        "match": [match for item in items for match in make.matched(item)],
+    }
+
+
+class _Maker:
+    """Makes samples of items; what is left to chance follows from seed, epoch and item."""
+
+    def __init__(self, store: Store, cfg: StudentConfig, frames: Frames, seed: int) -> None:
+        self.store, self.cfg, self.frames, self.seed = store, cfg, frames, seed
+
+    def frame(self, item: SelectionItem, k: int) -> Planned:
+        return Planned(
+            f"{FRAME} {account(self.store.scene(item.scene_id), item.prefix_stop)}",
+            1,
+            partial(self._frame, item, k),
+        )
+
+    def _frame(self, item: SelectionItem, k: int, epoch: int) -> Sample:
+        rng = rng_of(self.seed, epoch, item.item_id, "frame", k)
+        shown = [(c.scene_id, c.frame) for c in item.candidates]
+        shown += [(item.scene_id, f) for f in self._prefix(item)]
+        scene_id, frame = shown[rng.integers(len(shown))]
+        pixels = self.frames.array(scene_id, frame)
+        told = account(self.store.scene(scene_id), frame)
+        return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], told)
+
+    def clips(self, item: SelectionItem) -> Iterator[Planned]:
+        """The clip with the frame that comes of it, to be read off, and without, to be foreseen."""
+        scene = self.store.scene(item.scene_id)
+        start, stop, target = item.prefix_start, item.prefix_stop, item.target_frame
+        text = describe(scene, start, stop, target, self.seed)
+        if text is None:
+            return
+        for shown in (True, False):
+            media = self.cfg.frames // 2 + shown
+            yield Planned(f"{CLIP} {text}", media, partial(self._clip, item, shown, text))
+
+    def _clip(self, item: SelectionItem, shown: bool, text: str, epoch: int) -> Sample:
+        pixels = self.frames.array(item.scene_id, item.target_frame)
+        later = ["Later: ", pixels, "\n"] if shown else []
+        return self._after_prefix(item, [*later, CLIP], text)
+
+    def later(self, item: SelectionItem) -> Planned:
+        text = f"{LATER} {answer_line(LETTERS[0])}"
+        return Planned(text, self.cfg.frames // 2 + 2, partial(self._later, item))
+
+    def _later(self, item: SelectionItem, epoch: int) -> Sample:
+        rng = rng_of(self.seed, epoch, item.item_id, "later")
+        last = self.store.scene(item.scene_id).frames - 1
+        soonest = min(item.prefix_stop + HALF_SECOND, last)
+        first, second = item.prefix_stop, int(rng.integers(soonest, last + 1))
+        order = rng.permutation(2)
+        parts: list[str | np.ndarray] = []
+        for letter, k in zip(LETTERS, order, strict=False):
+            frame = (first, second)[k]
+            parts += [f"\nCandidate {letter}: ", self.frames.array(item.scene_id, frame)]
+        right = LETTERS[order.tolist().index(1)]
+        return self._after_prefix(item, [*parts, f"\n{LATER}"], answer_line(right))
+
+    def matched(self, item: SelectionItem) -> Iterator[Planned]:
+        """A description that one candidate alone fits, where there is such."""
+        predicates = predicates_of(item, self.store.scene(item.scene_id), self.store.scene)
+        plain = predicates and _plain(predicates)
+        if not plain:
+            return
+        differing = {d.object for c in plain.candidates for d in c.differences[:1]}
+        told = [o for o in plain.objects if o.target_sight == "shown"]
+        told.sort(key=lambda o: o.object not in differing)
+        what = ", ".join(f"the {o.object} {o.target_region}" for o in told[:NAMED])
+        asked = MATCH.format(what)
+        answer = "\n".join([*matches(plain, item), answer_line(item.letter)])
+        make = partial(self._match, item, asked, answer)
+        yield Planned(f"{asked} {answer}", len(LETTERS), make)
+
+    def _match(self, item: SelectionItem, asked: str, answer: str, epoch: int) -> Sample:
+        parts: list[str | np.ndarray] = []
+        for letter, c in zip(LETTERS, item.candidates, strict=True):
+            parts += [f"\nCandidate {letter}: ", self.frames.array(c.scene_id, c.frame)]
+        return conversation(f"{item.item_id} (match)", [*parts, f"\n{asked}"], answer)
+
+    def _after_prefix(
+        self, item: SelectionItem, parts: list[str | np.ndarray], told: str
+    ) -> Sample:
+        scene, shown = self.store.scene(item.scene_id), self._prefix(item)
+        clip = Clip(self.frames.stack(item.scene_id, shown), shown, scene.fps, scene.frames)
+        return conversation(f"{item.item_id} (clip)", parts, told, clip)
+
+    def _prefix(self, item: SelectionItem) -> list[int]:
+        return shown_frames(item.prefix_start, item.prefix_stop, self.cfg.frames)
+
+
+def account(scene: Scene, frame: int) -> str:
+    """The objects that a frame shows and where, from the top-left to the bottom-right."""
+    places = [region for row in REGIONS for region in row]
+    seen = [
+        (places.index(region_of(scene, frame, k)), o.phrase)
+        for k, o in enumerate(scene.objects)
+        if scene.in_view[frame, k] and scene.visible_fraction[frame, k] > HIDDEN
+    ]
+    told = [f"The {phrase} is {places[place]}." for place, phrase in sorted(seen)]
+    return " ".join(told) or "No object is in view."
+
+
+def _plain(predicates: Predicates) -> Predicates | None:
+    """Predicates with the differences that a description by regions tells; None where a candidate
+    has none of these."""
+    candidates = []
+    for c in predicates.candidates:
+        told = tuple(d for d in c.differences if d.kind in ("region", "missing"))
+        if not c.agrees and not told:
+            return None
+        candidates.append(replace(c, differences=told))
+    return replace(predicates, candidates=tuple(candidates))
