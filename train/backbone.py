@@ -58,6 +58,7 @@ def load_base(
     """
     if cfg.architecture is not None:
         processor = build_processor(corpus(), cfg.architecture.vocabulary, cfg.image_size)
+        pin_sizes(processor, cfg.image_size, cfg.frames)
         return build_model(cfg.architecture, len(processor.tokenizer)), processor
     check_reachable("student", cfg.model)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
@@ -131,14 +132,17 @@ def damaged(folder: Path, error: Exception) -> UserError:
 
 
 def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
-    """Keep frames at the preset's size: a video processor's default size would shrink a prefix to
-    a budget, and an image processor's would not, so that one frame came in two sizes."""
-    pixels = image_size * image_size
-    smallest = 32 * 32
-    processor.image_processor.size = {"shortest_edge": smallest, "longest_edge": pixels}
+    """Keep frames of image_size x image_size px at the nearest size on the tower's grid, in an
+    image and in a video of up to `frames` alike. By default a video is shrunk to a budget that an
+    image does not have, and one frame comes in two sizes."""
+    step = processor.image_processor.patch_size * processor.image_processor.merge_size
+    edge = round(image_size / step) * step
+    smallest = step * step
+    processor.image_processor.size = {"shortest_edge": smallest, "longest_edge": edge * edge}
+    # Twice the pixels there are: frames of a shorter or odd video fall under no budget either.
     processor.video_processor.size = {
         "shortest_edge": smallest,
-        "longest_edge": pixels * (frames + frames % 2),
+        "longest_edge": 2 * frames * edge * edge,
     }
     processor.video_processor.do_sample_frames = False
     processor.video_processor.cap_pixels_per_frame = False
@@ -146,20 +150,29 @@ def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
 
 def add_adapters(model: PreTrainedModel, lora: LoraConfig) -> nn.Module:
     """Freeze the base and add LoRA to the language tower's projections. Adapters are fp32 even
-    over a bf16 base: updates of this size vanish in bf16's steps."""
+    over a bf16 base: updates of this size vanish in bf16's steps.
+
+    Raises:
+        UserError: the pattern is none, or matches no module that can be adapted.
+    """
     import peft
 
     model.requires_grad_(False)
-    return peft.get_peft_model(
-        model,
-        peft.LoraConfig(
-            r=lora.rank,
-            lora_alpha=lora.alpha,
-            lora_dropout=lora.dropout,
-            target_modules=lora.targets,
-            task_type="CAUSAL_LM",
-        ),
+    config = peft.LoraConfig(
+        r=lora.rank,
+        lora_alpha=lora.alpha,
+        lora_dropout=lora.dropout,
+        target_modules=lora.targets,
+        task_type="CAUSAL_LM",
     )
+    try:
+        return peft.get_peft_model(model, config)
+    except (ValueError, re.error) as error:
+        raise UserError(
+            f"student.lora.targets={lora.targets} adapts nothing in this model: give a pattern "
+            "that matches whole names of linear layers, such as "
+            "model.language_model.layers.0.self_attn.q_proj"
+        ) from error
 
 
 def load_student(
@@ -266,13 +279,22 @@ def count_towers(model: nn.Module) -> dict[str, Tower]:
     towers = {name: Tower() for name in TOWERS}
     for name, parameter in model.named_parameters():
         tower = towers[_tower_of(name)]
-        packed = type(parameter).__name__ == "Params4bit"
-        entries = parameter.quant_state.shape.numel() if packed else parameter.numel()
+        entries, four_bit = _entries(parameter)
         tower.parameters += entries
-        tower.four_bit += entries if packed else 0
+        tower.four_bit += entries if four_bit else 0
         tower.lora += entries if "lora_" in name else 0
         tower.trainable += entries if parameter.requires_grad else 0
     return towers
+
+
+def _entries(parameter: nn.Parameter) -> tuple[int, bool]:
+    """How many entries a parameter stands for, and whether it holds them in 4 bits."""
+    if type(parameter).__name__ != "Params4bit":
+        return parameter.numel(), False
+    if parameter.quant_state is not None:
+        return parameter.quant_state.shape.numel(), True
+    # Weights are packed as they are loaded; on the meta device they keep their own shape.
+    return parameter.numel(), parameter.is_meta
 
 
 def _tower_of(name: str) -> str:
