@@ -139,3 +139,32 @@ def test_the_driver_says_how_many_gpus_there_are(monkeypatch, tmp_path):
     driver.write_text(f"#!{sys.executable}\nprint('GPU 0: A (UUID: GPU-1)\\nGPU 1: A (UUID: ...)')")
     driver.chmod(0o755)
     assert visible_gpus() == ["0", "1"]
+
+
+@pytest.mark.slow
+def test_a_cluster_comes_to_the_same_table_and_run_folders(room):
+    done = toy(room, "-m", "x=2", "end=well,bug", "run=s", "hydra/launcher=submitit_local")
+    assert done.returncode == 1
+    assert "ValueError: a bug" in done.stderr
+    folder = room / "checkpoints/toy/s"
+    assert rows(folder) == [
+        {"job": "0", "end": "well", "accuracy": "0.5", "loss": "4.0", "status": "done"},
+        {"job": "1", "end": "bug", "accuracy": "", "loss": "", "status": "failed"},
+    ]
+    assert (folder / "sweep.txt").read_text() == done.stdout
+    run = json.loads((folder / "0/run.json").read_text())
+    assert run["overrides"] == ["x=2", "end=well", "run=s", "run='s/0'"]
+    assert "x is 2.0" in (folder / "0/output.log").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["hydra/launcher=submitit_slurm"], "error: hydra/launcher=submitit_slurm: Could not det"),
+        (["hydra/launcher=submitit_local", "+hydra.launcher.nope=1"], "error: hydra/launcher=sub"),
+    ],
+)
+def test_a_cluster_that_cannot_be_used_is_told(room, options, said):
+    done = toy(room, "-m", "x=1,2", *options)
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
