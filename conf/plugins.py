@@ -1,6 +1,6 @@
-"""Makes this project's launchers known to Hydra, as if they were installed plugins.
+"""Makes this project's launchers and its search known to Hydra, as if they were installed plugins.
 
-Their settings have submitit's own names.
+A launcher's settings have submitit's own names, the search's those of hydra-optuna-sweeper.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from hydra.core.plugins import Plugins
 
 from conf.cluster import SubmititLauncher
 from conf.launcher import ProcessLauncher
+from conf.search import OptunaSweeper
 
 
 @dataclass
@@ -54,13 +55,28 @@ class SlurmConf(LocalConf):
     """Any other option of sbatch, by its name."""
 
 
+@dataclass
+class OptunaConf:
+    _target_: str = "hydra_plugins.dynapix.OptunaSweeper"
+    metric: str | None = None
+    """What a run measures that is to become best; null takes the command's usual one."""
+    n_trials: int = 20
+    """Jobs in all, those of an earlier start included."""
+    n_jobs: int | None = None
+    """Jobs that are chosen and run at once; null takes the number of GPUs."""
+    seed: int = 0
+    params: dict[str, str] | None = None
+    """What is swept over where the command line names nothing else, for presets."""
+
+
 # The first look at the plugins scans for installed ones, whose settings of the same names give way.
-for plugin in (ProcessLauncher, SubmititLauncher):
+for plugin in (ProcessLauncher, SubmititLauncher, OptunaSweeper):
     Plugins.instance().register(plugin)
 for group, name, node in (
     ("launcher", "process", ProcessConf),
     ("launcher", "submitit_local", LocalConf),
     ("launcher", "submitit_slurm", SlurmConf),
+    ("sweeper", "optuna", OptunaConf),
 ):
     ConfigStore.instance().store(group=f"hydra/{group}", name=name, node=node)
 # Hydra looks a plugin up by this name even when it is registered. The scan has imported the

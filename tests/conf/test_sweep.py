@@ -1,4 +1,4 @@
-"""Sweeps as they are typed: real processes of a toy command."""
+"""Sweeps as they are typed: real processes of a toy command, and the presets of train.sft."""
 
 import csv
 import json
@@ -12,9 +12,16 @@ from pathlib import Path
 
 import psutil
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
+from conf.compose import preflight
+from conf.errors import SettingsError, UserError
 from conf.processes import visible_gpus
+from conf.schema import SftCommand
+from conf.search import JOURNAL, distribution, open_study
 
+SEARCH = ("-m", "x=interval(0.5,3.0)", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=2")
 TWO_GPUS = {**os.environ, "CUDA_VISIBLE_DEVICES": "0,1"}
 NO_GPU = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}
 
@@ -60,6 +67,16 @@ def new_room(folder: Path) -> Path:
 @pytest.fixture
 def room(tmp_path: Path) -> Path:
     return new_room(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory) -> Path:
+    """A room with a finished search by loss."""
+    room = new_room(tmp_path_factory.mktemp("searched"))
+    done = toy(room, *SEARCH, "hydra.sweeper.metric=loss", "run=s")
+    assert done.returncode == 0, done.stderr
+    (room / "stderr").write_text(done.stderr)
+    return room
 
 
 @pytest.mark.slow
@@ -168,3 +185,143 @@ def test_a_cluster_that_cannot_be_used_is_told(room, options, said):
     done = toy(room, "-m", "x=1,2", *options)
     assert said in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_a_search_tells_the_best_by_its_metric(searched):
+    table = rows(searched / "checkpoints/toy/s")
+    least = min(table, key=lambda row: float(row["loss"]))
+    assert f"best: #{least['job']} x={least['x']}, loss" in (searched / "stderr").read_text()
+    assert all(0.5 <= float(row["x"]) <= 3 for row in table)
+
+
+def test_which_way_a_search_goes_is_its_metrics(tmp_path):
+    assert open_study(tmp_path / "a", "answer_loss").direction.name == "MINIMIZE"
+    assert open_study(tmp_path / "b", "answer_letter_accuracy").direction.name == "MAXIMIZE"
+    # The metric was mistyped so far.
+    study = open_study(tmp_path / "a", "mrr")
+    assert study.direction.name == "MAXIMIZE"
+    study.tell(study.ask({"x": FloatDistribution(0, 1)}), 0.5)
+    assert open_study(tmp_path / "a", "mrr").trials == study.trials
+
+
+@pytest.mark.slow
+def test_a_killed_search_tries_what_it_would_have_and_a_finished_one_adds_nothing(searched):
+    search = (*SEARCH, "hydra.sweeper.metric=loss", "run=k")
+    folder = searched / "checkpoints/toy/k"
+    killed = started(searched, *search)
+    wait_for(folder / "0/job.json")
+    killed.send_signal(signal.SIGTERM)
+    assert killed.wait(timeout=60) == 130
+    resumed = toy(searched, *search)
+    assert "#0 x=" in resumed.stderr.partition("finished before")[0]
+    undisturbed = rows(searched / "checkpoints/toy/s")
+    assert rows(folder) == undisturbed
+    again = toy(searched, *search)
+    assert again.stderr.count("finished before, skipped") == len(undisturbed) == 2
+    assert ": started" not in again.stderr
+    assert rows(folder) == undisturbed
+    assert len(open_study(folder / JOURNAL, "loss").trials) == 2
+
+
+@pytest.mark.slow
+def test_a_failed_trial_is_tried_again(room):
+    # It draws both values.
+    seed = "hydra.sweeper.seed=2"
+    search = ("-m", "x=range(0,2)", *SEARCH[2:], "hydra.sweeper.metric=loss", seed, "run=s")
+    assert toy(room, *search).returncode == 1
+    table = rows(room / "checkpoints/toy/s")
+    assert sorted((row["x"], row["status"]) for row in table) == [("0", "failed"), ("1", "done")]
+    again = toy(room, *search).stderr
+    assert again.count(": started") == 1
+    assert " x=0: started" in again
+    assert " x=1: finished before, skipped" in again
+
+
+@pytest.mark.slow
+def test_an_unknown_metric_is_told_and_may_be_mended(room):
+    wrong = toy(room, *SEARCH, "hydra.sweeper.metric=los", "run=s")
+    said = "error: hydra.sweeper.metric=los: a job of toy measures accuracy, loss here\n"
+    assert (wrong.returncode, wrong.stderr.endswith(said)) == (1, True)
+    right = toy(room, *SEARCH, "hydra.sweeper.metric=loss", "run=s")
+    assert right.returncode == 0
+    assert right.stderr.count("finished before, skipped") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (
+            ["hydra.sweeper.metric=accuracy", "x=interval(0.5,4.0)", "workers=1,3"],
+            "hydra.sweeper.metric is loss there and accuracy now; workers is fixed there and 1,3 "
+            "now; x is interval(0.5,3.0) there and interval(0.5,4.0) now. ",
+        ),
+        (["end=bug"], 'end is "well" there and "bug" now. '),
+    ],
+)
+def test_another_search_in_the_same_folder_is_refused(searched, changed, said):
+    table = rows(searched / "checkpoints/toy/s")
+    done = toy(searched, *SEARCH, "hydra.sweeper.metric=loss", "run=s", *changed)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: checkpoints/toy/s holds a search with other settings: ")
+    assert said in done.stderr
+    assert rows(searched / "checkpoints/toy/s") == table
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["x=interval(0,1)"], "x=interval(0,1): add hydra/sweeper=optuna, which draws from inter"),
+        (["x=interval(0,1)", "hydra/sweeper=optuna"], "toy has no usual metric to search by"),
+        ([*SEARCH[2:], "x=1", "hydra.sweeper.metric=loss"], "there is nothing to search"),
+        ([*SEARCH[2:], "x=interval(3,1)", "hydra.sweeper.metric=loss"], "x=interval(3,1): `low"),
+    ],
+)
+def test_a_search_that_cannot_be_is_told(room, arguments, said):
+    done = toy(room, "-m", *arguments)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: {said}")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_search_without_optuna_is_told(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(UserError, match=r"pip install 'dynapix\[optuna\]'"):
+        open_study(tmp_path / JOURNAL, "loss")
+
+
+def test_a_torn_line_is_dropped_and_the_study_goes_on(tmp_path):
+    journal = tmp_path / JOURNAL
+    study = open_study(journal, "loss")
+    for value in (2.0, 1.0):
+        study.tell(study.ask({"x": FloatDistribution(0, 1)}), value)
+    whole = journal.read_bytes()
+    journal.write_bytes(whole + b'{"op_code":4,"wor')
+    study = open_study(journal, "loss")
+    assert journal.read_bytes().startswith(whole)
+    study.tell(study.ask({"x": FloatDistribution(0, 1)}), 3.0)
+    assert [trial.value for trial in open_study(journal, "loss").trials] == [2.0, 1.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("typed", "drawn"),
+    [
+        ("x=interval(0,1)", FloatDistribution(0, 1)),
+        ("x=int(interval(1,4))", IntDistribution(1, 4)),
+        ("x=tag(log,interval(1e-5,1e-3))", FloatDistribution(1e-5, 1e-3, log=True)),
+        ("x=range(1,10,3)", IntDistribution(1, 7, step=3)),
+        ("x=range(0,1,0.5)", CategoricalDistribution(["0.0", "0.5"])),
+        ("x=1e-5,2", CategoricalDistribution(["1e-05", "2"])),
+        ("x={a:1},{a:2}", CategoricalDistribution(["{a:1}", "{a:2}"])),
+    ],
+)
+def test_what_is_typed_is_what_is_drawn_from(typed, drawn):
+    [override] = OverridesParser.create().parse_overrides([typed])
+    assert distribution(override) == drawn
+
+
+def test_a_search_checks_each_value_of_a_choice():
+    overrides = ["hydra/sweeper=optuna", "train.lr=1e-3,2e-3", "train.schedule=cosine,linear,x"]
+    with pytest.raises(SettingsError, match=r"train\.schedule=x: the options"):
+        preflight("train.sft", SftCommand, overrides, sweep=True)
