@@ -8,19 +8,24 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.resources import files
 from pathlib import Path
 
 import psutil
 import pytest
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-from conf.compose import preflight
+from conf.compose import compose, preflight
 from conf.errors import SettingsError, UserError
 from conf.processes import visible_gpus
-from conf.schema import SftCommand
+from conf.schema import ContrastiveCommand, SftCommand
+from conf.schema.training import REGIMES
 from conf.search import JOURNAL, distribution, open_study
 
+PRESETS = Path(str(files("conf"))) / "sweep"
 SEARCH = ("-m", "x=interval(0.5,3.0)", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=2")
 TWO_GPUS = {**os.environ, "CUDA_VISIBLE_DEVICES": "0,1"}
 NO_GPU = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}
@@ -319,6 +324,40 @@ def test_a_torn_line_is_dropped_and_the_study_goes_on(tmp_path):
 def test_what_is_typed_is_what_is_drawn_from(typed, drawn):
     [override] = OverridesParser.create().parse_overrides([typed])
     assert distribution(override) == drawn
+
+
+def preset_jobs(name: str) -> list[SftCommand]:
+    params = OmegaConf.load(PRESETS / f"{name}.yaml").hydra.sweeper.params
+    overrides = [f"{key}={value}" for key, value in params.items()]
+    [jobs] = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(overrides), None)
+    return [compose("train.sft", SftCommand, ["student=qwen3_vl_8b", *job]) for job in jobs]
+
+
+def test_the_regimes_are_all_that_a_student_can_be_trained_in():
+    assert {job.train.regime for job in preset_jobs("regimes")} == set(REGIMES) - {"describe"}
+
+
+def test_the_scale_of_adapters_stays_the_papers_at_every_rank():
+    jobs = preset_jobs("lr_rank")
+    paper = compose("train.sft", SftCommand, ["student=qwen3_vl_8b"])
+    assert len({(job.train.lr, job.student.lora.rank) for job in jobs}) == len(jobs) == 9
+    scales = {job.student.lora.alpha / job.student.lora.rank for job in jobs}
+    assert scales == {paper.student.lora.alpha / paper.student.lora.rank}
+    assert (paper.train.lr, paper.student.lora.rank) in {
+        (job.train.lr, job.student.lora.rank) for job in jobs
+    }
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in PRESETS.glob("*.yaml")))
+def test_a_preset_is_checked_before_it_starts(name):
+    preflight("train.sft", SftCommand, [f"+sweep={name}"], sweep=True)
+    with pytest.raises(SettingsError, match=rf"\+sweep={name} is a sweep: run it with -m"):
+        preflight("train.sft", SftCommand, [f"+sweep={name}"], sweep=False)
+
+
+def test_a_preset_of_another_command_is_told():
+    with pytest.raises(SettingsError, match=r"student\.lora: train\.contrastive has no such key"):
+        preflight("train.contrastive", ContrastiveCommand, ["+sweep=lr_rank"], sweep=True)
 
 
 def test_a_search_checks_each_value_of_a_choice():
