@@ -364,3 +364,23 @@ def test_a_search_checks_each_value_of_a_choice():
     overrides = ["hydra/sweeper=optuna", "train.lr=1e-3,2e-3", "train.schedule=cosine,linear,x"]
     with pytest.raises(SettingsError, match=r"train\.schedule=x: the options"):
         preflight("train.sft", SftCommand, overrides, sweep=True)
+
+
+@pytest.mark.slow
+def test_a_sweeps_table_and_plot_can_be_drawn_again(searched):
+    def report(folder: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "train.sweep_report", folder]
+        return subprocess.run(command, cwd=searched, capture_output=True, text=True)
+
+    folder = searched / "checkpoints/toy/s"
+    drawn = [folder / f"sweep.{end}" for end in ("txt", "csv", "png")]
+    before = [path.read_bytes() for path in drawn]
+    for path in drawn:
+        path.unlink()
+    done = report("checkpoints/toy/s")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [path.read_bytes() for path in drawn] == before
+    assert done.stdout.encode() == before[0]
+    none = report("checkpoints/toy")
+    assert none.returncode == 1
+    assert none.stderr == "error: checkpoints/toy holds no sweep with a job that has ended\n"
