@@ -24,7 +24,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-import conf.launcher  # noqa: F401  registers the launcher that run_folder.yaml names
+import conf.plugins  # noqa: F401  registers the launcher that run_folder.yaml names
 from conf.errors import SettingsError
 from conf.keys import dict_above, has_key, keys, keys_like, nearest
 
@@ -59,8 +59,30 @@ def preflight(command: str, schema: type, overrides: list[str], sweep: bool) -> 
                 f"{_typed_key(override)}=[a,b]"
             )
         _check_overrides(command, schema, parsed, loader)
-        for job in _jobs(parsed) if sweep else [overrides]:
-            _compose_one(command, schema, job)
+        first = _each_value(parsed)[0] if sweep else overrides
+        _compose_one(command, schema, first)
+        overlays = [str(o.input_line) for o in parsed if o.key_or_group == "sweep"]
+        if not (sweep or overlays):
+            return
+        hydra = hydra_compose(short(command), first, return_hydra_config=True).hydra
+        preset = [f"{key}={value}" for key, value in (hydra.sweeper.get("params") or {}).items()]
+        if preset and not sweep:
+            raise SettingsError(f"{' '.join(overlays)} is a sweep: run it with -m")
+        if sweep:
+            sweeper = hydra.runtime.choices["hydra/sweeper"]
+            _check_sweep(command, schema, _parse([*preset, *overrides], loader), loader, sweeper)
+
+
+def _check_sweep(
+    command: str, schema: type, parsed: list[Override], loader: ConfigLoader, sweeper: str
+) -> None:
+    _check_overrides(command, schema, parsed, loader)
+    # A search tries few of the combinations that it chooses among.
+    for job in _jobs(parsed) if sweeper == "basic" else _each_value(parsed):
+        _compose_one(command, schema, job)
+    drawn = [o.input_line for o in parsed if o.is_interval_sweep()]
+    if drawn and sweeper == "basic":
+        raise SettingsError(f"{drawn[0]}: add hydra/sweeper=optuna, which draws from intervals")
 
 
 def options(command: str, schema: type) -> dict[str, list[str]]:
@@ -160,11 +182,29 @@ def _typed_key(override: Override) -> str:
 
 
 def _jobs(overrides: list[Override]) -> list[list[str]]:
-    """Each job of a sweep; where a sweeper draws from an interval, its start stands for it."""
-    drawn = [o for o in overrides if o.is_sweep_override() and not o.is_discrete_sweep()]
+    """Each job of a sweep over every combination; the start of an interval stands for it."""
+    drawn = [o for o in overrides if o.is_interval_sweep()]
     [jobs] = BasicSweeper.split_arguments([o for o in overrides if o not in drawn], None)
-    starts = [f"{o.get_key_element()}={o.value().start}" for o in drawn]
-    return [[*job, *starts] for job in jobs]
+    return [[*job, *(_values(o)[0] for o in drawn)] for job in jobs]
+
+
+def _each_value(overrides: list[Override]) -> list[list[str]]:
+    """As few jobs as have each value of a sweep in one of them, both ends of an interval too."""
+    values = {o.get_key_element(): _values(o) for o in overrides}
+    return [
+        [lines[number % len(lines)] for lines in values.values()]
+        for number in range(max(map(len, values.values()), default=1))
+    ]
+
+
+def _values(override: Override) -> list[str]:
+    key = override.get_key_element()
+    if override.is_interval_sweep():
+        interval = override.value()
+        return [f"{key}={interval.start}", f"{key}={interval.end}"]
+    if override.is_sweep_override():
+        return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    return [str(override.input_line)]
 
 
 def _compose_one(command: str, schema: type, overrides: list[str]) -> Any:

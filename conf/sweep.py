@@ -35,7 +35,7 @@ class Job:
 def read_jobs(folder: Path) -> list[Job]:
     """The jobs of a sweep that have ended, by number."""
     jobs = []
-    for path in folder.glob(f"*/{JOB_FILE}"):
+    for path in folder.glob(f"[0-9]*/{JOB_FILE}"):
         metrics = path.with_name("metrics.json")
         told = json.loads(path.read_text())
         found = outcome(json.loads(metrics.read_text())) if metrics.exists() else {}
@@ -86,13 +86,17 @@ def varying(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
     return [{key: job[key] for key in differ if key in job} for job in told]
 
 
+def less_is_better(name: str) -> bool:
+    """Whether a metric is a loss, a rank or a count of what was refused."""
+    return re.search(LESS_IS_BETTER, name) is not None
+
+
 def best(name: str, values: Sequence[float]) -> float | None:
-    """The best of a metric's values: the least of a loss, a rank or what was refused, else the
-    greatest."""
+    """The best of a metric's values that are numbers."""
     finite = [value for value in values if math.isfinite(value)]
     if not finite:
         return None
-    return (min if re.search(LESS_IS_BETTER, name) else max)(finite)
+    return (min if less_is_better(name) else max)(finite)
 
 
 def _text(rows: list[dict[str, Any]], columns: list[str], metrics: list[str]) -> str:

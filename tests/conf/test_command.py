@@ -1,12 +1,9 @@
 """A command from its command line: real processes, with a toy for `main`."""
 
-import csv
 import json
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -101,55 +98,3 @@ def test_help_tells_the_settings_and_imports_nothing_heavy(room):
         line.split() == ["x", "=", "5.0", "How", "much."] for line in done.stdout.split("\n")
     )
     assert not (room / "checkpoints").exists()
-
-
-@pytest.mark.slow
-def test_a_sweep_outlives_a_failed_job_and_goes_on(room):
-    sweep = ("-m", "x=1,2", "end=well,bug", "run=s")
-    done = toy(room, *sweep)
-    assert done.returncode == 1
-    assert "#1 x=1 end=bug: failed" in done.stderr
-    assert "ValueError: a bug" in done.stderr
-    folder = room / "checkpoints/toy/s"
-    rows = list(csv.DictReader((folder / "sweep.csv").open()))
-    assert [(r["x"], r["end"], r["status"], r["loss"]) for r in rows] == [
-        ("1", "well", "done", "1.0"),
-        ("1", "bug", "failed", ""),
-        ("2", "well", "done", "4.0"),
-        ("2", "bug", "failed", ""),
-    ]
-    table = (folder / "sweep.txt").read_text()
-    assert table == done.stdout
-    assert table.splitlines()[1].split()[:6] == ["0", "1", "well", "1*", "1*", "1"]
-    assert (folder / "sweep.png").stat().st_size > 1000
-    assert "x is 2.0" in (folder / "2/output.log").read_text()
-    assert "x: 2.0" in (folder / "2/config.yaml").read_text()
-
-    again = toy(room, *sweep)
-    assert "#0 x=1 end=well: finished before, skipped" in again.stderr
-    assert "#1 x=1 end=bug: started" in again.stderr
-    assert json.loads((folder / "0/run.json").read_text())["earlier_starts"] == []
-
-
-@pytest.mark.slow
-def test_a_sweep_without_a_name_is_named_by_its_overrides(room):
-    done = toy(room, "-m", "x=1,2")
-    assert done.returncode == 0
-    assert (room / "checkpoints/toy/x-1-2/1/metrics.json").exists()
-
-
-def test_a_killed_sweep_takes_its_child_along(room):
-    sweep = subprocess.Popen(
-        [sys.executable, "-m", "toy", "-m", "x=1,2", "end=never"],
-        cwd=room,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    output = room / "checkpoints/toy/x-1-2+end-never/0/output.log"
-    until = time.monotonic() + 60
-    while not (output.exists() and output.read_text()) and time.monotonic() < until:
-        time.sleep(0.05)
-    sweep.send_signal(signal.SIGTERM)
-    assert sweep.wait(timeout=60) == 130
-    assert not (output.parent / "job.json").exists()
-    assert not (output.parent.parent / "1").exists()

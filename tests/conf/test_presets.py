@@ -28,6 +28,8 @@ SCHEMAS = {
 def settings(line: str):
     python, m, command, *overrides = shlex.split(line)
     assert (python, m) == ("python", "-m")
+    # Each job of a sweep is composed in test_sweep.py.
+    overrides = [o for o in overrides if o != "--multirun"]
     return compose(command, SCHEMAS[command], overrides)
 
 
@@ -40,8 +42,9 @@ def test_a_file_names_a_command_that_composes_it(path):
     assert line.startswith("# python -m ")
     settings(line.removeprefix("# "))
     group = path.parent.name
-    if group == "exp":
-        assert f"+exp={path.stem}" in line
+    if group in ("exp", "sweep"):
+        assert f"+{group}={path.stem}" in line
+        assert ("--multirun" in line) == (group == "sweep")
     elif path.parent == CONF and path.stem != "run_folder":
         assert line == f"# python -m {next(c for c in SCHEMAS if c.endswith('.' + path.stem))}"
 

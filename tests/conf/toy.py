@@ -1,6 +1,7 @@
 """A toy that squares x."""
 
 import logging
+import os
 import time
 from dataclasses import dataclass, field
 
@@ -29,6 +30,8 @@ ConfigStore.instance().store(name="toy", node={"defaults": defaults})
 def main(cfg: ToyCommand, run: Run) -> dict[str, float]:
     assert isinstance(cfg.teacher, TeacherConfig)
     log.info("x is %s in %s", cfg.x, run.folder)
+    if gpu := os.environ.get("CUDA_VISIBLE_DEVICES"):
+        log.info("sees GPU %s", gpu)
     match cfg.end:
         case "mistake":
             raise UserError("this end is a mistake: set end=well")
@@ -38,9 +41,21 @@ def main(cfg: ToyCommand, run: Run) -> dict[str, float]:
             raise OSError(28, "No space left on device", "some/file")
         case "interrupt":
             raise KeyboardInterrupt
+        case "meet":
+            _meet(run)
         case "never":
             time.sleep(60)
-    return {"loss": cfg.x**2, "accuracy": 1 / cfg.x, "objective": cfg.x}
+    return {"loss": cfg.x**2, "accuracy": 1 / cfg.x}
+
+
+def _meet(run: Run) -> None:
+    """Wait for another job of the sweep that runs at the same time, in vain if none does."""
+    (run.folder / "here").touch()
+    until = time.monotonic() + 60
+    while len(list(run.folder.parent.glob("*/here"))) < 2:
+        if time.monotonic() > until:
+            raise RuntimeError("alone")
+        time.sleep(0.05)
 
 
 if __name__ == "__main__":
