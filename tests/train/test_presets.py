@@ -40,7 +40,7 @@ from train import backbone
 from train.audit import audit
 from train.backbone import Tower
 from train.collate import Collator, encode
-from train.conversation import Sample, response, selection_sample
+from train.conversation import Clip, Sample, conversation, response, selection_sample
 from train.samples import supervised_items
 
 RELEASED = {"qwen3_vl_8b": 8_767_123_696, "qwen3_vl_2b": 2_127_532_032}
@@ -298,8 +298,7 @@ def test_frames_come_at_320_px_and_at_their_true_times(
 def media(size: int, count: int) -> Sample:
     """A video of `count` black frames and one image of them."""
     video = np.zeros((count, size, size, 3), np.uint8)
-    return Sample("black", [{"type": "video"}, {"type": "image"}], video, list(range(count)),
-                  [video[0]])  # fmt: skip
+    return conversation("black", [video[0]], None, Clip(video, list(range(count))))
 
 
 def test_a_video_of_default_size_is_shrunk_where_an_image_is_not(processor) -> None:
