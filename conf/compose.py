@@ -28,6 +28,8 @@ import conf.plugins  # noqa: F401  registers the launcher that run_folder.yaml n
 from conf.errors import SettingsError
 from conf.keys import dict_above, has_key, keys, keys_like, nearest
 
+OWN_NAMES = {"train.export": "export_student"}
+"""Commands that do not go by the last part of their name, because data.export does."""
 OVERLAYS = ("exp", "sweep")
 """Groups that any command takes, as `+exp=cot`."""
 
@@ -39,7 +41,7 @@ def register(command: str, schema: type) -> None:
 
 def short(command: str) -> str:
     """sft for train.sft: the name of its config and of its folder of runs."""
-    return command.rpartition(".")[2]
+    return OWN_NAMES.get(command) or command.rpartition(".")[2]
 
 
 def compose(command: str, schema: type, overrides: list[str]) -> Any:

@@ -58,6 +58,17 @@ def run_name(run: str | None, overrides: Sequence[str]) -> str:
     return name
 
 
+def run_below(run: str, folder: str) -> str:
+    """The name of the run in `folder` that is given by its name or by its own folder."""
+    path = os.path.relpath(run, folder)
+    return os.path.normpath(run) if path.startswith("..") else path
+
+
+def is_name(run: str) -> bool:
+    """Whether a run's name leads to a folder below another one; a sweep's job is SWEEP/NUMBER."""
+    return not os.path.isabs(run) and run.split(os.sep)[0] not in (".", "..")
+
+
 def finished(run: Run) -> dict[str, float] | None:
     """The metrics of a run that has ended; None while there is something left to do."""
     path = run.folder / "metrics.json"
@@ -65,6 +76,7 @@ def finished(run: Run) -> dict[str, float] | None:
 
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+OmegaConf.register_new_resolver("run_below", run_below, replace=True)
 
 
 def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[str]) -> None:

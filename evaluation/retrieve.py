@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.retrieve", RetrieveCommand)
 def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
-    from evaluation.trained import run_title, settings_of
+    from train.trained import run_title, settings_of
 
     folder = Path(cfg.model) if cfg.model is not None else None
     trained = settings_of(folder, ContrastiveCommand, "retriever") if folder else cfg

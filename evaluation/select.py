@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.select", SelectCommand)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
-    from evaluation.trained import run_title, settings_of
+    from train.trained import product_folder, run_title, settings_of
 
     folder = Path(cfg.model) if cfg.model is not None else None
     trained = settings_of(folder, SftCommand, "student") if folder else cfg
@@ -44,14 +44,16 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     backbone.keep_big_blocks()
     if folder is not None:
         backbone.check_base(folder, student.model)
-        model, processor = backbone.load_trained(student, precision, folder / "student")
+        weights = product_folder(folder, "student")
+        model, processor = backbone.load_trained(student, precision, weights)
     else:
+        weights = None
         model, processor = backbone.load_base(student, precision, list)
     name = run_title(folder) if folder else f"{student.name} base"
     asked = ", ".join(filter(None, (store.name, cfg.suite, cfg.control)))
     frames = Frames(store, student.image_size)
-    weights = backbone.weights_digest(student.model, folder and folder / "student")
-    measured = f"{weights} on {store.identity}, {asked}"
+    digest = backbone.weights_digest(student.model, weights)
+    measured = f"{digest} on {store.identity}, {asked}"
     journal = answers.AnswerLog(run.folder / "answers.jsonl", measured, items)
     rows, subtypes, metrics = [], {}, {}
     for mode in modes:

@@ -20,6 +20,7 @@ COMMANDS = (
     "teacher.serve",
     "train.sft",
     "train.contrastive",
+    "train.export",
     "evaluation.select",
     "evaluation.retrieve",
     "evaluation.report",

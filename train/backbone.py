@@ -28,6 +28,7 @@ from conf.errors import UserError
 from conf.runs import write_json
 from conf.schema import LoraConfig, RetrieverConfig, StudentConfig
 from train.tiny import build_model, build_processor
+from train.trained import EXPORT
 
 UNQUANTIZED = ["model.visual", "visual", "lm_head"]
 """Modules that keep their precision. Matching is anchored at the name's start, so the tower is
@@ -214,11 +215,34 @@ def load_trained(
             return peft.PeftModel.from_pretrained(base, folder).eval(), processor
         except UNREADABLE as error:
             raise damaged(folder, error) from error
+    if (folder / EXPORT).exists():
+        return load_merged(folder)
     whole = replace(
         cfg, model=str(folder), architecture=None, quantization="none", lora=LoraConfig(rank=0)
     )
     model, processor = load_base(whole, precision, list)
     return model.eval(), processor
+
+
+def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
+    """A student merged into its base, as `train.export` wrote it: in the precision of its weights,
+    and with nothing that the standard classes do not read themselves.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    try:
+        processor = AutoProcessor.from_pretrained(folder)
+        model = AutoModelForImageTextToText.from_pretrained(
+            folder, dtype="auto", use_safetensors=True
+        )
+    except UNREADABLE as error:
+        first = next(iter(str(error).strip().splitlines()), type(error).__name__)
+        raise UserError(
+            f"{folder} is damaged and cannot be read ({first}): delete it and export again"
+        ) from error
+    processor.tokenizer.padding_side = "left"
+    return model.to("cuda" if torch.cuda.is_available() else "cpu").eval(), processor
 
 
 def weights_digest(*models: str | Path | None) -> str:

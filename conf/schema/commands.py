@@ -7,12 +7,14 @@ from datetime import date
 
 from omegaconf import MISSING
 
+from conf.runs import is_name, run_below
 from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.checks import is_url, too_small
 from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.teacher import TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
 
+EXPORTS = ("bf16", "fp32", "adapter")
 FRAMES_AHEAD = ("named", "all", "none")
 ENGINES = ("loky", "ray")
 DTYPES = ("auto", "bfloat16", "float16", "float32")
@@ -165,6 +167,27 @@ class SftCommand(CommandConfig):
 
 
 @dataclass
+class ExportStudentCommand(CommandConfig):
+    run: str = "default"
+    """The run of train.sft that is exported: its name or its folder."""
+    format: str = "bf16"
+    """bf16 or fp32 merges the adapters into the dequantised base, whose weights are then written in
+    that precision; adapter writes the adapters alone."""
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        if self.format not in EXPORTS:
+            problems.append(f"format={self.format}: the options are bf16, fp32 and adapter")
+        runs = f"{self.checkpoints}/sft"
+        if not is_name(run_below(self.run, runs)):
+            problems.append(
+                f"run={self.run} is no run below {runs}: name one that is there, and give "
+                "checkpoints=FOLDER where the runs are elsewhere"
+            )
+        return problems
+
+
+@dataclass
 class ContrastiveCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     retriever: RetrieverConfig = MISSING
@@ -189,7 +212,8 @@ class SelectCommand(CommandConfig):
     train: SftTrainConfig = field(default_factory=SftTrainConfig)
     """The preset's recipe; a measurement of a base takes its precision and its regime's prompt."""
     model: str | None = None
-    """A run folder of train.sft, with its own student and recipe; null takes the student's base."""
+    """A run folder of train.sft or what train.export wrote, with its own student and recipe; null
+    takes the student's base."""
     modes: list[str] | None = None
     """reasoning (rationale, then answer) and answer (at once), each measured by itself; null takes
     those that the student was trained in."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from conf import schema
-from conf.compose import compose
+from conf.compose import compose, short
 
 CONF = Path(str(files("conf")))
 SCHEMAS = {
@@ -19,6 +19,7 @@ SCHEMAS = {
     "teacher.serve": schema.ServeCommand,
     "train.sft": schema.SftCommand,
     "train.contrastive": schema.ContrastiveCommand,
+    "train.export": schema.ExportStudentCommand,
     "evaluation.select": schema.SelectCommand,
     "evaluation.retrieve": schema.RetrieveCommand,
     "evaluation.report": schema.ReportCommand,
@@ -46,7 +47,7 @@ def test_a_file_names_a_command_that_composes_it(path):
         assert f"+{group}={path.stem}" in line
         assert ("--multirun" in line) == (group == "sweep")
     elif path.parent == CONF and path.stem != "run_folder":
-        assert line == f"# python -m {next(c for c in SCHEMAS if c.endswith('.' + path.stem))}"
+        assert line == f"# python -m {next(c for c in SCHEMAS if short(c) == path.stem)}"
 
 
 def test_a_student_brings_its_recipe():

@@ -25,8 +25,8 @@ from conf.schema import (
 )
 from evaluation import report, retrieve, select
 from evaluation.answers import AnswerLog
-from evaluation.trained import settings_of
 from train import backbone, retriever, samples
+from train.trained import settings_of
 
 SMALL = ArchitectureConfig(
     hidden=64, layers=1, heads=2, kv_heads=2, feed_forward=64,

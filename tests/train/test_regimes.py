@@ -121,7 +121,7 @@ def test_an_epoch_reaches_the_samples(micro_store, frames, student_cfg) -> None:
 
 def test_a_mode_that_was_not_trained_is_told(tmp_path, monkeypatch) -> None:
     from conf.schema import SftCommand
-    from evaluation import trained
+    from train import trained
 
     settings = SftCommand(train=SftTrainConfig(regime="answer_only"))
     monkeypatch.setattr(trained, "settings_of", lambda *_: settings)

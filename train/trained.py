@@ -1,0 +1,86 @@
+"""Find what a training run wrote, and the settings it was trained with."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, TypeVar
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from conf.errors import UserError
+
+EXPORT = "export.json"
+"""Stands in a folder that `train.export` wrote, and there only."""
+
+Command = TypeVar("Command")
+
+
+def run_title(folder: Path) -> str:
+    """A run's name for a table; a sweep's job goes by the sweep and its number, an export by its
+    run and format."""
+    if (folder / EXPORT).exists():
+        record = export_record(folder)
+        return f"{record['run']} {record['format']}"
+    return f"{folder.parent.name}/{folder.name}" if folder.name.isdigit() else folder.name
+
+
+def export_record(folder: Path) -> dict[str, Any]:
+    """What `train.export` noted of an export: its `run`, its `format`, the SHA-256 of the
+    adapters that it is of as `weights`, and what was `measured` of it.
+
+    Raises:
+        UserError: the note is not whole.
+    """
+    try:
+        record = json.loads((folder / EXPORT).read_text())
+        return {name: record[name] for name in ("run", "format", "weights", "measured")}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{folder / EXPORT} is missing or damaged: delete {folder} and export again"
+        ) from error
+
+
+def product_folder(folder: Path, product: str) -> Path:
+    """Where the weights and the processor of a run's `product` (student, retriever) are; an export
+    is that folder itself."""
+    return folder if (folder / EXPORT).exists() else folder / product
+
+
+def settings_of(folder: Path, schema: type[Command], product: str, key: str = "model") -> Command:
+    """The settings of a finished training run or of an export's, as its command's dataclass.
+
+    `key` is the one by which the user named the folder.
+
+    Raises:
+        UserError: `folder` is no run folder, holds no finished `product` (student, retriever), or
+            settings that cannot be read.
+    """
+    config = folder / "config.yaml"
+    try:
+        there = OmegaConf.load(config)
+        if (folder / product / EXPORT).exists():
+            raise UserError(f"{key}={folder} holds an export: give {key}={folder / product}")
+        if not OmegaConf.is_dict(there) or product not in there:
+            raise UserError(f"{key}={folder} trained no {product}: it is another command's")
+        if not (folder / EXPORT).exists() and not _finished(folder, product):
+            raise UserError(
+                f"{key}={folder} is not finished: run its command again to go on with it"
+            )
+        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), there))
+    except FileNotFoundError as error:
+        raise UserError(
+            f"{key}={folder} is no run folder of a trained {product}: {config} is missing; give "
+            "the folder that the training command named, below checkpoints/"
+        ) from error
+    except (YAMLError, OmegaConfBaseException) as error:
+        first = str(error).partition("\n")[0]
+        raise UserError(
+            f"{config} is damaged or of another version of DynaPix ({first}); train again"
+        ) from error
+
+
+def _finished(folder: Path, product: str) -> bool:
+    return (folder / "metrics.json").exists() and (folder / product).is_dir()
