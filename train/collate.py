@@ -8,7 +8,7 @@ their rows pass the head.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,7 +84,7 @@ class Collator:
         self._processor = processor
         self._max_length = max_length
 
-    def __call__(self, samples: Sequence[Sample | Callable[[], Sample]]) -> dict[str, Any]:
+    def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
         encoded = [encode(s, self._processor, self._max_length) for s in samples]
         batch = pad(encoded, self._processor.tokenizer.pad_token_id)
         labels = batch.pop("labels")
@@ -95,6 +95,10 @@ class Collator:
         batch["labels"] = labels[:, start:]
         batch["logits_to_keep"] = torch.arange(start, labels.shape[1])
         return batch
+
+    def named(self, samples: Sequence[Sample]) -> dict[str, Any]:
+        """The batch with its samples' ids, as `sample_ids`."""
+        return {**self(samples), "sample_ids": [s.sample_id for s in samples]}
 
 
 def pad(encoded: Sequence[Encoded], pad_id: int) -> dict[str, Any]:

@@ -97,7 +97,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
         loss=loss,
         data_collator=collator,
     )
-    loop.train_and_log(trainer, run, checkpoint)
+    loop.train_and_log(trainer, run, checkpoint, "train.mini_batch, which changes no gradient")
     model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)
     log.info("the retriever is in %s", run.folder / "retriever")
     return loop.evaluated(run.folder)

@@ -84,16 +84,33 @@ def checkpointing(train: TrainConfig) -> dict[str, Any]:
     return {name: True, f"{name}_kwargs": {"use_reentrant": False}}
 
 
-def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None) -> None:
-    """Train from the start or a checkpoint, writing the journal and the curves."""
+def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: str) -> None:
+    """Train from the start or a checkpoint, writing the journal and the curves.
+
+    Raises:
+        UserError: memory runs out; `lower` says by which key less of it is taken.
+    """
     trainer.remove_callback(ProgressCallback)
     trainer.remove_callback(PrinterCallback)
     trainer.add_callback(Bar())
     trainer.add_callback(Journal(run.folder))
     if checkpoint is not None:
         log.info("going on from %s", checkpoint)
-    trainer.train(resume_from_checkpoint=str(checkpoint) if checkpoint else None)
+    try:
+        trainer.train(resume_from_checkpoint=str(checkpoint) if checkpoint else None)
+    except RuntimeError as error:
+        if not is_out_of_memory(error):
+            raise
+        raise UserError(
+            f"out of memory after step {trainer.state.global_step}: lower {lower}, or set "
+            "train.gradient_checkpointing=true, in a run of its own (run=NAME)"
+        ) from error
     curves_figure(read_journal(run.folder), run.folder / "curves.png")
+
+
+def is_out_of_memory(error: RuntimeError) -> bool:
+    """Whether a card's or the machine's memory was too small."""
+    return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
 def evaluated(folder: Path) -> dict[str, float]:

@@ -24,12 +24,14 @@ class Planned:
     differ by epoch.
 
     `text` is what it does not share with others of its kind, `media` counts the images and the
-    pairs of a clip's frames that it shows: both tell how long it is.
+    pairs of a clip's frames that it shows: both tell how long it is. `family` is the item's, None
+    where it is none.
     """
 
     text: str
     media: int
     make: Callable[[int], Sample]
+    family: str | None = None
 
 
 class Samples(Dataset):
@@ -44,6 +46,10 @@ class Samples(Dataset):
 
     def __getitem__(self, index: int) -> Sample:
         return self._planned[index].make(self.epoch)
+
+    @property
+    def families(self) -> list[str | None]:
+        return [p.family for p in self._planned]
 
     def lengths(self, tokenizer: PreTrainedTokenizerBase, image_size: int) -> list[int]:
         """About how many tokens each sample has, without making it."""

@@ -71,7 +71,8 @@ class Supervised:
 
     def planned(self, frames: Frames, cfg: StudentConfig) -> Planned:
         media = cfg.frames // 2 + len(LETTERS)
-        return Planned(self.text(), media, partial(self.sample, frames, cfg))
+        make = partial(self.sample, frames, cfg)
+        return Planned(self.text(), media, make, self.item.family)
 
 
 def held_out_scenes(store: Store) -> set[str]:

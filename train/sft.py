@@ -67,16 +67,16 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
             per_device_eval_batch_size=cfg.train.micro_batch,
             label_names=["labels"],
         ),
-        data_collator=collator,
+        data_collator=collator.named,
         train_dataset=training,
         eval_dataset=validation,
         compute_loss_func=token_mean,
-        preprocess_logits_for_metrics=choice.shrink,
-        compute_metrics=choice.accuracy,
         callbacks=[Epochs(training, order)],
         order=order,
+        choice=choice,
     )
-    loop.train_and_log(trainer, run, checkpoint)
+    lower = "train.micro_batch and raise train.accumulation by as much"
+    loop.train_and_log(trainer, run, checkpoint, lower)
     backbone.save(model, processor, run.folder / "student", cfg.train.precision)
     log.info("the student is in %s", run.folder / "student")
     return loop.evaluated(run.folder)

@@ -3,13 +3,19 @@ of samples and of their candidates in an epoch, and the measure of the answer's 
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from torch.nn import Module
 from torch.nn.functional import cross_entropy
+from torch.utils.data import DataLoader
 from transformers import EvalPrediction, Trainer, TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
 
+from conf.errors import UserError
+from conf.runs import write_json
 from train.collate import IGNORED
 from train.planned import ByLength, Samples
 
@@ -29,15 +35,48 @@ def token_mean(
     return total / count
 
 
-class StudentTrainer(Trainer):
-    """A Trainer whose micro-batches are made of samples of about one length."""
+STOPPED = "stopped.json"
+"""Names the samples whose loss was no number."""
 
-    def __init__(self, *args: Any, order: ByLength, **settings: Any) -> None:
-        super().__init__(*args, **settings)
+
+class StudentTrainer(Trainer):
+    """A Trainer that takes its samples in an `order` of ours, measures an evaluation by a `choice`
+    that is told the samples, and stops where a loss is no number."""
+
+    def __init__(
+        self, *args: Any, order: ByLength, choice: TokenChoice | LetterChoice, **settings: Any
+    ) -> None:
+        super().__init__(
+            *args,
+            preprocess_logits_for_metrics=choice.shrink,
+            compute_metrics=lambda prediction: choice.measure(prediction, self._measured),
+            **settings,
+        )
         self._order = order
 
     def _get_train_sampler(self, *_: Any) -> ByLength:
         return self._order
+
+    def evaluation_loop(self, dataloader: DataLoader, *args: Any, **settings: Any) -> Any:
+        self._measured: Samples = dataloader.dataset
+        return super().evaluation_loop(dataloader, *args, **settings)
+
+    def compute_loss(
+        self, model: Module, inputs: dict[str, Any], return_outputs: bool = False, **settings: Any
+    ) -> Any:
+        """Raises UserError for a loss that is no number; the samples' ids are then in a file."""
+        ids = inputs.pop("sample_ids")
+        found = super().compute_loss(model, inputs, return_outputs, **settings)
+        loss = found[0] if return_outputs else found
+        if not torch.isfinite(loss):
+            step, path = self.state.global_step, Path(self.args.output_dir) / STOPPED
+            write_json(path, {"step": step, "loss": str(loss.item()), "samples": ids})
+            raise UserError(
+                f"the loss is {loss.item()} after step {step}; {path} names the samples. A lower "
+                "train.lr or train.precision=fp32 may help; what was trained up to the last "
+                "checkpoint is kept"
+            )
+        return found
 
 
 class Epochs(TrainerCallback):
@@ -64,7 +103,7 @@ class TokenChoice:
         return torch.stack([right, (following != IGNORED).sum(dim=-1)], dim=-1)
 
     @staticmethod
-    def accuracy(prediction: EvalPrediction) -> dict[str, float]:
+    def measure(prediction: EvalPrediction, samples: Samples) -> dict[str, float]:
         right, counted = prediction.predictions.sum(axis=0)
         return {"token_accuracy": float(right / counted)}
 
@@ -92,6 +131,12 @@ class LetterChoice:
         return torch.stack([chosen, right], dim=-1)
 
     @staticmethod
-    def accuracy(prediction: EvalPrediction) -> dict[str, float]:
-        chosen, right = prediction.predictions[:, 0], prediction.predictions[:, 1]
-        return {"letter_accuracy": float((chosen == right).mean())}
+    def measure(prediction: EvalPrediction, samples: Samples) -> dict[str, float]:
+        """The share of right letters, and that of each family's samples."""
+        right = prediction.predictions[:, 0] == prediction.predictions[:, 1]
+        families = np.asarray(samples.families)
+        by_family = {
+            f"letter_accuracy_{family}": float(right[families == family].mean())
+            for family in sorted(set(samples.families))
+        }
+        return {"letter_accuracy": float(right.mean()), **by_family}

@@ -138,6 +138,15 @@ def test_the_letters_logits_choose_the_answer(
     chosen, right = LetterChoice(letters).shrink(logits, labels).T
     assert right.tolist() == [i.answer for i in items]
     assert (chosen == right).tolist() == [False] + [True] * 5
+    measured = Samples(
+        [Planned("", 0, lambda epoch: None, f) for f in ("event",) * 4 + ("time",) * 2]
+    )
+    told = LetterChoice.measure(
+        EvalPrediction(torch.stack([chosen, right], dim=1).numpy(), None), measured
+    )
+    assert told == {
+        "letter_accuracy": 5 / 6, "letter_accuracy_event": 3 / 4, "letter_accuracy_time": 1.0
+    }  # fmt: skip
 
 
 def test_controls_reach_the_prompt(micro_store, frames, student_cfg, processor) -> None:
@@ -183,5 +192,5 @@ def test_the_right_tokens_are_counted() -> None:
     counts = TokenChoice.shrink(logits, labels)
     # A position's logits tell the next one's token; what is not supervised is not counted.
     assert counts.tolist() == [[2, 3], [2, 2]]
-    told = TokenChoice.accuracy(EvalPrediction(counts.numpy(), None))
+    told = TokenChoice.measure(EvalPrediction(counts.numpy(), None), Samples([]))
     assert told["token_accuracy"] == pytest.approx(4 / 5)
