@@ -56,8 +56,11 @@ def curves_figure(records: Sequence[dict[str, float]], path: Path | str) -> None
 
 
 def _style(index: int) -> dict[str, object]:
-    color = COLORS[index % len(COLORS)]
-    return {"color": color, "linewidth": 1.8, "marker": "o", "markersize": 4}
+    cycle, color = divmod(index, len(COLORS))
+    line = ("-", ":", "--")[cycle % 3]
+    return {
+        "color": COLORS[color], "linestyle": line, "linewidth": 1.8, "marker": "o", "markersize": 4
+    }  # fmt: skip
 
 
 def _name(key: str) -> str:
