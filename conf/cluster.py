@@ -37,9 +37,9 @@ class SubmititLauncher(ProcessLauncher):
 
     def run(self, children: list[Child]) -> Iterator[tuple[Child, int | None, float | None]]:
         left = list(zip(children, self._submit(children), strict=True)) if children else []
-        for child, job in left:
-            log.info("%s: handed to %s as job %s", child.title, self.cluster, job.job_id)
         try:
+            for child, job in left:
+                log.info("%s: handed to %s as job %s", child.title, self.cluster, job.job_id)
             while left:
                 for child, job in [(child, job) for child, job in left if job.done()]:
                     left.remove((child, job))

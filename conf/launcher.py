@@ -185,6 +185,8 @@ def _record(child: Child, status: str, seconds: float | None) -> None:
         before = json.loads(path.read_text())
         # How long it took is known where this sweep ran it before.
         now["seconds"] = before["seconds"] if before["status"] == status else None
+    # A job that a cluster never started has no folder.
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, now)
 
 

@@ -42,6 +42,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from train.samples import held_out_scenes, shuffled
 
     backbone.keep_big_blocks()
+    loop.keep_to_one_gpu()
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
     frames = Frames(store, cfg.retriever.image_size)

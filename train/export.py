@@ -130,7 +130,7 @@ def renamed_when_whole(folder: Path) -> Iterator[Path]:
     partial.mkdir(exist_ok=True)
     with held(partial, folder):
         for leftover in partial.iterdir():
-            leftover.unlink()
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         try:
             yield partial
         except (UserError, KeyboardInterrupt):
@@ -143,8 +143,7 @@ def write_adapter(trained: Trained, folder: Path) -> Measured:
     """Copy the adapters and the processor, and the hash of the base that they were trained over."""
     from train.backbone import BASE
 
-    for path in trained.student.iterdir():
-        shutil.copy(path, folder)
+    shutil.copytree(trained.student, folder, dirs_exist_ok=True)
     if (trained.folder / BASE).exists():
         shutil.copy(trained.folder / BASE, folder)
     return {}

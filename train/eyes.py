@@ -33,8 +33,8 @@ MATCH = (
 ASKED = (FRAME, CLIP, LATER, MATCH)
 FRAMES = 4
 """Frames described for each item in an epoch."""
-HALF_SECOND = 12
-"""Frames at least between two of which one is the later: what has not moved tells nothing."""
+MOVED = 0.08
+"""Share of the view's width by which an object has moved in the later of two frames, at least."""
 HIDDEN = 0.05
 """Share of an object's pixels under which it is not said to be seen."""
 NAMED = 4
@@ -42,15 +42,15 @@ NAMED = 4
 
 
 def kinds(
-    store: Store, scenes: set[str], cfg: StudentConfig, frames: Frames, seed: int
+    store: Store, items: list[SelectionItem], cfg: StudentConfig, frames: Frames, seed: int
 ) -> dict[str, list[Planned]]:
-    """Samples of each kind from the training items of some scenes; an epoch chooses anew."""
-    items = [item for item in store.selection("train") if item.scene_id in scenes]
+    """Samples of each kind from some items. Which frame is described or is the later, and the
+    order of the two, is another in each epoch."""
     make = _Maker(store, cfg, frames, seed)
     return {
         "frame": [make.frame(item, k) for item in items for k in range(FRAMES)],
         "clip": [clip for item in items for clip in make.clips(item)],
-        "later": [make.later(item) for item in items],
+        "later": [later for item in items for later in make.later(item)],
         "match": [match for item in items for match in make.matched(item)],
     }
 
@@ -93,15 +93,16 @@ class _Maker:
         later = ["Later: ", pixels, "\n"] if shown else []
         return self._after_prefix(item, [*later, CLIP], text)
 
-    def later(self, item: SelectionItem) -> Planned:
-        text = f"{LATER} {answer_line(LETTERS[0])}"
-        return Planned(text, self.cfg.frames // 2 + 2, partial(self._later, item))
+    def later(self, item: SelectionItem) -> Iterator[Planned]:
+        """Two frames that can be told apart, where something still moves after the prefix."""
+        after = moved(self.store.scene(item.scene_id), item.prefix_stop)
+        if after:
+            text = f"{LATER} {answer_line(LETTERS[0])}"
+            yield Planned(text, self.cfg.frames // 2 + 2, partial(self._later, item, after))
 
-    def _later(self, item: SelectionItem, epoch: int) -> Sample:
+    def _later(self, item: SelectionItem, after: list[int], epoch: int) -> Sample:
         rng = rng_of(self.seed, epoch, item.item_id, "later")
-        last = self.store.scene(item.scene_id).frames - 1
-        soonest = min(item.prefix_stop + HALF_SECOND, last)
-        first, second = item.prefix_stop, int(rng.integers(soonest, last + 1))
+        first, second = item.prefix_stop, after[rng.integers(len(after))]
         order = rng.permutation(2)
         parts: list[str | np.ndarray] = []
         for letter, k in zip(LETTERS, order, strict=False):
@@ -136,7 +137,7 @@ class _Maker:
     ) -> Sample:
         scene, shown = self.store.scene(item.scene_id), self._prefix(item)
         clip = Clip(self.frames.stack(item.scene_id, shown), shown, scene.fps, scene.frames)
-        return conversation(f"{item.item_id} (clip)", parts, told, clip)
+        return conversation(f"{item.item_id} (clip and frames)", parts, told, clip)
 
     def _prefix(self, item: SelectionItem) -> list[int]:
         return shown_frames(item.prefix_start, item.prefix_stop, self.cfg.frames)
@@ -152,6 +153,14 @@ def account(scene: Scene, frame: int) -> str:
     ]
     told = [f"The {phrase} is {places[place]}." for place, phrase in sorted(seen)]
     return " ".join(told) or "No object is in view."
+
+
+def moved(scene: Scene, start: int) -> list[int]:
+    """The frames after `start` in which an object in view has moved by a good piece."""
+    way = scene.image_positions[start + 1 :] - scene.image_positions[start]
+    far = np.hypot(*np.moveaxis(way, -1, 0)) > MOVED * scene.image_size[0]
+    seen = scene.in_view[start + 1 :] & scene.in_view[start]
+    return (start + 1 + np.flatnonzero((far & seen).any(axis=1))).tolist()
 
 
 def _plain(predicates: Predicates) -> Predicates | None:

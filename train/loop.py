@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import re
 from dataclasses import fields
 from pathlib import Path
@@ -21,6 +22,7 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.entry import Run
 from conf.errors import UserError
+from conf.processes import visible_gpus
 from conf.runs import write_text
 from conf.schema import TrainConfig
 from conf.sweep import AT_START
@@ -84,6 +86,15 @@ def checkpointing(train: TrainConfig) -> dict[str, Any]:
     return {name: True, f"{name}_kwargs": {"use_reentrant": False}}
 
 
+def keep_to_one_gpu() -> None:
+    """See the first GPU alone where no launcher has started several ranks: the trainer would spread
+    each micro-batch over all of them, and train on more samples a step than the settings say."""
+    gpus = visible_gpus()
+    if len(gpus) > 1 and "LOCAL_RANK" not in os.environ:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[0]
+        log.info("training on GPU %s of %d; several take accelerate launch", gpus[0], len(gpus))
+
+
 def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: str) -> None:
     """Train from the start or a checkpoint, writing the journal and the curves.
 
@@ -97,7 +108,11 @@ def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: st
     if checkpoint is not None:
         log.info("going on from %s", checkpoint)
     try:
-        trainer.train(resume_from_checkpoint=str(checkpoint) if checkpoint else None)
+        if checkpoint is not None and is_last(checkpoint):
+            # The trainer would take a step more.
+            trainer._load_from_checkpoint(str(checkpoint))
+        else:
+            trainer.train(resume_from_checkpoint=str(checkpoint) if checkpoint else None)
     except RuntimeError as error:
         if not is_out_of_memory(error):
             raise
@@ -106,6 +121,12 @@ def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: st
             "train.gradient_checkpointing=true, in a run of its own (run=NAME)"
         ) from error
     curves_figure(read_journal(run.folder), run.folder / "curves.png")
+
+
+def is_last(checkpoint: Path) -> bool:
+    """Whether a checkpoint is that of a run's last step."""
+    state = json.loads((checkpoint / "trainer_state.json").read_text())
+    return state["global_step"] >= state["max_steps"]
 
 
 def is_out_of_memory(error: RuntimeError) -> bool:
@@ -191,6 +212,7 @@ def newest_checkpoint(folder: Path) -> Path | None:
         try:
             json.loads((path / "trainer_state.json").read_text())
         except (OSError, ValueError):
+            log.warning("%s was cut off: going on from the one before it", path)
             continue
         return path
     return None

@@ -14,8 +14,6 @@ from train.conversation import Sample
 
 TOKEN, STAMP = 32, 8
 """Side in px of the square that a token shows, and tokens about each piece of media."""
-BLOCK = 32
-"""Micro-batches of samples that are sorted by length together."""
 
 
 @dataclass(frozen=True)
@@ -60,12 +58,13 @@ class Samples(Dataset):
 
 
 class ByLength(Sampler[int]):
-    """All samples in a random order of each epoch, those of a micro-batch of about one length, so
-    that little of it is padding."""
+    """All samples in a random order of each epoch, those of a step sorted by length, so that little
+    of a micro-batch is padding. What a step holds does not hang on how it is split."""
 
-    def __init__(self, lengths: Sequence[int], micro_batch: int, seed: int) -> None:
+    def __init__(self, lengths: Sequence[int], batch: int, seed: int) -> None:
+        """`batch`: samples of a step, over all its micro-batches."""
         self._lengths = np.asarray(lengths)
-        self._micro_batch = micro_batch
+        self._batch = batch
         self._seed = seed
         self._epoch = 0
 
@@ -78,19 +77,10 @@ class ByLength(Sampler[int]):
     def __iter__(self) -> Iterator[int]:
         rng = np.random.default_rng([self._seed, self._epoch])
         order = rng.permutation(len(self._lengths))
-        block = BLOCK * self._micro_batch
-        batches: list[np.ndarray] = []
-        for start in range(0, len(order), block):
-            part = order[start : start + block]
-            part = part[np.argsort(self._lengths[part], kind="stable")]
-            batches += np.split(part, range(self._micro_batch, len(part), self._micro_batch))
-        # A short one anywhere but at the end would shift all that follow it.
-        whole = [b for b in batches if len(b) == self._micro_batch]
-        rest = [b for b in batches if len(b) < self._micro_batch]
-        for k in rng.permutation(len(whole)):
-            yield from whole[k].tolist()
-        for part in rest:
-            yield from part.tolist()
+        for start in range(0, len(order), self._batch):
+            step = order[start : start + self._batch]
+            # The longest come first, so that what memory they take is known at the start.
+            yield from step[np.argsort(-self._lengths[step], kind="stable")].tolist()
 
 
 def rng_of(*keys: int | str) -> np.random.Generator:

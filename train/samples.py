@@ -88,6 +88,11 @@ def held_out_scenes(store: Store) -> set[str]:
     return set(names[: max(1, round(HELD_OUT * len(names)))])
 
 
+def shows_only(item: SelectionItem, scenes: set[str]) -> bool:
+    """Whether all that an item shows is of these scenes."""
+    return {item.scene_id, *(c.scene_id for c in item.candidates)} <= scenes
+
+
 def shuffled(rows: list[Row], seed: int) -> list[Row]:
     """The rows in a seeded order."""
     return [rows[k] for k in np.random.default_rng([seed, 2]).permutation(len(rows))]
@@ -127,20 +132,24 @@ def splits(
     held_out = held_out_scenes(store)
     others = set(store.scene_ids("train")) - held_out
     limit = cfg.train.validation_items
+    items = store.selection("train")
+    # A training item may show, among its candidates, no frame of what measures the run.
+    trained = [item for item in items if shows_only(item, others)]
     if cfg.train.regime == "describe":
-        told = eyes.kinds(store, others, cfg.student, frames, cfg.seed)
-        kept = eyes.kinds(store, held_out, cfg.student, frames, cfg.seed)
+        kept = [item for item in items if shows_only(item, held_out)]
+        told, measuring = (
+            eyes.kinds(store, part, cfg.student, frames, cfg.seed) for part in (trained, kept)
+        )
         return Samples([sample for made in told.values() for sample in made]), {
-            kind: Samples(shuffled(made, cfg.seed)[:limit]) for kind, made in kept.items()
+            kind: Samples(shuffled(made, cfg.seed)[:limit])
+            for kind, made in measuring.items()
+            if made
         }
     by_item = {r.item_id: r for r in rationales}
-    items = store.selection("train")
     # The items of every family stand together: a shuffled slice measures all of them.
     kept = shuffled([i for i in items if i.scene_id in held_out], cfg.seed)[:limit]
     seed = cfg.seed if cfg.train.permute_candidates else None
-    training = supervised_items(
-        store, [i for i in items if i.scene_id in others], by_item, cfg.train, seed
-    )
+    training = supervised_items(store, trained, by_item, cfg.train, seed)
     validation = supervised_items(store, kept, by_item, cfg.train, None)
 
     def planned(supervised: list[Supervised]) -> list[Planned]:

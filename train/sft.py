@@ -36,6 +36,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from train.sft_trainer import Epochs, LetterChoice, StudentTrainer, TokenChoice, token_mean
 
     backbone.keep_big_blocks()
+    loop.keep_to_one_gpu()
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
     log.info("loading student %s", cfg.student.name)
@@ -53,7 +54,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
     longest = training[lengths.index(max(lengths))]
     log.info(audit(model, processor, cfg.student, longest, collator))
-    order = ByLength(lengths, cfg.train.micro_batch, cfg.seed)
+    order = ByLength(lengths, cfg.train.micro_batch * cfg.train.accumulation, cfg.seed)
 
     # Descriptions end in no answer whose letter could be measured.
     describes = cfg.train.regime == "describe"

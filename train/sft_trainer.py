@@ -125,9 +125,12 @@ class LetterChoice:
         The letter is the last supervised token but one, before the end of the turn.
         """
         letters = self._letters.to(logits.device)
-        position = labels.shape[1] - 2
-        chosen = logits[:, position - 1, letters].argmax(dim=-1)
-        right = (labels[:, position, None] == letters).int().argmax(dim=-1)
+        places = torch.arange(labels.shape[1], device=labels.device)
+        # Several ranks pad their batches on the right to one width.
+        letter = torch.where(labels != IGNORED, places, 0).amax(dim=1) - 1
+        rows = torch.arange(len(labels), device=labels.device)
+        chosen = logits[rows, letter - 1][:, letters].argmax(dim=-1)
+        right = (labels[rows, letter, None] == letters).int().argmax(dim=-1)
         return torch.stack([chosen, right], dim=-1)
 
     @staticmethod

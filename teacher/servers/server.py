@@ -20,6 +20,10 @@ NO_REPLY = (AttributeError, IndexError, TypeError, ValueError)
 """What the client raises at a reply that is not of the API's form."""
 
 
+BUSY = (408, 409)
+"""Statuses below 500 that another try may change: a timeout on the way, a conflict."""
+
+
 class RequestError(Exception):
     """A request without an answer."""
 
@@ -85,6 +89,8 @@ class Server:
         except openai.InternalServerError as error:
             raise RequestError(f"HTTP {error.status_code}") from error
         except openai.APIStatusError as error:
+            if error.status_code in BUSY:
+                raise RequestError(f"HTTP {error.status_code}") from error
             raise RefusedError(error.message) from error
         except (openai.APITimeoutError, TimeoutError) as error:
             raise RequestError(

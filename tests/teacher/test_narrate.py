@@ -172,7 +172,15 @@ def test_half_of_a_surrogate_pair_is_no_trouble(store, odd):
 
 @pytest.mark.parametrize(
     "fault",
-    ["reset", "hang", 500, b'{"choices": [{"message": {"content": "\xff\xfe"}}]}', b"<html>", b"{"],
+    [
+        "reset",
+        "hang",
+        500,
+        408,
+        b'{"choices": [{"message": {"content": "\xff\xfe"}}]}',
+        b"<html>",
+        b"{",
+    ],
 )
 def test_a_request_that_fails_is_asked_again(store, odd, fault):
     server = odd(fault)

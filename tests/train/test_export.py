@@ -153,7 +153,8 @@ def test_it_says_the_same_where_only_transformers_is(
     """Against the trained student itself, the adapters over their 4-bit base."""
     item = micro_store.selection("test")[0]
     sample = selection_sample(item, "answer", "cot", frames, settings.student)
-    given = {name: getattr(sample, name) for name in ("content", "images", "video", "metadata")}
+    given = {"content": sample.content, "images": sample.images}
+    given |= {"video": sample.clip.pixels, "metadata": sample.clip.metadata}
     torch.save(given, tmp_path / "asked.pt")
     arguments = [forms["fp32"][1], tmp_path / "asked.pt", tmp_path / "said.pt"]
     subprocess.run(

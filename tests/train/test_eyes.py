@@ -15,8 +15,7 @@ from train.planned import Planned
 
 @pytest.fixture
 def kinds(micro_store, frames, student_cfg) -> dict[str, list[Planned]]:
-    scenes = set(micro_store.scene_ids("train"))
-    return eyes.kinds(micro_store, scenes, student_cfg, frames, 0)
+    return eyes.kinds(micro_store, micro_store.selection("train"), student_cfg, frames, 0)
 
 
 def shown(store: Store, scene_id: str, frame: int) -> dict[str, str]:
@@ -71,8 +70,9 @@ def test_the_later_frame_is_the_answer(frames, kinds) -> None:
             assert len(sample.images) == 2
             letters.add(sample.response)
             wrong = sample.images[sample.response == "Answer: A"]
-            # The earlier one is the clip's last frame.
+            # The earlier one is the clip's last frame, and the two can be told apart.
             assert (wrong == sample.clip.pixels[-1]).all()
+            assert not (sample.images[0] == sample.images[1]).all()
     assert letters == {"Answer: A", "Answer: B"}
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.entry import Run
 from conf.errors import UserError
@@ -19,9 +20,11 @@ from conf.schema import (
     SftTrainConfig,
     TeacherConfig,
 )
-from train import contrastive, sft
+from train import contrastive, samples, sft
 from train.backbone import check_base, note_base
 from train.loop import newest_checkpoint, read_journal
+from train.planned import ByLength, Samples
+from train.sft_trainer import Epochs
 
 
 def common(micro, store) -> dict:
@@ -47,18 +50,20 @@ def contrastive_settings(micro, micro_store, retriever_cfg) -> ContrastiveComman
     return ContrastiveCommand(**common(micro, micro_store), retriever=retriever_cfg, train=train)
 
 
-def train_twice(main, settings, folder: Path) -> tuple[Path, Path]:
-    """An undisturbed run, and one that goes on from the first's middle checkpoint."""
+def train_twice(main, settings, folder: Path, step: int = 2) -> tuple[Path, Path]:
+    """An undisturbed run, and one that goes on from the first's checkpoint of a step."""
     whole, killed = folder / "whole", folder / "killed"
     whole.mkdir()
     main.__wrapped__(settings, Run("whole", whole))
     killed.mkdir()
-    shutil.copytree(whole / "checkpoint-2", killed / "checkpoint-2")
+    kept = killed / f"checkpoint-{step}"
+    shutil.copytree(whole / kept.name, kept)
     # What a kill leaves: a checkpoint without its state, and a journal past the whole one.
-    (killed / "checkpoint-3").mkdir()
-    (killed / "checkpoint-3" / "trainer_state.json").write_text("{")
+    torn = killed / f"checkpoint-{step + 1}"
+    torn.mkdir()
+    (torn / "trainer_state.json").write_text("{")
     shutil.copy(whole / "metrics.jsonl", killed / "metrics.jsonl")
-    assert newest_checkpoint(killed) == killed / "checkpoint-2"
+    assert newest_checkpoint(killed) == kept
     main.__wrapped__(settings, Run("killed", killed))
     return whole, killed
 
@@ -84,6 +89,48 @@ def test_a_student_goes_on_as_if_undisturbed(sft_settings, tmp_path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("steps", "step"), [(4, 2), (6, 3)], ids=["at a border", "within"])
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_student_goes_on_within_a_later_epoch(
+    sft_settings, tmp_path, monkeypatch, steps, step, workers
+) -> None:
+    """Six samples are two steps an epoch, in each of which candidates stand otherwise."""
+    make = samples.supervised_items
+    few = {"reasoning": 3, "answer": 3}
+
+    def fewer(*arguments):
+        return {mode: made[: few[mode]] for mode, made in make(*arguments).items()}
+
+    shown: dict[str, set[str]] = {}
+    ask = samples.selection_sample
+
+    def noted(item, mode, regime, frames, cfg, response):
+        shown.setdefault(f"{item.item_id} {mode}", set()).add(item.letter)
+        return ask(item, mode, regime, frames, cfg, response)
+
+    monkeypatch.setattr(samples, "supervised_items", fewer)
+    monkeypatch.setattr(samples, "selection_sample", noted)
+    train = replace(sft_settings.train, max_steps=steps, workers=workers)
+    whole, killed = train_twice(sft.main, replace(sft_settings, train=train), tmp_path, step)
+    same_weights(*(f / "student" / "adapter_model.safetensors" for f in (whole, killed)))
+    same_journals(whole, killed)
+    # Another process makes the samples where there are workers.
+    assert workers or max(map(len, shown.values())) > 1
+
+
+def test_each_epoch_reaches_the_samples_and_their_order() -> None:
+    """As the trainer tells it: at an epoch's start, and within one that is gone on with."""
+    training, order = Samples([]), ByLength(range(100), 4, seed=0)
+    orders = []
+    for told, epoch in ((None, 0), (1.0, 1), (1.4, 1), (2.0, 2)):
+        Epochs(training, order).on_epoch_begin(None, TrainerState(epoch=told), TrainerControl())
+        assert training.epoch == epoch
+        orders.append(list(order))
+    assert orders[1] == orders[2]
+    assert orders[0] != orders[1] != orders[3]
+
+
+@pytest.mark.slow
 def test_a_token_weighs_the_same_however_a_batch_is_split(sft_settings, tmp_path) -> None:
     """The first step's loss and gradient of four unequal samples, at once and one by one."""
     first = []
@@ -96,6 +143,23 @@ def test_a_token_weighs_the_same_however_a_batch_is_split(sft_settings, tmp_path
         first.append(next(r for r in read_journal(run.folder) if "grad_norm" in r))
     assert first[0]["loss"] == pytest.approx(first[1]["loss"], rel=1e-4)
     assert first[0]["grad_norm"] == pytest.approx(first[1]["grad_norm"], rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_run_killed_after_its_last_step_takes_no_other(sft_settings, tmp_path) -> None:
+    """Its student was not yet written; the schedule would move the weights by another step."""
+    train = replace(sft_settings.train, schedule="constant", warmup=0.0, max_steps=2)
+    settings = replace(sft_settings, train=train)
+    run = Run("run", tmp_path)
+    sft.main.__wrapped__(settings, run)
+    weights, journal = tmp_path / "student" / "adapter_model.safetensors", read_journal(tmp_path)
+    kept = load_file(weights)
+    shutil.rmtree(tmp_path / "student")
+    sft.main.__wrapped__(settings, run)
+    assert read_journal(tmp_path) == journal
+    again = load_file(weights)
+    assert all(torch.equal(again[name], weight) for name, weight in kept.items())
+    assert newest_checkpoint(tmp_path).name == "checkpoint-2"
 
 
 def test_a_run_holds_to_its_base(saved_base, tmp_path) -> None:

@@ -1,9 +1,11 @@
-"""What cannot be gone on with ends in a sentence that says what to do."""
+"""What a run must not do: train on what measures it or on other GPUs, or go on where it cannot."""
 
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -11,7 +13,10 @@ import torch
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import SftCommand, SftTrainConfig
-from train import sft
+from data.records import SelectionItem
+from data.store import Store
+from train import loop, samples, sft
+from train.samples import shows_only, splits
 
 
 @pytest.fixture
@@ -48,3 +53,47 @@ def test_too_little_memory_is_told_with_the_key_to_lower(settings, tmp_path, mon
     monkeypatch.setattr("train.sft_trainer.token_mean", greedy)
     with pytest.raises(UserError, match=r"out of memory after step 0: lower train\.micro_batch"):
         sft.main.__wrapped__(settings, Run("run", tmp_path))
+
+
+class OneMore:
+    """A store with one more training item."""
+
+    def __init__(self, store: Store, item: SelectionItem) -> None:
+        self.store, self.item = store, item
+
+    def selection(self, split: str) -> list[SelectionItem]:
+        return [*self.store.selection(split), self.item]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.store, name)
+
+
+@pytest.mark.parametrize("regime", ["answer_only", "describe"])
+def test_nothing_is_trained_on_that_shows_a_held_out_scene(
+    settings, micro_store, frames, regime
+) -> None:
+    held_out = samples.held_out_scenes(micro_store)
+    others = set(micro_store.scene_ids("train")) - held_out
+    item = next(i for i in micro_store.selection("train") if shows_only(i, others))
+    stranger = replace(item.candidates[item.answer - 1], scene_id=next(iter(held_out)))
+    candidates = list(item.candidates)
+    candidates[item.answer - 1] = stranger
+    crossed = replace(item, item_id="crossed", candidates=tuple(candidates))
+    told = replace(settings, train=replace(settings.train, regime=regime))
+    plain, _ = splits(micro_store, [], told, frames)
+    more, _ = splits(OneMore(micro_store, crossed), [], told, frames)
+    again, _ = splits(OneMore(micro_store, replace(item, item_id="again")), [], told, frames)
+    assert len(plain) == len(more) < len(again)
+
+
+@pytest.mark.parametrize(
+    ("visible", "rank", "kept"),
+    [("2,3", None, "2"), ("1", None, "1"), ("", None, ""), ("2,3", "0", "2,3")],
+)
+def test_a_run_keeps_to_one_gpu_unless_ranks_were_started(monkeypatch, visible, rank, kept) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    monkeypatch.delenv("LOCAL_RANK", raising=False)
+    if rank is not None:
+        monkeypatch.setenv("LOCAL_RANK", rank)
+    loop.keep_to_one_gpu()
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == kept
