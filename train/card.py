@@ -78,8 +78,7 @@ def _training(settings: SftCommand, folder: Path) -> Iterable[tuple[str, str]]:
         yield "teacher", f"{teacher.name}{f' ({teacher.model})' if teacher.model else ''}"
     yield "frames", f"{student.frames} a prefix, {student.image_size} x {student.image_size} px"
     length = f"{train.epochs:g} epochs" if train.max_steps == -1 else f"{train.max_steps} steps"
-    batch = train.micro_batch * train.accumulation
-    yield "length", f"{length} of {batch} samples a step"
+    yield "length", f"{length} of {train.batch} samples a step"
     yield "learning rate", f"{train.lr:g}, {train.schedule}"
     yield "precision", train.precision
     yield "seed", str(settings.seed)

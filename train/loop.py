@@ -56,7 +56,6 @@ def arguments(train: TrainConfig, run: Run, seed: int, checkpoint: Path | None) 
         "max_grad_norm": train.max_grad_norm,
         "num_train_epochs": train.epochs,
         "max_steps": train.max_steps,
-        "gradient_accumulation_steps": train.accumulation,
         "bf16": train.precision == "bf16",
         "use_cpu": not torch.cuda.is_available(),
         **checkpointing(train),

@@ -54,7 +54,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
     longest = training[lengths.index(max(lengths))]
     log.info(audit(model, processor, cfg.student, longest, collator))
-    order = ByLength(lengths, cfg.train.micro_batch * cfg.train.accumulation, cfg.seed)
+    order = ByLength(lengths, cfg.train.batch, cfg.seed)
 
     # Descriptions end in no answer whose letter could be measured.
     describes = cfg.train.regime == "describe"
@@ -65,6 +65,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         args=TrainingArguments(
             **loop.arguments(cfg.train, run, cfg.seed, checkpoint),
             per_device_train_batch_size=cfg.train.micro_batch,
+            gradient_accumulation_steps=cfg.train.batch // cfg.train.micro_batch,
             per_device_eval_batch_size=cfg.train.micro_batch,
             label_names=["labels"],
         ),
@@ -76,7 +77,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         order=order,
         choice=choice,
     )
-    lower = "train.micro_batch and raise train.accumulation by as much"
+    lower = "train.micro_batch"
     loop.train_and_log(trainer, run, checkpoint, lower)
     backbone.save(model, processor, run.folder / "student", cfg.train.precision)
     log.info("the student is in %s", run.folder / "student")

@@ -23,8 +23,6 @@ class TrainConfig:
     epochs: float = 3.0
     max_steps: int = -1
     """Optimizer steps; -1 leaves it to `epochs`."""
-    micro_batch: int = 1
-    accumulation: int = 16
     precision: str = "bf16"
     """bf16 or fp32: what the passes compute in; adapters and optimizer stay fp32."""
     gradient_checkpointing: bool = True
@@ -45,8 +43,6 @@ class TrainConfig:
                 "warmup": 0,
                 "weight_decay": 0,
                 "max_grad_norm": 0,
-                "micro_batch": 1,
-                "accumulation": 1,
                 "evaluations": 1,
                 "keep": 1,
                 "workers": 0,
@@ -74,13 +70,23 @@ class SftTrainConfig(TrainConfig):
     """What a student writes: cot (the rationale, whether each candidate matches it, the answer),
     cot_no_candidate_analysis, cot_no_match_layout, answer_only, or describe (the recipe of the
     tiny base)."""
+    batch: int = 16
+    """Samples a step, over all its micro-batches and ranks."""
+    micro_batch: int = 1
+    """Samples that pass the model at once; moves memory and time, not what is learnt."""
     permute_candidates: bool = False
     """Whether each epoch shows every item's candidates in an order of its own."""
     validation_items: int = 64
     """Training-split items of held-out training scenes that measure the run."""
 
     def check(self) -> list[str]:
-        problems = super().check() + too_small(self, "train.", {"validation_items": 1})
+        problems = super().check() + too_small(
+            self, "train.", {"batch": 1, "micro_batch": 1, "validation_items": 1}
+        )
+        if self.batch % max(1, self.micro_batch):
+            problems.append(
+                f"train.micro_batch={self.micro_batch} must divide train.batch={self.batch}"
+            )
         if self.regime not in REGIMES:
             problems.append(f"train.regime={self.regime}: the options are {', '.join(REGIMES)}")
         if self.permute_candidates and self.regime == "describe":
@@ -108,16 +114,6 @@ class ContrastiveTrainConfig(TrainConfig):
         problems = super().check() + too_small(
             self, "train.", {"hard_negatives": 0, "validation_queries": 1}
         )
-        if self.accumulation != 1:
-            problems.append(
-                f"train.accumulation={self.accumulation}: the cached loss already splits "
-                "train.batch into train.mini_batch, leave train.accumulation=1"
-            )
-        if self.micro_batch != 1:
-            problems.append(
-                f"train.micro_batch={self.micro_batch}: a retriever's step is train.batch queries, "
-                "of which train.mini_batch pass the model at once; leave train.micro_batch=1"
-            )
         if self.scale <= 0:
             problems.append(f"train.scale={self.scale} must be above 0")
         if not 1 <= self.mini_batch <= self.batch:

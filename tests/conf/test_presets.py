@@ -53,9 +53,9 @@ def test_a_file_names_a_command_that_composes_it(path):
 def test_a_student_brings_its_recipe():
     tiny = settings("python -m train.sft")
     paper = settings("python -m train.sft student=qwen3_vl_8b")
-    assert (tiny.train.lr, tiny.train.micro_batch, tiny.train.accumulation) == (2e-3, 8, 2)
+    assert (tiny.train.lr, tiny.train.batch, tiny.train.micro_batch) == (2e-3, 16, 8)
     assert tiny.train.regime == "cot"
-    assert (paper.train.lr, paper.train.micro_batch, paper.train.accumulation) == (2e-5, 1, 16)
+    assert (paper.train.lr, paper.train.batch, paper.train.micro_batch) == (2e-5, 16, 1)
     assert (paper.train.epochs, paper.train.precision) == (3, "bf16")
     assert (paper.student.lora.rank, paper.student.lora.alpha) == (16, 32)
     assert (paper.student.frames, paper.student.image_size, paper.student.max_length) == (

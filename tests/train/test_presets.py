@@ -159,7 +159,7 @@ def test_the_recipe_is_the_papers(preset) -> None:
     asked, train = cfg.student, cfg.train
     assert (asked.quantization, asked.lora.rank, asked.lora.alpha) == ("nf4", RANK, 32)
     assert (asked.frames, asked.image_size, asked.max_length) == (12, 336, 3072)
-    assert (train.lr, train.epochs, train.micro_batch, train.accumulation) == (2e-5, 3, 1, 16)
+    assert (train.lr, train.epochs, train.batch, train.micro_batch) == (2e-5, 3, 16, 1)
     assert train.precision == "bf16"
 
 

@@ -34,7 +34,7 @@ def common(micro, store) -> dict:
 @pytest.fixture
 def sft_settings(micro, micro_store, nf4_cfg) -> SftCommand:
     train = SftTrainConfig(
-        lr=1e-3, max_steps=4, micro_batch=2, accumulation=2, precision="fp32",
+        lr=1e-3, max_steps=4, batch=4, micro_batch=2, precision="fp32",
         gradient_checkpointing=False, evaluations=2, validation_items=4, permute_candidates=True,
     )  # fmt: skip
     teacher = TeacherConfig(name="template")
@@ -44,7 +44,7 @@ def sft_settings(micro, micro_store, nf4_cfg) -> SftCommand:
 @pytest.fixture
 def contrastive_settings(micro, micro_store, retriever_cfg) -> ContrastiveCommand:
     train = ContrastiveTrainConfig(
-        lr=1e-3, max_steps=4, batch=4, mini_batch=2, accumulation=1, precision="fp32",
+        lr=1e-3, max_steps=4, batch=4, mini_batch=2, precision="fp32",
         gradient_checkpointing=False, evaluations=2, validation_queries=4,
     )  # fmt: skip
     return ContrastiveCommand(**common(micro, micro_store), retriever=retriever_cfg, train=train)
@@ -135,8 +135,8 @@ def test_a_token_weighs_the_same_however_a_batch_is_split(sft_settings, tmp_path
     """The first step's loss and gradient of four unequal samples, at once and one by one."""
     first = []
     for micro_batch in (4, 1):
-        split = {"micro_batch": micro_batch, "accumulation": 4 // micro_batch}
-        train = replace(sft_settings.train, max_steps=1, validation_items=1, **split)
+        train = replace(sft_settings.train, max_steps=1, validation_items=1)
+        train.micro_batch = micro_batch
         run = Run(f"by {micro_batch}", tmp_path / str(micro_batch))
         run.folder.mkdir()
         sft.main.__wrapped__(replace(sft_settings, train=train), run)

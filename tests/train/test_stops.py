@@ -22,7 +22,7 @@ from train.samples import shows_only, splits
 @pytest.fixture
 def settings(micro, micro_store, nf4_cfg) -> SftCommand:
     train = SftTrainConfig(
-        lr=1e-3, max_steps=3, micro_batch=2, accumulation=1, precision="fp32",
+        lr=1e-3, max_steps=3, batch=2, micro_batch=2, precision="fp32",
         gradient_checkpointing=False, evaluations=1, validation_items=2, regime="answer_only",
     )  # fmt: skip
     return SftCommand(
