@@ -44,6 +44,16 @@ class Clip:
 
 
 @dataclass(frozen=True)
+class Sight:
+    """An object that one of a sample's pictures shows: which picture (pairs of a clip's frames
+    first, then images), where, as shares of its width and height, and the object's words."""
+
+    picture: int
+    place: tuple[float, float]
+    words: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Sample:
     """A conversation with its media, before any tokenizer has seen it.
 
@@ -52,6 +62,7 @@ class Sample:
         clip: the prefix; None where none is shown.
         images: (S, S, 3) uint8 pixels of each image in order, such as the candidates.
         response: what the assistant should say, or None where it is to be generated.
+        sights: what the pictures show, where a model is to be taught to see.
     """
 
     sample_id: str
@@ -59,6 +70,12 @@ class Sample:
     clip: Clip | None
     images: list[np.ndarray]
     response: str | None = None
+    sights: tuple[Sight, ...] = ()
+
+    @property
+    def pictures(self) -> int:
+        """Images, and pairs of a clip's frames."""
+        return len(self.images) + ((len(self.clip.indices) + 1) // 2 if self.clip else 0)
 
 
 def answer_line(letter: str) -> str:
@@ -129,6 +146,7 @@ def conversation(
     parts: Sequence[str | np.ndarray],
     response: str | None,
     clip: Clip | None = None,
+    sights: Sequence[Sight] = (),
 ) -> Sample:
     """A clip, if there is one, and then `parts`: texts and (S, S, 3) uint8 pixels of images."""
     content: list[dict[str, Any]] = [{"type": "video"}] if clip else []
@@ -137,4 +155,4 @@ def conversation(
         for part in parts
     ]
     images = [part for part in parts if not isinstance(part, str)]
-    return Sample(sample_id, content, clip, images, response)
+    return Sample(sample_id, content, clip, images, response, tuple(sights))

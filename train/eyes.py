@@ -20,7 +20,7 @@ from data.records import LETTERS, Scene, SelectionItem, shown_frames
 from data.store import Store
 from teacher.predicates import REGIONS, Predicates, predicates_of, region_of
 from teacher.template import describe, matches
-from train.conversation import Clip, Sample, answer_line, conversation
+from train.conversation import Clip, Sample, Sight, answer_line, conversation
 from train.planned import Planned, rng_of
 
 FRAME = "Describe the frame."
@@ -31,10 +31,12 @@ MATCH = (
     'why. End with a line "Answer:" and the letter.'
 )
 ASKED = (FRAME, CLIP, LATER, MATCH)
-FRAMES = 4
+FRAMES = 10
 """Frames described for each item in an epoch."""
 MOVED = 0.08
 """Share of the view's width by which an object has moved in the later of two frames, at least."""
+CLEAR = 0.3
+"""Share of an object's pixels over which a visual token is to name it."""
 HIDDEN = 0.05
 """Share of an object's pixels under which it is not said to be seen."""
 NAMED = 4
@@ -75,7 +77,8 @@ class _Maker:
         scene_id, frame = shown[rng.integers(len(shown))]
         pixels = self.frames.array(scene_id, frame)
         told = account(self.store.scene(scene_id), frame)
-        return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], told)
+        sights = self._sights([(scene_id, frame)])
+        return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], told, None, sights)
 
     def clips(self, item: SelectionItem) -> Iterator[Planned]:
         """The clip with the frame that comes of it, to be read off, and without, to be foreseen."""
@@ -91,7 +94,8 @@ class _Maker:
     def _clip(self, item: SelectionItem, shown: bool, text: str, epoch: int) -> Sample:
         pixels = self.frames.array(item.scene_id, item.target_frame)
         later = ["Later: ", pixels, "\n"] if shown else []
-        return self._after_prefix(item, [*later, CLIP], text)
+        images = [item.target_frame] if shown else []
+        return self._after_prefix(item, [*later, CLIP], text, images)
 
     def later(self, item: SelectionItem) -> Iterator[Planned]:
         """Two frames that can be told apart, where something still moves after the prefix."""
@@ -105,11 +109,11 @@ class _Maker:
         first, second = item.prefix_stop, after[rng.integers(len(after))]
         order = rng.permutation(2)
         parts: list[str | np.ndarray] = []
-        for letter, k in zip(LETTERS, order, strict=False):
-            frame = (first, second)[k]
+        images = [(first, second)[k] for k in order]
+        for letter, frame in zip(LETTERS, images, strict=False):
             parts += [f"\nCandidate {letter}: ", self.frames.array(item.scene_id, frame)]
         right = LETTERS[order.tolist().index(1)]
-        return self._after_prefix(item, [*parts, f"\n{LATER}"], answer_line(right))
+        return self._after_prefix(item, [*parts, f"\n{LATER}"], answer_line(right), images)
 
     def matched(self, item: SelectionItem) -> Iterator[Planned]:
         """A description that one candidate alone fits, where there is such."""
@@ -130,14 +134,26 @@ class _Maker:
         parts: list[str | np.ndarray] = []
         for letter, c in zip(LETTERS, item.candidates, strict=True):
             parts += [f"\nCandidate {letter}: ", self.frames.array(c.scene_id, c.frame)]
-        return conversation(f"{item.item_id} (match)", [*parts, f"\n{asked}"], answer)
+        sights = self._sights([(c.scene_id, c.frame) for c in item.candidates])
+        parts.append(f"\n{asked}")
+        return conversation(f"{item.item_id} (match)", parts, answer, None, sights)
 
     def _after_prefix(
-        self, item: SelectionItem, parts: list[str | np.ndarray], told: str
+        self, item: SelectionItem, parts: list[str | np.ndarray], told: str, images: list[int]
     ) -> Sample:
         scene, shown = self.store.scene(item.scene_id), self._prefix(item)
         clip = Clip(self.frames.stack(item.scene_id, shown), shown, scene.fps, scene.frames)
-        return conversation(f"{item.item_id} (clip and frames)", parts, told, clip)
+        # A visual token of a clip shows two frames; its object is where the first has it.
+        sights = self._sights([(item.scene_id, f) for f in [*shown[::2], *images]])
+        return conversation(f"{item.item_id} (clip and frames)", parts, told, clip, sights)
+
+    def _sights(self, pictures: list[tuple[str, int]]) -> list[Sight]:
+        """What a sample's pictures show, each a scene's frame."""
+        return [
+            Sight(k, place, words)
+            for k, (scene_id, frame) in enumerate(pictures)
+            for place, words in sights(self.store.scene(scene_id), frame)
+        ]
 
     def _prefix(self, item: SelectionItem) -> list[int]:
         return shown_frames(item.prefix_start, item.prefix_stop, self.cfg.frames)
@@ -153,6 +169,15 @@ def account(scene: Scene, frame: int) -> str:
     ]
     told = [f"The {phrase} is {places[place]}." for place, phrase in sorted(seen)]
     return " ".join(told) or "No object is in view."
+
+
+def sights(scene: Scene, frame: int) -> Iterator[tuple[tuple[float, float], tuple[str, ...]]]:
+    """Where in a frame each object is that can be made out, as shares of width and height, and the
+    words that name it."""
+    places = scene.image_positions[frame] / np.asarray(scene.image_size)
+    seen = scene.in_view[frame] & (scene.visible_fraction[frame] > CLEAR)
+    for k in np.flatnonzero(seen):
+        yield tuple(places[k].tolist()), tuple(scene.objects[k].phrase.split())
 
 
 def moved(scene: Scene, start: int) -> list[int]:

@@ -34,6 +34,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from train.collate import Collator, letter_ids
     from train.planned import ByLength
     from train.sft_trainer import Epochs, LetterChoice, StudentTrainer, TokenChoice, token_mean
+    from train.sights import SightCollator, SightTrainer, seen_words
 
     backbone.keep_big_blocks()
     loop.keep_to_one_gpu()
@@ -50,17 +51,18 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     training, validation = samples.splits(store, rationales, cfg, frames)
     loop.check_not_empty(len(training), f"samples for train.regime={cfg.train.regime}")
     loop.check_not_empty(sum(map(len, validation.values())), "items of held-out training scenes")
-    collator = Collator(processor, cfg.student.max_length)
+    # Descriptions end in no answer whose letter could be measured, and teach to see.
+    describes = cfg.train.regime == "describe"
+    letters = None if describes else LetterChoice(letter_ids(processor))
+    choice = letters or TokenChoice(seen_words(processor))
+    collator = (SightCollator if describes else Collator)(processor, cfg.student.max_length)
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
     longest = training[lengths.index(max(lengths))]
     log.info(audit(model, processor, cfg.student, longest, collator))
     order = ByLength(lengths, cfg.train.batch, cfg.seed)
 
-    # Descriptions end in no answer whose letter could be measured.
-    describes = cfg.train.regime == "describe"
-    choice = TokenChoice() if describes else LetterChoice(letter_ids(processor))
     checkpoint = loop.newest_checkpoint(run.folder)
-    trainer = StudentTrainer(
+    trainer = (SightTrainer if describes else StudentTrainer)(
         model=model,
         args=TrainingArguments(
             **loop.arguments(cfg.train, run, cfg.seed, checkpoint),

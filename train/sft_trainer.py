@@ -93,19 +93,28 @@ class Epochs(TrainerCallback):
 
 
 class TokenChoice:
-    """The share of supervised tokens that a model would write, all before each being given."""
+    """The share of supervised tokens that a model would write, all before each being given: of all
+    tokens, and of the `words` of each kind, which tell what is seen where the rest is grammar."""
 
-    @staticmethod
-    def shrink(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
-        """(B, 2) counts of the tokens that are right and of all."""
+    def __init__(self, words: dict[str, list[int]]) -> None:
+        self._words = {kind: torch.tensor(ids) for kind, ids in words.items()}
+
+    def shrink(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+        """(B, 1 + kinds, 2) counts of the tokens that are right and of all."""
         chosen, following = logits[:, :-1].argmax(dim=-1), labels[:, 1:]
-        right = (chosen == following).sum(dim=-1)
-        return torch.stack([right, (following != IGNORED).sum(dim=-1)], dim=-1)
+        right = chosen == following
+        counted = [following != IGNORED]
+        counted += [torch.isin(following, ids.to(labels.device)) for ids in self._words.values()]
+        counts = [torch.stack([(right & c).sum(dim=-1), c.sum(dim=-1)], dim=-1) for c in counted]
+        return torch.stack(counts, dim=1)
 
-    @staticmethod
-    def measure(prediction: EvalPrediction, samples: Samples) -> dict[str, float]:
-        right, counted = prediction.predictions.sum(axis=0)
-        return {"token_accuracy": float(right / counted)}
+    def measure(self, prediction: EvalPrediction, samples: Samples) -> dict[str, float]:
+        counts = prediction.predictions.sum(axis=0)
+        return {
+            f"{kind}_accuracy": float(right / counted)
+            for kind, (right, counted) in zip(("token", *self._words), counts, strict=True)
+            if counted
+        }
 
 
 class LetterChoice:

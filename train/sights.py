@@ -1,0 +1,100 @@
+"""Teach a base to see, token by token: at the place of a visual token that shows an object, the
+model names the object.
+
+What a sample's answer says of its pictures is a weak sign of what they show: a model that writes it
+well may hardly look. The words of the object at each visual token are a strong one, beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch.nn import Module
+from torch.nn.functional import pad
+from transformers import ProcessorMixin
+
+from data.records import COLORS, MATERIALS, SHAPES
+from train.collate import IGNORED, Collator
+from train.conversation import Sample
+from train.sft_trainer import StudentTrainer
+
+WEIGHT = 16.0
+"""A named object weighs as much as this many supervised tokens."""
+PLACES = ("top", "left", "right", "center", "bottom")
+"""First words of the places that an object is near."""
+WORDS = 3
+"""Words that name an object: its colour, material and shape."""
+
+
+def seen_words(processor: ProcessorMixin) -> dict[str, list[int]]:
+    """The words of objects and of their places, by kind, each by its first token."""
+    kinds = {"color": COLORS, "material": MATERIALS, "shape": SHAPES, "place": PLACES}
+    return {kind: [first_token(processor, w) for w in words] for kind, words in kinds.items()}
+
+
+def first_token(processor: ProcessorMixin, word: str) -> int:
+    return processor.tokenizer.encode(f" {word}", add_special_tokens=False)[0]
+
+
+class SightCollator(Collator):
+    """Batches that also hold `sights` (N, 2 + WORDS): row and position of a visual token, and the
+    first tokens of the words for what it shows. All positions keep their logits."""
+
+    def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
+        batch = super().__call__(samples)
+        length = batch["input_ids"].shape[1]
+        batch["labels"] = pad(
+            batch["labels"], (length - batch["labels"].shape[1], 0), value=IGNORED
+        )
+        batch["logits_to_keep"] = torch.arange(length)
+        batch["sights"] = torch.tensor(
+            [row for k, s in enumerate(samples) for row in self._of(s, k, batch["input_ids"][k])]
+        ).reshape(-1, 2 + WORDS)
+        return batch
+
+    def _of(self, sample: Sample, row: int, ids: torch.Tensor) -> list[list[int]]:
+        visual = torch.tensor([self._processor.image_token_id, self._processor.video_token_id])
+        positions = torch.isin(ids, visual).nonzero()[:, 0].tolist()
+        each = len(positions) // max(1, sample.pictures)
+        grid = math.isqrt(each)
+        found = []
+        for sight in sample.sights:
+            column, line = (min(int(share * grid), grid - 1) for share in sight.place)
+            position = positions[sight.picture * each + line * grid + column]
+            found.append([row, position, *(first_token(self._processor, w) for w in sight.words)])
+        return found
+
+
+class SightTrainer(StudentTrainer):
+    """A trainer whose loss also counts how well visual tokens name what they show."""
+
+    def compute_loss(
+        self,
+        model: Module,
+        inputs: dict[str, Any],
+        return_outputs: bool = False,
+        num_items_in_batch: torch.Tensor | int | None = None,
+    ) -> Any:
+        sights = inputs.pop("sights")
+        loss, outputs = super().compute_loss(
+            model, inputs, True, num_items_in_batch=num_items_in_batch
+        )
+        if model.training and len(sights):
+            loss = loss + WEIGHT * unnamed(outputs.logits, sights) / num_items_in_batch
+        return (loss, outputs) if return_outputs else loss
+
+
+def unnamed(logits: torch.Tensor, sights: torch.Tensor) -> torch.Tensor:
+    """Cross entropy between what visual tokens say and the words for what they show, each word as
+    likely as the other; a sum over sights.
+
+    Args:
+        logits: (B, L, V).
+        sights: (N, 2 + WORDS) as `SightCollator` gives them.
+    """
+    row, position, words = sights[:, 0], sights[:, 1], sights[:, 2:]
+    told = logits[row, position].float().log_softmax(dim=-1)
+    return -told.gather(1, words).mean(dim=1).sum()
