@@ -31,7 +31,7 @@ MATCH = (
     'why. End with a line "Answer:" and the letter.'
 )
 ASKED = (FRAME, CLIP, LATER, MATCH)
-FRAMES = 10
+FRAMES = 8
 """Frames described for each item in an epoch."""
 MOVED = 0.08
 """Share of the view's width by which an object has moved in the later of two frames, at least."""
@@ -51,7 +51,7 @@ def kinds(
     make = _Maker(store, cfg, frames, seed)
     return {
         "frame": [make.frame(item, k) for item in items for k in range(FRAMES)],
-        "clip": [clip for item in items for clip in make.clips(item)],
+        "clip": [clip for item in items for clip in make.clip(item)],
         "later": [later for item in items for later in make.later(item)],
         "match": [match for item in items for match in make.matched(item)],
     }
@@ -80,18 +80,17 @@ class _Maker:
         sights = self._sights([(scene_id, frame)])
         return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], told, None, sights)
 
-    def clips(self, item: SelectionItem) -> Iterator[Planned]:
-        """The clip with the frame that comes of it, to be read off, and without, to be foreseen."""
+    def clip(self, item: SelectionItem) -> Iterator[Planned]:
+        """The clip with the frame that comes of it, to be read off, or without, to be foreseen."""
         scene = self.store.scene(item.scene_id)
         start, stop, target = item.prefix_start, item.prefix_stop, item.target_frame
         text = describe(scene, start, stop, target, self.seed)
-        if text is None:
-            return
-        for shown in (True, False):
-            media = self.cfg.frames // 2 + shown
-            yield Planned(f"{CLIP} {text}", media, partial(self._clip, item, shown, text))
+        if text is not None:
+            media = self.cfg.frames // 2 + 1
+            yield Planned(f"{CLIP} {text}", media, partial(self._clip, item, text))
 
-    def _clip(self, item: SelectionItem, shown: bool, text: str, epoch: int) -> Sample:
+    def _clip(self, item: SelectionItem, text: str, epoch: int) -> Sample:
+        shown = rng_of(self.seed, epoch, item.item_id, "clip").random() < 0.5
         pixels = self.frames.array(item.scene_id, item.target_frame)
         later = ["Later: ", pixels, "\n"] if shown else []
         images = [item.target_frame] if shown else []
