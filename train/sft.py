@@ -32,6 +32,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from train import backbone, loop, samples
     from train.audit import audit
     from train.collate import Collator, letter_ids
+    from train.packing import PackingCollator, rope_of
     from train.planned import ByLength
     from train.sft_trainer import Epochs, LetterChoice, StudentTrainer, TokenChoice, token_mean
 
@@ -51,6 +52,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     loop.check_not_empty(len(training), f"samples for train.regime={cfg.train.regime}")
     loop.check_not_empty(sum(map(len, validation.values())), "items of held-out training scenes")
     collator = Collator(processor, cfg.student.max_length)
+    rope = rope_of(model, cfg.train.packing)
+    packs = rope and PackingCollator(processor, cfg.student.max_length, rope)
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
     longest = training[lengths.index(max(lengths))]
     log.info(audit(model, processor, cfg.student, longest, collator))
@@ -70,6 +73,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
             label_names=["labels"],
         ),
         data_collator=collator.named,
+        training_collator=(packs or collator).named,
         train_dataset=training,
         eval_dataset=validation,
         compute_loss_func=token_mean,
