@@ -27,6 +27,7 @@ from transformers.utils import logging as transformers_logging
 from conf.errors import UserError
 from conf.runs import write_json
 from conf.schema import LoraConfig, RetrieverConfig, StudentConfig
+from train.attention import choose_attention
 from train.tiny import build_model, build_processor
 from train.trained import EXPORT
 
@@ -60,7 +61,9 @@ def load_base(
     if cfg.architecture is not None:
         processor = build_processor(corpus(), cfg.architecture.vocabulary, cfg.image_size)
         pin_sizes(processor, cfg.image_size, cfg.frames)
-        return build_model(cfg.architecture, len(processor.tokenizer)), processor
+        model = build_model(cfg.architecture, len(processor.tokenizer))
+        choose_attention(model, precision, cfg.max_length)
+        return model, processor
     check_reachable("student", cfg.model)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     # Weights that are trained stay fp32 and are computed in lower precision by autocast.
@@ -78,6 +81,7 @@ def load_base(
         )
     except UNREADABLE as error:
         raise load_failure("student", cfg.model, error) from error
+    choose_attention(model, precision, cfg.max_length)
     pin_sizes(processor, cfg.image_size, cfg.frames)
     processor.tokenizer.padding_side = "left"
     return model, processor

@@ -114,11 +114,13 @@ def pad(encoded: Sequence[Encoded], pad_id: int) -> dict[str, Any]:
         "mm_token_type_ids": stack([e.mm_token_type_ids for e in encoded], 0),
         "labels": stack([e.labels for e in encoded], IGNORED),
     }
-    for name in MEDIA:
-        parts = [e.media[name] for e in encoded if name in e.media]
-        if parts:
-            batch[name] = torch.cat(parts)
-    return batch
+    return batch | stacked_media(encoded)
+
+
+def stacked_media(encoded: Sequence[Encoded]) -> dict[str, torch.Tensor]:
+    """The media tensors of all samples in order."""
+    parts = {name: [e.media[name] for e in encoded if name in e.media] for name in MEDIA}
+    return {name: torch.cat(found) for name, found in parts.items() if found}
 
 
 def letter_ids(processor: ProcessorMixin) -> list[int]:

@@ -32,6 +32,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from train import backbone, loop, samples
     from train.audit import audit
     from train.collate import Collator, letter_ids
+    from train.packing import PackingCollator, rope_of
     from train.planned import ByLength
     from train.sft_trainer import Epochs, LetterChoice, StudentTrainer, TokenChoice, token_mean
     from train.sights import SightCollator, SightTrainer, seen_words
@@ -56,6 +57,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     letters = None if describes else LetterChoice(letter_ids(processor))
     choice = letters or TokenChoice(seen_words(processor))
     collator = (SightCollator if describes else Collator)(processor, cfg.student.max_length)
+    rope = None if describes else rope_of(model, cfg.train.packing)
+    packs = rope and PackingCollator(processor, cfg.student.max_length, rope)
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
     longest = training[lengths.index(max(lengths))]
     log.info(audit(model, processor, cfg.student, longest, collator))
@@ -72,6 +75,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
             label_names=["labels"],
         ),
         data_collator=collator.named,
+        training_collator=(packs or collator).named,
         train_dataset=training,
         eval_dataset=validation,
         compute_loss_func=token_mean,

@@ -3,6 +3,7 @@ of samples and of their candidates in an epoch, and the measure of the answer's 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -40,11 +41,17 @@ STOPPED = "stopped.json"
 
 
 class StudentTrainer(Trainer):
-    """A Trainer that takes its samples in an `order` of ours, measures an evaluation by a `choice`
-    that is told the samples, and stops where a loss is no number."""
+    """A Trainer that takes its samples in an `order` of ours and makes training batches with a
+    `training_collator`, measures an evaluation by a `choice` that is told the samples, and stops
+    where a loss is no number."""
 
     def __init__(
-        self, *args: Any, order: ByLength, choice: TokenChoice | LetterChoice, **settings: Any
+        self,
+        *args: Any,
+        training_collator: Callable[[list[Any]], dict[str, Any]],
+        order: ByLength,
+        choice: TokenChoice | LetterChoice,
+        **settings: Any,
     ) -> None:
         super().__init__(
             *args,
@@ -53,6 +60,14 @@ class StudentTrainer(Trainer):
             **settings,
         )
         self._order = order
+        self._training_collator = training_collator
+
+    def get_train_dataloader(self) -> DataLoader:
+        # An evaluation's samples are measured by their rows.
+        others, self.data_collator = self.data_collator, self._training_collator
+        loader = super().get_train_dataloader()
+        self.data_collator = others
+        return loader
 
     def _get_train_sampler(self, *_: Any) -> ByLength:
         return self._order

@@ -74,6 +74,10 @@ class SftTrainConfig(TrainConfig):
     """Samples a step, over all its micro-batches and ranks."""
     micro_batch: int = 1
     """Samples that pass the model at once; moves memory and time, not what is learnt."""
+    packing: str = "auto"
+    """Whether a micro-batch's samples stand in one row without padding, kept from seeing each
+    other: true, false, or auto, where flash attention does so at no cost (never on a CPU, where it
+    is slower)."""
     permute_candidates: bool = False
     """Whether each epoch shows every item's candidates in an order of its own."""
     validation_items: int = 64
@@ -87,8 +91,15 @@ class SftTrainConfig(TrainConfig):
             problems.append(
                 f"train.micro_batch={self.micro_batch} must divide train.batch={self.batch}"
             )
+        if self.packing.lower() not in ("auto", "true", "false"):
+            problems.append(f"train.packing={self.packing}: the options are auto, true and false")
         if self.regime not in REGIMES:
             problems.append(f"train.regime={self.regime}: the options are {', '.join(REGIMES)}")
+        if self.packing.lower() == "true" and self.regime == "describe":
+            problems.append(
+                "train.packing=true with train.regime=describe: what each visual token shows is "
+                "learnt from padded samples, leave train.packing=auto"
+            )
         if self.permute_candidates and self.regime == "describe":
             problems.append(
                 "train.permute_candidates=true with train.regime=describe: descriptions have no "

@@ -1,0 +1,114 @@
+"""How a model attends: the implementation that is fastest where it runs, with the same numbers.
+
+The vision tower attends within each frame. Without flash attention transformers calls it once a
+frame, but all frames here have one size, so that one call over all of them gives the same numbers.
+
+On a CPU in bf16, torch's fused attention takes three to six times as long in its backward pass as
+the matrix products that it stands for, as long as their scores fit in memory.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch.nn import Module
+from transformers import AttentionInterface, AttentionMaskInterface, PreTrainedModel
+from transformers.integrations.sdpa_attention import repeat_kv, sdpa_attention_forward
+from transformers.masking_utils import eager_mask
+from transformers.utils import is_flash_attn_2_available, is_flash_attn_3_available
+
+PRODUCTS = "dynapix_products"
+BY_FRAME = "dynapix_frames_flash"
+"""Its name must have "flash" in it: only then is a function given all frames at once, with their
+bounds, by a Qwen3-VL's vision tower."""
+SHORT = 2048
+"""Tokens up to which the scores of all pairs are kept for the backward pass."""
+
+
+def choose_attention(model: PreTrainedModel, precision: str, max_length: int) -> None:
+    """Let a Qwen3-VL attend in the fastest way that there is for the machine, for passes in
+    `precision` (bf16 or fp32) over up to `max_length` tokens; other models are left as they are.
+    """
+    if model.config.model_type != "qwen3_vl":
+        return
+    flash = flash_attention(precision)
+    if flash is not None:
+        model.set_attn_implementation(flash)
+        return
+    products = not torch.cuda.is_available() and precision == "bf16" and max_length <= SHORT
+    text = PRODUCTS if products else "sdpa"
+    model.set_attn_implementation({"text_config": text, "vision_config": BY_FRAME})
+
+
+def flash_attention(precision: str) -> str | None:
+    """The flash attention that is installed and runs here in `precision`, by transformers' name."""
+    if not torch.cuda.is_available() or precision != "bf16":
+        return None
+    if is_flash_attn_3_available():
+        return "flash_attention_3"
+    return "flash_attention_2" if is_flash_attn_2_available() else None
+
+
+def attend_by_products(
+    module: Module,
+    query: torch.Tensor,
+    key: torch.Tensor,
+    value: torch.Tensor,
+    attention_mask: torch.Tensor | None,
+    scaling: float,
+    dropout: float = 0.0,
+    **_: Any,
+) -> tuple[torch.Tensor, None]:
+    """Attention of (B, H, Q, D) queries to (B, G, K, D) keys and values, as (B, Q, H, D).
+
+    What transformers calls eager, but of the scores only the softmax is kept, in the precision of
+    the products: a third of the memory.
+    """
+    groups = query.shape[1] // key.shape[1]
+    key, value = repeat_kv(key, groups), repeat_kv(value, groups)
+    scores = torch.matmul(query * scaling, key.transpose(2, 3))
+    if attention_mask is not None:
+        scores.add_(attention_mask)
+    weights = torch.nn.functional.dropout(scores.softmax(dim=-1), dropout)
+    return torch.matmul(weights, value).transpose(1, 2).contiguous(), None
+
+
+def products_mask(*args: Any, dtype: torch.dtype, **settings: Any) -> torch.Tensor | None:
+    """The mask that is added to scores, in bf16 even where the embeddings are fp32: the least fp32
+    number is no finite one in bf16, and rows of padding alone would have no softmax."""
+    return eager_mask(*args, dtype=torch.bfloat16, **settings)
+
+
+def attend_by_frame(
+    module: Module,
+    query: torch.Tensor,
+    key: torch.Tensor,
+    value: torch.Tensor,
+    attention_mask: torch.Tensor | None,
+    scaling: float,
+    cu_seq_lens_q: torch.Tensor,
+    max_length_q: int,
+    dropout: float = 0.0,
+    **_: Any,
+) -> tuple[torch.Tensor, None]:
+    """Attention of the (1, H, N, D) patches of several frames, each within its own, as
+    (1, N, H, D); `cu_seq_lens_q` are the frames' bounds among the N, `max_length_q` is the longest.
+    """
+    reduced = torch.is_autocast_enabled(query.device.type) or query.dtype != torch.float32
+    attend = attend_by_products if reduced and not query.is_cuda else sdpa_attention_forward
+    settings = {"scaling": scaling, "dropout": dropout, "is_causal": False}
+    parts = (query, key, value)
+    frames = len(cu_seq_lens_q) - 1
+    if frames * max_length_q == query.shape[2]:
+        folded = (p[0].unflatten(1, (frames, max_length_q)).transpose(0, 1) for p in parts)
+        found, _weights = attend(module, *folded, None, **settings)
+        return found.flatten(0, 1)[None], None
+    lengths = (cu_seq_lens_q[1:] - cu_seq_lens_q[:-1]).tolist()
+    split = zip(*(p.split(lengths, dim=2) for p in parts), strict=True)
+    return torch.cat([attend(module, *one, None, **settings)[0] for one in split], dim=1), None
+
+
+AttentionInterface.register(PRODUCTS, attend_by_products)
+AttentionMaskInterface.register(PRODUCTS, products_mask)
+AttentionInterface.register(BY_FRAME, attend_by_frame)
