@@ -15,7 +15,7 @@ from transformers import EvalPrediction, Trainer, TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.errors import UserError
-from conf.runs import write_json
+from conf.runs import rank, write_json
 from train.collate import IGNORED
 from train.planned import ByLength, Samples
 
@@ -35,27 +35,55 @@ def token_mean(
     return total / count
 
 
+def token_losses(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+    """(B, 2) each sample's cross entropy, summed over its supervised tokens, and their count."""
+    following = labels[:, 1:]
+    losses = cross_entropy(
+        logits[:, :-1].transpose(1, 2).float(), following, ignore_index=IGNORED, reduction="none"
+    )
+    return torch.stack([losses.sum(dim=-1), (following != IGNORED).sum(dim=-1)], dim=-1)
+
+
 STOPPED = "stopped.json"
-"""Names the samples whose loss was no number."""
+"""Names the samples whose loss was no number; another rank than the main one has its number in
+front."""
 
 
 class StudentTrainer(Trainer):
     """A Trainer that takes its samples in an `order` of ours, measures an evaluation by a `choice`
-    that is told the samples, and stops where a loss is no number."""
+    that is told the samples, and stops where a loss is no number.
+
+    The loss of an evaluation is the mean over all supervised tokens of its samples; the trainer's
+    own would hang on how they are split into micro-batches and ranks.
+    """
 
     def __init__(
         self, *args: Any, order: ByLength, choice: TokenChoice | LetterChoice, **settings: Any
     ) -> None:
         super().__init__(
             *args,
-            preprocess_logits_for_metrics=choice.shrink,
-            compute_metrics=lambda prediction: choice.measure(prediction, self._measured),
+            preprocess_logits_for_metrics=self._shrink,
+            compute_metrics=self._measure,
             **settings,
         )
         self._order = order
+        self._choice = choice
 
     def _get_train_sampler(self, *_: Any) -> ByLength:
         return self._order
+
+    def _shrink(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+        """(B, 2 + kept) the losses, and what the choice keeps."""
+        return torch.cat(
+            [token_losses(logits, labels), self._choice.shrink(logits, labels)], dim=-1
+        )
+
+    def _measure(self, prediction: EvalPrediction) -> dict[str, float]:
+        losses, kept = np.split(prediction.predictions, [2], axis=-1)
+        total, count = losses.sum(axis=0, dtype=np.float64)
+        told = self._choice.measure(EvalPrediction(kept, prediction.label_ids), self._measured)
+        # The trainer names this after its own mean, which it thereby takes the place of.
+        return {**told, "loss": total / count}
 
     def evaluation_loop(self, dataloader: DataLoader, *args: Any, **settings: Any) -> Any:
         self._measured: Samples = dataloader.dataset
@@ -69,7 +97,8 @@ class StudentTrainer(Trainer):
         found = super().compute_loss(model, inputs, return_outputs, **settings)
         loss = found[0] if return_outputs else found
         if not torch.isfinite(loss):
-            step, path = self.state.global_step, Path(self.args.output_dir) / STOPPED
+            name = f"{rank()}-{STOPPED}" if rank() else STOPPED
+            step, path = self.state.global_step, Path(self.args.output_dir) / name
             write_json(path, {"step": step, "loss": str(loss.item()), "samples": ids})
             raise UserError(
                 f"the loss is {loss.item()} after step {step}; {path} names the samples. A lower "
