@@ -52,6 +52,7 @@ class Sample:
         clip: the prefix; None where none is shown.
         images: (S, S, 3) uint8 pixels of each image in order, such as the candidates.
         response: what the assistant should say, or None where it is to be generated.
+        supervised: whether the response is learnt; else the sample only fills a place.
     """
 
     sample_id: str
@@ -59,6 +60,7 @@ class Sample:
     clip: Clip | None
     images: list[np.ndarray]
     response: str | None = None
+    supervised: bool = True
 
 
 def answer_line(letter: str) -> str:

@@ -73,7 +73,7 @@ class SftTrainConfig(TrainConfig):
     batch: int = 16
     """Samples a step, over all its micro-batches and ranks."""
     micro_batch: int = 1
-    """Samples that pass the model at once; moves memory and time, not what is learnt."""
+    """Samples that pass a rank's model at once; moves memory and time, not what is learnt."""
     permute_candidates: bool = False
     """Whether each epoch shows every item's candidates in an order of its own."""
     validation_items: int = 64
