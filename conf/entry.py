@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import errno
 import functools
+import logging
 import os
+import re
 import shutil
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -21,11 +24,15 @@ from omegaconf import DictConfig
 from conf.compose import preflight, register, short, strict
 from conf.errors import SettingsError, UserError
 from conf.help import help_text
-from conf.runs import Run, open_run, run_name, write_json
+from conf.runs import Run, open_run, rank, ranks, run_name, write_json
 
 Metrics = dict[str, float]
 Main = Callable[[Any, Run], Metrics | None]
 
+GRACE = 3.0
+"""Seconds that the main rank has to say what went wrong before another one does."""
+LEFT_ALONE = r"gloo.*(by peer|[Bb]roken pipe)"
+"""What a rank that waits for the others raises where one of them ended."""
 NOTHING_LEFT = 1 << 20
 """Free bytes under which a disk counts as full."""
 CANNOT_WRITE = (
@@ -68,6 +75,8 @@ def _start(name: str, schema: type, main: Main) -> None:
         return
     if not (args.hydra_help or args.info or args.shell_completion):
         sweep = args.multirun or "hydra.mode=MULTIRUN" in args.overrides
+        if sweep and ranks() > 1:
+            raise UserError("a sweep starts processes of its own: start it with python, not ranks")
         preflight(name, schema, args.overrides, sweep)
 
     def task(cfg: DictConfig) -> Metrics | None:
@@ -86,9 +95,12 @@ def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None
     task = HydraConfig.get()
     overrides = list(task.overrides.task)
     run = Run(run_name(settings.run, overrides), Path(os.path.relpath(task.runtime.output_dir)))
-    open_run(run, asdict(settings), name, overrides)
+    if rank() == 0:
+        open_run(run, asdict(settings), name, overrides)
+    else:
+        logging.disable(logging.WARNING)
     metrics = main(settings, run)
-    if metrics is not None:
+    if metrics is not None and rank() == 0:
         write_json(run.folder / "metrics.json", metrics)
     return metrics
 
@@ -98,33 +110,58 @@ def _sentences(folder: str = ".") -> Iterator[None]:
     """End with a sentence where a user can help it; any other error is a bug, with its traceback.
 
     A full disk may name no file, and some libraries report it as an error of their own: `folder`
-    is where it is looked for.
+    is where it is looked for. What ends several ranks is said by one of them.
     """
     try:
         yield
     except UserError as error:
+        _let_main_speak()
         for line in str(error).splitlines():
             print(f"error: {line}", file=sys.stderr)
-        sys.exit(2 if isinstance(error, SettingsError) else 1)
+        _leave(2 if isinstance(error, SettingsError) else 1)
     except KeyboardInterrupt:
+        _let_main_speak()
         print("interrupted; run the same command again to go on", file=sys.stderr)
-        sys.exit(130)
+        _leave(130)
     except OSError as error:
         if error.errno not in CANNOT_WRITE:
             raise
         _cannot_write(str(error.filename or folder), str(error.strerror))
-    except Exception:
+    except Exception as error:
+        if ranks() > 1 and re.search(LEFT_ALONE, str(error)):
+            _leave(1)
         if not _full(folder):
             raise
         _cannot_write(folder, os.strerror(errno.ENOSPC))
 
 
+def _leave(code: int) -> NoReturn:
+    """End at once where there are several ranks: an orderly end waits for what others still send,
+    and it is by the end of one that the launcher knows to end all."""
+    if ranks() > 1:
+        logging.shutdown()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
+def _let_main_speak() -> None:
+    """What is wrong on all ranks is said by the main one, with whose end the launcher ends the
+    others; only what went wrong on this one alone is still to be said after a while."""
+    if rank() != 0:
+        time.sleep(GRACE)
+        # The main one's progress bar stands in the line.
+        print(file=sys.stderr)
+
+
 def _cannot_write(where: str, why: str) -> NoReturn:
+    _let_main_speak()
     print(
         f"error: {where}: {why}; once that is mended, the same command goes on where it was",
         file=sys.stderr,
     )
-    sys.exit(1)
+    _leave(1)
 
 
 def _full(folder: str) -> bool:

@@ -44,6 +44,17 @@ class Run:
     folder: Path
 
 
+def rank() -> int:
+    """Which of the ranks this process is that a launcher such as torchrun started; 0, the main one,
+    prepares, logs and writes for all."""
+    return int(os.environ["RANK"]) if "LOCAL_RANK" in os.environ else 0
+
+
+def ranks() -> int:
+    """How many ranks a launcher started; 1 without one."""
+    return int(os.environ["WORLD_SIZE"]) if "LOCAL_RANK" in os.environ else 1
+
+
 def run_name(run: str | None, overrides: Sequence[str]) -> str:
     """The given name, or one made of the overrides in the order they were typed."""
     if run is not None:
@@ -150,6 +161,7 @@ def _record(
         "command": command,
         "overrides": overrides,
         "seeds": {k: v for k, v in _flat(settings).items() if k.rpartition(".")[2] == "seed"},
+        "ranks": ranks(),
         "git": _git(),
         "python": platform.python_version(),
         "platform": platform.platform(),

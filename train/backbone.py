@@ -280,15 +280,24 @@ def check_base(folder: Path, model: str | None) -> None:
         )
 
 
-def save(model: nn.Module, processor: ProcessorMixin, folder: Path, precision: str) -> None:
+def save(
+    model: nn.Module,
+    processor: ProcessorMixin,
+    folder: Path,
+    precision: str,
+    weights: dict[str, torch.Tensor] | None = None,
+) -> None:
     """Write what was trained, the adapters or the whole model, and the processor that goes with
-    it. A whole model is written in the precision that it computed in."""
+    it. A whole model is written in the precision that it computed in. `weights` are the model's
+    where it holds a part of them."""
     import peft
 
     if not isinstance(model, peft.PeftModel):
         model = model.to(DTYPES[precision])
         model.config.use_cache = True
-    model.save_pretrained(folder)
+        if weights is not None:
+            weights = {name: weight.to(DTYPES[precision]) for name, weight in weights.items()}
+    model.save_pretrained(folder, state_dict=weights)
     processor.save_pretrained(folder)
 
 

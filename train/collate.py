@@ -92,6 +92,7 @@ class Collator:
             return batch
         # The position before the first supervised token predicts it.
         start = int((labels != IGNORED).any(dim=0).nonzero()[0]) - 1
+        labels[[not s.supervised for s in samples]] = IGNORED
         batch["labels"] = labels[:, start:]
         batch["logits_to_keep"] = torch.arange(start, labels.shape[1])
         return batch

@@ -63,6 +63,7 @@ class Sample:
         images: (S, S, 3) uint8 pixels of each image in order, such as the candidates.
         response: what the assistant should say, or None where it is to be generated.
         sights: what the pictures show, where a model is to be taught to see.
+        supervised: whether the response is learnt; else the sample only fills a place.
     """
 
     sample_id: str
@@ -70,6 +71,7 @@ class Sample:
     clip: Clip | None
     images: list[np.ndarray]
     response: str | None = None
+    supervised: bool = True
     sights: tuple[Sight, ...] = ()
 
     @property

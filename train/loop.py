@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
 from transformers import (
     PrinterCallback,
     ProgressCallback,
@@ -23,7 +24,7 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 from conf.entry import Run
 from conf.errors import UserError
 from conf.processes import visible_gpus
-from conf.runs import write_text
+from conf.runs import rank, write_text
 from conf.schema import TrainConfig
 from conf.sweep import AT_START
 from train.plots import curves_figure
@@ -53,6 +54,7 @@ def arguments(train: TrainConfig, run: Run, seed: int, checkpoint: Path | None) 
         "lr_scheduler_type": SCHEDULES[train.schedule],
         "warmup_steps": train.warmup,
         "weight_decay": train.weight_decay,
+        "adam_beta2": train.adam_beta2,
         "max_grad_norm": train.max_grad_norm,
         "num_train_epochs": train.epochs,
         "max_steps": train.max_steps,
@@ -103,13 +105,15 @@ def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: st
     trainer.remove_callback(ProgressCallback)
     trainer.remove_callback(PrinterCallback)
     trainer.add_callback(Bar())
-    trainer.add_callback(Journal(run.folder))
+    if rank() == 0:
+        trainer.add_callback(Journal(run.folder))
+    check_fsdp(trainer, checkpoint)
     if checkpoint is not None:
         log.info("going on from %s", checkpoint)
     try:
         if checkpoint is not None and is_last(checkpoint):
             # The trainer would take a step more.
-            trainer._load_from_checkpoint(str(checkpoint))
+            load(trainer, checkpoint)
         else:
             trainer.train(resume_from_checkpoint=str(checkpoint) if checkpoint else None)
     except RuntimeError as error:
@@ -119,13 +123,51 @@ def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: st
             f"out of memory after step {trainer.state.global_step}: lower {lower}, or set "
             "train.gradient_checkpointing=true, in a run of its own (run=NAME)"
         ) from error
-    curves_figure(read_journal(run.folder), run.folder / "curves.png")
+    if rank() == 0:
+        curves_figure(read_journal(run.folder), run.folder / "curves.png")
 
 
 def is_last(checkpoint: Path) -> bool:
     """Whether a checkpoint is that of a run's last step."""
     state = json.loads((checkpoint / "trainer_state.json").read_text())
     return state["global_step"] >= state["max_steps"]
+
+
+def check_fsdp(trainer: Trainer, checkpoint: Path | None) -> None:
+    """Raises UserError where the FSDP that a launcher was told of is none that trains here, or a
+    run was begun with it and goes on without, or the reverse."""
+    fsdp = trainer.is_fsdp_enabled
+    if os.environ.get("ACCELERATE_USE_FSDP") == "true" and not fsdp:
+        raise UserError(
+            "accelerate has FSDP for several GPUs only, and would train without a word about it: "
+            "leave --use_fsdp away (and give --multi_gpu, on CPUs too)"
+        )
+    if fsdp and trainer.accelerator.state.fsdp_plugin.fsdp_version != 2:
+        raise UserError("of FSDP only the second version trains adapters: give --fsdp_version 2")
+    if checkpoint is not None and any(checkpoint.glob("pytorch_model_fsdp*")) != fsdp:
+        begun = "without" if fsdp else "with"
+        raise UserError(
+            f"{checkpoint} was written {begun} FSDP: start the run {begun} it again, on as many "
+            "ranks as you like, or begin another one with run=NAME"
+        )
+
+
+def load(trainer: Trainer, checkpoint: Path) -> None:
+    """Take a checkpoint's weights without training on from it."""
+    if trainer.is_fsdp_enabled:
+        # A model in parts takes its parts, and accelerate parts it with its optimizer.
+        trainer.create_optimizer()
+        trainer.accelerator.prepare(trainer.model, trainer.optimizer)
+    trainer._load_from_checkpoint(str(checkpoint))
+
+
+def gathered(trainer: Trainer) -> dict[str, torch.Tensor] | None:
+    """What was trained, on the main rank, where FSDP gave each rank a part of it; else None."""
+    if not trainer.is_fsdp_enabled:
+        return None
+    # A frozen base is where it was.
+    options = StateDictOptions(full_state_dict=True, cpu_offload=True, ignore_frozen_params=True)
+    return get_model_state_dict(trainer.model, options=options)
 
 
 def is_out_of_memory(error: RuntimeError) -> bool:

@@ -38,16 +38,18 @@ class PackingCollator(Collator):
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
         encoded = [encode(s, self._processor, self._max_length) for s in samples]
-        return pack(encoded, self._rope)
+        return pack(encoded, self._rope, [s.supervised for s in samples])
 
 
-def pack(encoded: Sequence[Encoded], rope: Rope) -> dict[str, Any]:
-    """One row of all samples' tokens, with the rows of the head that are supervised."""
+def pack(encoded: Sequence[Encoded], rope: Rope, supervised: Sequence[bool]) -> dict[str, Any]:
+    """One row of all samples' tokens, with the rows of the head that predict responses; the labels
+    of those that are not `supervised` are ignored."""
     labels, kept, begin = [], [], 0
-    for one in encoded:
+    for one, learnt in zip(encoded, supervised, strict=True):
         # The position before the first supervised token predicts it.
         start = next(k for k, label in enumerate(one.labels) if label != IGNORED) - 1
-        labels += one.labels[start:]
+        told = one.labels[start:]
+        labels += told if learnt else [IGNORED] * len(told)
         kept += range(begin + start, begin + len(one.labels))
         begin += len(one.labels)
     batch = {

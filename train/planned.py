@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from torch.utils.data import Dataset, Sampler
@@ -33,7 +33,8 @@ class Planned:
 
 
 class Samples(Dataset):
-    """Planned samples as a trainer reads them, as they are in `epoch`."""
+    """Planned samples as a trainer reads them, as they are in `epoch`. At ~index, below 0, is the
+    sample of that index with nothing supervised."""
 
     def __init__(self, planned: Sequence[Planned]) -> None:
         self._planned = planned
@@ -43,6 +44,8 @@ class Samples(Dataset):
         return len(self._planned)
 
     def __getitem__(self, index: int) -> Sample:
+        if index < 0:
+            return replace(self[~index], supervised=False)
         return self._planned[index].make(self.epoch)
 
     @property
@@ -59,20 +62,29 @@ class Samples(Dataset):
 
 class ByLength(Sampler[int]):
     """All samples in a random order of each epoch, those of a step sorted by length, so that little
-    of a micro-batch is padding. What a step holds does not hang on how it is split."""
+    of a micro-batch is padding. What a step holds does not hang on how it is split.
 
-    def __init__(self, lengths: Sequence[int], batch: int, seed: int) -> None:
-        """`batch`: samples of a step, over all its micro-batches."""
+    Ranks take a micro-batch each in turn. Neighbours in length pass at once, and now the one rank
+    gets the longer, now the other. Where the last step of an epoch is too small for all, it is
+    filled up with samples of which nothing is supervised.
+    """
+
+    def __init__(
+        self, lengths: Sequence[int], batch: int, seed: int, micro_batch: int = 1, ranks: int = 1
+    ) -> None:
+        """`batch`: samples of a step, over all its micro-batches and ranks."""
         self._lengths = np.asarray(lengths)
         self._batch = batch
         self._seed = seed
+        self._micro_batch = micro_batch
+        self._ranks = ranks
         self._epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
         self._epoch = epoch
 
     def __len__(self) -> int:
-        return len(self._lengths)
+        return len(self._lengths) + self._missing(len(self._lengths) % self._batch)
 
     def __iter__(self) -> Iterator[int]:
         rng = np.random.default_rng([self._seed, self._epoch])
@@ -80,7 +92,20 @@ class ByLength(Sampler[int]):
         for start in range(0, len(order), self._batch):
             step = order[start : start + self._batch]
             # The longest come first, so that what memory they take is known at the start.
-            yield from step[np.argsort(-self._lengths[step], kind="stable")].tolist()
+            yield from self._dealt(step[np.argsort(-self._lengths[step], kind="stable")]).tolist()
+
+    def _dealt(self, step: np.ndarray) -> np.ndarray:
+        """A step's samples, longest first, in the order in which the ranks take them."""
+        fillers = np.repeat(~step[-1:], self._missing(len(step)))
+        rounds = np.append(step, fillers)
+        if self._ranks > 1:
+            rounds = rounds.reshape(-1, self._ranks, self._micro_batch)
+            rounds[1::2] = rounds[1::2, ::-1]
+        return rounds.ravel()
+
+    def _missing(self, samples: int) -> int:
+        """How many samples a step of so many lacks for all ranks to have as much to do."""
+        return -samples % (self._micro_batch * self._ranks) if self._ranks > 1 else 0
 
 
 def rng_of(*keys: int | str) -> np.random.Generator:

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from conf.entry import Run, command
-from conf.runs import finished
+from conf.runs import finished, rank
 from conf.schema import SftCommand
+
+if TYPE_CHECKING:
+    from data.records import Rationale
+    from data.store import Store
 
 log = logging.getLogger(__name__)
 
@@ -18,13 +24,10 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         log.info("%s is finished; delete it, or give run=NAME, to train anew", run.folder)
         return metrics
 
-    from data.build import ensure_benchmark
-    from teacher.narrate import ensure_rationales
+    from train import ranks
 
-    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
-    rationales = []
-    if cfg.train.regime != "answer_only":
-        rationales = ensure_rationales(store, cfg.teacher)
+    accumulation = ranks.accumulation(cfg.train.batch, cfg.train.micro_batch)
+    store, rationales = ranks.from_main(partial(prepared, cfg))
 
     from transformers import TrainingArguments, set_seed
 
@@ -42,7 +45,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
     log.info("loading student %s", cfg.student.name)
-    backbone.note_base(run.folder, cfg.student.model)
+    if rank() == 0:
+        backbone.note_base(run.folder, cfg.student.model)
     model, processor = backbone.load_student(
         cfg.student, cfg.train.precision, lambda: samples.corpus(store, rationales)
     )
@@ -62,7 +66,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
     longest = training[lengths.index(max(lengths))]
     log.info(audit(model, processor, cfg.student, longest, collator))
-    order = ByLength(lengths, cfg.train.batch, cfg.seed)
+    split = cfg.train.micro_batch, ranks.ranks()
+    order = ByLength(lengths, cfg.train.batch, cfg.seed, *split)
 
     checkpoint = loop.newest_checkpoint(run.folder)
     trainer = (SightTrainer if describes else StudentTrainer)(
@@ -70,9 +75,12 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         args=TrainingArguments(
             **loop.arguments(cfg.train, run, cfg.seed, checkpoint),
             per_device_train_batch_size=cfg.train.micro_batch,
-            gradient_accumulation_steps=cfg.train.batch // cfg.train.micro_batch,
+            gradient_accumulation_steps=accumulation,
             per_device_eval_batch_size=cfg.train.micro_batch,
             label_names=["labels"],
+            # Every pass goes through all adapters; a whole model's tower has nothing to do where
+            # no frames are shown.
+            ddp_find_unused_parameters=not cfg.student.lora.rank,
         ),
         data_collator=collator.named,
         training_collator=(packs or collator).named,
@@ -85,9 +93,21 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     )
     lower = "train.micro_batch"
     loop.train_and_log(trainer, run, checkpoint, lower)
-    backbone.save(model, processor, run.folder / "student", cfg.train.precision)
+    weights = loop.gathered(trainer)
+    if rank() == 0:
+        backbone.save(model, processor, run.folder / "student", cfg.train.precision, weights)
     log.info("the student is in %s", run.folder / "student")
     return loop.evaluated(run.folder)
+
+
+def prepared(cfg: SftCommand) -> tuple[Store, list[Rationale]]:
+    """The benchmark, and the rationales where the regime has any, made where they are missing."""
+    from data.build import ensure_benchmark
+    from teacher.narrate import ensure_rationales
+
+    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    told = cfg.train.regime != "answer_only"
+    return store, ensure_rationales(store, cfg.teacher) if told else []
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from transformers import EvalPrediction, Trainer, TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.errors import UserError
-from conf.runs import write_json
+from conf.runs import rank, write_json
 from train.collate import IGNORED
 from train.planned import ByLength, Samples
 
@@ -36,14 +36,28 @@ def token_mean(
     return total / count
 
 
+def token_losses(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+    """(B, 2) each sample's cross entropy, summed over its supervised tokens, and their count."""
+    following = labels[:, 1:]
+    losses = cross_entropy(
+        logits[:, :-1].transpose(1, 2).float(), following, ignore_index=IGNORED, reduction="none"
+    )
+    return torch.stack([losses.sum(dim=-1), (following != IGNORED).sum(dim=-1)], dim=-1)
+
+
 STOPPED = "stopped.json"
-"""Names the samples whose loss was no number."""
+"""Names the samples whose loss was no number; another rank than the main one has its number in
+front."""
 
 
 class StudentTrainer(Trainer):
     """A Trainer that takes its samples in an `order` of ours and makes training batches with a
     `training_collator`, measures an evaluation by a `choice` that is told the samples, and stops
-    where a loss is no number."""
+    where a loss is no number.
+
+    The loss of an evaluation is the mean over all supervised tokens of its samples; the trainer's
+    own would hang on how they are split into micro-batches and ranks.
+    """
 
     def __init__(
         self,
@@ -55,11 +69,12 @@ class StudentTrainer(Trainer):
     ) -> None:
         super().__init__(
             *args,
-            preprocess_logits_for_metrics=choice.shrink,
-            compute_metrics=lambda prediction: choice.measure(prediction, self._measured),
+            preprocess_logits_for_metrics=self._shrink,
+            compute_metrics=self._measure,
             **settings,
         )
         self._order = order
+        self._choice = choice
         self._training_collator = training_collator
 
     def get_train_dataloader(self) -> DataLoader:
@@ -71,6 +86,19 @@ class StudentTrainer(Trainer):
 
     def _get_train_sampler(self, *_: Any) -> ByLength:
         return self._order
+
+    def _shrink(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+        """(B, 2 + kept) the losses, and what the choice keeps."""
+        return torch.cat(
+            [token_losses(logits, labels), self._choice.shrink(logits, labels)], dim=-1
+        )
+
+    def _measure(self, prediction: EvalPrediction) -> dict[str, float]:
+        losses, kept = np.split(prediction.predictions, [2], axis=-1)
+        total, count = losses.sum(axis=0, dtype=np.float64)
+        told = self._choice.measure(EvalPrediction(kept, prediction.label_ids), self._measured)
+        # The trainer names this after its own mean, which it thereby takes the place of.
+        return {**told, "loss": total / count}
 
     def evaluation_loop(self, dataloader: DataLoader, *args: Any, **settings: Any) -> Any:
         self._measured: Samples = dataloader.dataset
@@ -84,7 +112,8 @@ class StudentTrainer(Trainer):
         found = super().compute_loss(model, inputs, return_outputs, **settings)
         loss = found[0] if return_outputs else found
         if not torch.isfinite(loss):
-            step, path = self.state.global_step, Path(self.args.output_dir) / STOPPED
+            name = f"{rank()}-{STOPPED}" if rank() else STOPPED
+            step, path = self.state.global_step, Path(self.args.output_dir) / name
             write_json(path, {"step": step, "loss": str(loss.item()), "samples": ids})
             raise UserError(
                 f"the loss is {loss.item()} after step {step}; {path} names the samples. A lower "
@@ -115,16 +144,16 @@ class TokenChoice:
         self._words = {kind: torch.tensor(ids) for kind, ids in words.items()}
 
     def shrink(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
-        """(B, 1 + kinds, 2) counts of the tokens that are right and of all."""
+        """(B, 2 * (1 + kinds)) counts of the tokens that are right and of all, kind by kind."""
         chosen, following = logits[:, :-1].argmax(dim=-1), labels[:, 1:]
         right = chosen == following
         counted = [following != IGNORED]
         counted += [torch.isin(following, ids.to(labels.device)) for ids in self._words.values()]
         counts = [torch.stack([(right & c).sum(dim=-1), c.sum(dim=-1)], dim=-1) for c in counted]
-        return torch.stack(counts, dim=1)
+        return torch.cat(counts, dim=1)
 
     def measure(self, prediction: EvalPrediction, samples: Samples) -> dict[str, float]:
-        counts = prediction.predictions.sum(axis=0)
+        counts = prediction.predictions.sum(axis=0).reshape(-1, 2)
         return {
             f"{kind}_accuracy": float(right / counted)
             for kind, (right, counted) in zip(("token", *self._words), counts, strict=True)

@@ -21,7 +21,7 @@ from train.collate import IGNORED, Collator
 from train.conversation import Sample
 from train.sft_trainer import StudentTrainer
 
-WEIGHT = 16.0
+WEIGHT = 6.0
 """A named object weighs as much as this many supervised tokens."""
 PLACES = ("top", "left", "right", "center", "bottom")
 """First words of the places that an object is near."""
@@ -51,7 +51,12 @@ class SightCollator(Collator):
         )
         batch["logits_to_keep"] = torch.arange(length)
         batch["sights"] = torch.tensor(
-            [row for k, s in enumerate(samples) for row in self._of(s, k, batch["input_ids"][k])]
+            [
+                row
+                for k, s in enumerate(samples)
+                if s.supervised
+                for row in self._of(s, k, batch["input_ids"][k])
+            ]
         ).reshape(-1, 2 + WORDS)
         return batch
 
@@ -83,7 +88,9 @@ class SightTrainer(StudentTrainer):
             model, inputs, True, num_items_in_batch=num_items_in_batch
         )
         if model.training and len(sights):
-            loss = loss + WEIGHT * unnamed(outputs.logits, sights) / num_items_in_batch
+            # The mean over ranks, by which gradients are shared, is undone as in the tokens' loss.
+            ranks = self.accelerator.num_processes
+            loss = loss + ranks * WEIGHT * unnamed(outputs.logits, sights) / num_items_in_batch
         return (loss, outputs) if return_outputs else loss
 
 

@@ -19,6 +19,8 @@ class TrainConfig:
     warmup: float = 0.03
     """Share of the steps."""
     weight_decay: float = 0.0
+    adam_beta2: float = 0.999
+    """How much of the squared gradients' mean AdamW keeps from step to step."""
     max_grad_norm: float = 1.0
     epochs: float = 3.0
     max_steps: int = -1
@@ -73,7 +75,7 @@ class SftTrainConfig(TrainConfig):
     batch: int = 16
     """Samples a step, over all its micro-batches and ranks."""
     micro_batch: int = 1
-    """Samples that pass the model at once; moves memory and time, not what is learnt."""
+    """Samples that pass a rank's model at once; moves memory and time, not what is learnt."""
     packing: str = "auto"
     """Whether a micro-batch's samples stand in one row without padding, kept from seeing each
     other: true, false, or auto, where flash attention does so at no cost (never on a CPU, where it

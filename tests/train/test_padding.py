@@ -112,10 +112,15 @@ def test_each_packed_samples_loss_is_its_own(samples, processor, attending) -> N
         only = list(others)
         only[k] = encoded[k]
         # The other samples' ends are supervised too, so that each of them has its rows.
-        ends = [summed(attending, pack([one], rope)) for j, one in enumerate(others) if j != k]
+        ends = [
+            summed(attending, pack([one], rope, [True])) for j, one in enumerate(others) if j != k
+        ]
         alone = summed(attending, Collator(processor, LENGTH)([sample]))
         torch.testing.assert_close(
-            summed(attending, pack(only, rope)), alone + sum(ends), atol=1e-4, rtol=1e-6
+            summed(attending, pack(only, rope, [True] * len(only))),
+            alone + sum(ends),
+            atol=1e-4,
+            rtol=1e-6,
         )
 
 
@@ -136,7 +141,7 @@ def test_a_packed_samples_logits_know_nothing_of_its_neighbours(
 
 
 def packed_logits(model: PreTrainedModel, encoded: list[Encoded], rope: Callable) -> torch.Tensor:
-    batch = pack(encoded, rope)
+    batch = pack(encoded, rope, [True] * len(encoded))
     del batch["labels"]
     with torch.no_grad():
         return model(**batch).logits
@@ -174,7 +179,7 @@ def test_a_near_miss_of_packing_leaks(miss, samples, processor, model) -> None:
 
 def test_packed_rows_stand_where_the_model_itself_would_put_them(samples, processor, model) -> None:
     encoded = [encode(s, processor, LENGTH) for s in samples]
-    packed = pack(encoded, rope_of(model, "true"))["position_ids"]
+    packed = pack(encoded, rope_of(model, "true"), [True] * len(encoded))["position_ids"]
     assert packed.shape == (4, 1, sum(len(e.input_ids) for e in encoded))
     for one, place in zip(
         encoded, packed.split([len(e.input_ids) for e in encoded], -1), strict=True

@@ -1,0 +1,250 @@
+"""Several ranks train what one does: the same steps, numbers and weights, however they share."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from accelerate.data_loader import BatchSamplerShard
+from safetensors.torch import load_file
+from torch.utils.data import BatchSampler
+
+from conf.entry import Run
+from conf.errors import UserError
+from conf.schema import SftCommand, SftTrainConfig, TeacherConfig
+from train import loop, ranks, samples, sft
+from train.collate import IGNORED, Collator
+from train.conversation import selection_sample
+from train.loop import read_journal
+from train.planned import ByLength, Planned, Samples
+from train.sft_trainer import token_losses, token_mean
+
+ROOT = Path(__file__).parents[2]
+LAUNCHED = Path(__file__).with_name("launched.py")
+SHARDED = ("--use_fsdp", "--fsdp_version=2", "--fsdp_auto_wrap_policy=TRANSFORMER_BASED_WRAP")
+
+
+@pytest.fixture
+def settings(micro, micro_store, nf4_cfg) -> SftCommand:
+    train = SftTrainConfig(
+        lr=1e-3, max_steps=4, batch=4, micro_batch=2, precision="fp32", evaluations=2,
+        gradient_checkpointing=False, validation_items=3, permute_candidates=True,
+    )  # fmt: skip
+    return SftCommand(
+        benchmark=micro,
+        store=str(micro_store.folder.parent),
+        workers=1,
+        teacher=TeacherConfig(name="template"),
+        student=nf4_cfg,
+        train=train,
+    )
+
+
+@pytest.fixture
+def few(monkeypatch) -> None:
+    """Five training samples, as for the ranks that are launched."""
+    spec = importlib.util.spec_from_file_location("launched", LAUNCHED)
+    launched = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(launched)
+    monkeypatch.setattr(samples, "supervised_items", launched.fewer)
+
+
+def alone(settings: SftCommand, folder: Path, after: Path | None = None) -> Path:
+    """A run of one rank, from its start or a checkpoint."""
+    folder.mkdir(parents=True)
+    if after is not None:
+        shutil.copytree(after, folder / after.name)
+    sft.main.__wrapped__(settings, Run(folder.name, folder))
+    return folder
+
+
+def planned(settings: SftCommand, folder: Path, **changes: Any) -> dict[str, Any]:
+    """What launched.py is told of a run."""
+    student, train = settings.student, settings.train
+    overrides = [
+        "+exp=cot", "benchmark=micro", f"store={settings.store}", f"run={folder.name}",
+        f"checkpoints={folder.parents[1]}", "workers=1",
+        *(f"student.{key}={getattr(student, key)}" for key in ("name", "model", "quantization")),
+        *(f"student.{key}={getattr(student, key)}" for key in ("image_size", "max_length")),
+        f"student.lora.rank={student.lora.rank}",
+        *(f"train.{key}={value}" for key, value in asdict(train).items() if key != "report_to"),
+    ]  # fmt: skip
+    unless = {"fsdp": False, "after": None, "fails_on": None}
+    return {**unless, "overrides": overrides, "folder": folder, **changes}
+
+
+def launch(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Two ranks on CPUs, whatever GPUs there are."""
+    accelerate = Path(sys.executable).with_name("accelerate")
+    command = [accelerate, "launch", "--num_processes=2", "--main_process_port=0", *arguments]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
+    return subprocess.run(
+        list(map(str, command)),
+        cwd=ROOT, env={**environment, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True,
+    )  # fmt: skip
+
+
+def same(one: Path, two: Path, step: int = -1) -> None:
+    """The journals after a step, but for shares of an epoch, which are counted in a rank's
+    micro-batches; and the weights."""
+    journals = [
+        [{k: v for k, v in r.items() if k != "epoch"} for r in read_journal(f) if r["step"] > step]
+        for f in (one, two)
+    ]
+    for first, second in zip(*journals, strict=True):
+        assert first == pytest.approx(second, rel=1e-5)
+    same_weights(one, two)
+
+
+def same_weights(one: Path, two: Path) -> None:
+    weights = [load_file(f / "student" / "adapter_model.safetensors") for f in (one, two)]
+    assert weights[0].keys() == weights[1].keys()
+    for name, weight in weights[0].items():
+        torch.testing.assert_close(weight, weights[1][name], atol=1e-6, rtol=1e-5)
+
+
+def said(ended: subprocess.CompletedProcess[str]) -> list[str]:
+    """The errors that a user is told; what a bug looks like fails."""
+    assert "[rank0]: Traceback" not in ended.stderr
+    assert "[rank1]: Traceback" not in ended.stderr
+    return [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
+
+
+@pytest.mark.slow
+def test_two_ranks_are_one_with_twice_the_accumulation(settings, few, tmp_path) -> None:
+    """With every rank holding the adapters, or by FSDP a part of them. So is a run that was killed,
+    and one that one rank began and two go on with, or the reverse. What goes wrong on one rank ends
+    both with one sentence."""
+    runs = tmp_path / "sft"
+    one = alone(settings, runs / "one")
+    told = [
+        planned(settings, runs / "two"),
+        planned(settings, runs / "more", after=one / "checkpoint-2"),
+        planned(settings, runs / "parts", fsdp=True),
+        planned(settings, runs / "on", fsdp=True, after=runs / "parts" / "checkpoint-2"),
+        planned(settings, runs / "done", fsdp=True, after=runs / "parts" / "checkpoint-4"),
+        planned(settings, runs / "lost", fails_on=1),
+    ]
+    file = tmp_path / "runs.json"
+    benchmark = asdict(settings.benchmark)
+    file.write_text(json.dumps({"benchmark": benchmark, "runs": told}, default=str))
+    ended = launch(*SHARDED, LAUNCHED, file)
+    assert said(ended) == ["error: this rank alone cannot go on"], ended.stderr
+    assert ended.returncode == 1
+    for name in ("two", "parts"):
+        same(one, runs / name)
+    for name in ("more", "on"):
+        same(one, runs / name, step=2)
+    same_weights(one, runs / "done")
+    fewer = alone(settings, runs / "fewer", after=runs / "two" / "checkpoint-2")
+    same(one, fewer, step=2)
+    with pytest.raises(UserError, match="was written with FSDP: start the run with it again"):
+        alone(settings, runs / "mixed", after=runs / "parts" / "checkpoint-2")
+    record = json.loads((runs / "two" / "run.json").read_text())
+    assert (record["ranks"], record["earlier_starts"]) == (2, [])
+    assert (runs / "two" / "run.log").read_text().count("loading student") == 1
+    assert json.loads((runs / "two" / "metrics.json").read_text()) == pytest.approx(
+        loop.evaluated(one), rel=1e-5
+    )
+
+
+@pytest.mark.slow
+def test_what_is_wrong_for_all_ranks_is_said_once(tmp_path) -> None:
+    overrides = ["+exp=cot", "train.batch=6", "train.micro_batch=2", f"checkpoints={tmp_path}"]
+    ended = launch("--multi_gpu", "-m", "train.sft", *overrides)
+    assert ended.returncode == 1
+    assert said(ended) == [
+        "error: train.batch=6 cannot be split over 2 ranks in micro-batches of "
+        "train.micro_batch=2: set train.batch to a multiple of 4, such as 8, or start another "
+        "number of ranks"
+    ]
+
+
+@pytest.mark.slow
+def test_fsdp_that_would_be_passed_over_is_refused(settings, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
+    with pytest.raises(UserError, match="FSDP for several GPUs only"):
+        alone(settings, tmp_path / "run")
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 8, 11, 64])
+@pytest.mark.parametrize(("micro_batch", "number"), [(1, 2), (2, 2), (4, 2), (2, 4), (1, 8)])
+def test_ranks_share_the_steps_of_one(count, micro_batch, number) -> None:
+    """As accelerate deals out an order: micro-batches in turn."""
+    lengths = np.random.default_rng(0).integers(1, 1000, count).tolist()
+    alone = list(ByLength(lengths, 8, 0))
+    order = ByLength(lengths, 8, 0, micro_batch, number)
+    batches = BatchSampler(order, micro_batch, drop_last=False)
+    dealt = [list(BatchSamplerShard(batches, number, rank)) for rank in range(number)]
+    assert len(order) == len(list(order)) == sum(len(b) for part in dealt for b in part)
+    each = 8 // (micro_batch * number)
+    for step in range(0, count, 8):
+        first = step // 8 * each
+        taken = [i for part in dealt for b in part[first : first + each] for i in b]
+        supervised = sorted(i for i in taken if i >= 0)
+        assert supervised == sorted(alone[step : step + 8])
+        # Fillers are the shortest there is.
+        assert {~i for i in taken if i < 0} <= {alone[step : step + 8][-1]}
+    assert len({len(part) for part in dealt}) == 1
+
+
+def test_ranks_have_as_much_to_do() -> None:
+    """None gets the longer of each two neighbours."""
+    lengths = np.random.default_rng(0).integers(1, 1000, 64)
+    order = np.array(list(ByLength(lengths.tolist(), 64, 0, 1, 2))).reshape(-1, 2)
+    loads = lengths[order].sum(axis=0)
+    assert abs(loads[0] - loads[1]) <= lengths.max() - lengths.min()
+    assert (lengths[order[::2, 0]] >= lengths[order[::2, 1]]).all()
+    assert (lengths[order[1::2, 0]] <= lengths[order[1::2, 1]]).all()
+
+
+def test_a_filler_changes_no_loss(micro_store, frames, student_cfg, processor, model) -> None:
+    items = micro_store.selection("train")[:2]
+    made = Samples(
+        [
+            Planned("", 0, partial(shown, item, frames, student_cfg, text))
+            for item, text in zip(items, ("Answer: A", "near the top\nAnswer: B"), strict=True)
+        ]
+    )
+    collate = Collator(processor, 1500)
+    plain = collate([made[0], made[1]])
+    filled = collate([made[0], made[1], made[~0]])
+    count = int((plain["labels"] != IGNORED).sum())
+    assert int((filled["labels"] != IGNORED).sum()) == count
+    losses = []
+    for batch in (plain, filled, collate([made[~1]])):
+        labels = batch.pop("labels")
+        logits = model(**batch, use_cache=False).logits
+        losses.append(token_mean(SimpleNamespace(logits=logits), labels, count))
+        each = token_losses(logits, labels)
+        torch.testing.assert_close(each[:, 0].sum() / count, losses[-1])
+    torch.testing.assert_close(losses[0], losses[1])
+    assert losses[2] == 0
+    losses[2].backward()
+    assert all((p.grad == 0).all() for p in model.parameters() if p.grad is not None)
+
+
+def shown(item, frames, cfg, text, epoch):
+    return selection_sample(item, "answer", "cot", frames, cfg, text)
+
+
+def test_a_step_is_split_over_micro_batches_and_ranks(monkeypatch) -> None:
+    assert ranks.accumulation(16, 2) == 8
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    monkeypatch.setenv("RANK", "1")
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    assert ranks.accumulation(16, 2) == 2
+    with pytest.raises(UserError, match=r"batch=16 .* 4 ranks .*micro_batch=8: set .* of 32"):
+        ranks.accumulation(16, 8)

@@ -1,0 +1,49 @@
+"""Several ranks train one model: who prepares for all, and what each takes of a step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import timedelta
+from typing import TypeVar
+
+from conf.errors import UserError
+from conf.runs import rank, ranks
+
+PATIENCE = timedelta(days=30)
+"""How long ranks wait while the main one builds and narrates."""
+
+Made = TypeVar("Made")
+
+
+def from_main(make: Callable[[], Made]) -> Made:
+    """What `make` gives on the main rank, on every one; the others wait for it as long as it takes.
+    Alone, a process just makes it."""
+    if ranks() == 1:
+        return make()
+    import torch
+    from accelerate import PartialState
+
+    # Gives a rank its GPU too.
+    PartialState(cpu=not torch.cuda.is_available())
+    # A group of its own: ranks that wait in a step so long have lost another.
+    waiting = torch.distributed.new_group(backend="gloo", timeout=PATIENCE)
+    made = [make() if rank() == 0 else None]
+    torch.distributed.broadcast_object_list(made, src=0, group=waiting)
+    return made[0]
+
+
+def accumulation(batch: int, micro_batch: int) -> int:
+    """How many micro-batches a rank takes of a step of `batch` samples over all ranks.
+
+    Raises:
+        UserError: they cannot all be full.
+    """
+    at_once = micro_batch * ranks()
+    if batch % at_once:
+        near = max(1, round(batch / at_once)) * at_once
+        raise UserError(
+            f"train.batch={batch} cannot be split over {ranks()} ranks in micro-batches of "
+            f"train.micro_batch={micro_batch}: set train.batch to a multiple of {at_once}, such as "
+            f"{near}, or start another number of ranks"
+        )
+    return batch // at_once
