@@ -20,7 +20,7 @@ from teacher.sections import SECTIONS, parts
 from teacher.validate import validate
 from train.conversation import answer_line, instruction, response
 from train.planned import Samples
-from train.samples import Supervised, supervised_items
+from train.samples import HELD_OUT, Supervised, held_out_scenes, supervised_items
 
 TEACHER = TeacherConfig(name="template")
 ASKED = [r for r in REGIMES if r not in ("answer_only", "describe")]
@@ -131,3 +131,21 @@ def test_a_mode_that_was_not_trained_is_told(tmp_path, monkeypatch) -> None:
     cfg = SelectCommand(model=str(tmp_path), modes=["reasoning"])
     with pytest.raises(UserError, match=r"answer mode alone .* give modes=\[answer\]"):
         select.main.__wrapped__(cfg, None)
+
+
+class Names:
+    """All of a store that says which scenes are held out."""
+
+    def __init__(self, names: list[str]) -> None:
+        self.names = names
+
+    def scene_ids(self, split: str) -> list[str]:
+        return self.names
+
+
+def test_a_scene_is_held_out_whatever_else_a_store_holds() -> None:
+    names = [f"s0-{k:06d}" for k in range(2000)]
+    held_out = held_out_scenes(Names(names))
+    assert len(held_out) == pytest.approx(HELD_OUT * len(names), rel=0.15)
+    assert held_out_scenes(Names(names[:500])) == held_out & set(names[:500])
+    assert len(held_out_scenes(Names(names[:1]))) == 1
