@@ -157,4 +157,4 @@ def conversation(
         for part in parts
     ]
     images = [part for part in parts if not isinstance(part, str)]
-    return Sample(sample_id, content, clip, images, response, tuple(sights))
+    return Sample(sample_id, content, clip, images, response, sights=tuple(sights))
