@@ -29,7 +29,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from transformers import TrainingArguments, set_seed
 
     from data.frames import Frames
-    from train import backbone, loop, samples
+    from train import backbone, loop, memory, samples
     from train.audit import audit
     from train.collate import Collator, letter_ids
     from train.planned import ByLength
@@ -54,7 +54,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
     longest = training[lengths.index(max(lengths))]
     log.info(audit(model, processor, cfg.student, longest, collator))
-    order = ByLength(lengths, cfg.train.batch, cfg.seed)
+    train = memory.settle(cfg.train, run.folder, model, collator, training, lengths)
+    order = ByLength(lengths, train.batch, cfg.seed)
 
     # Descriptions end in no answer whose letter could be measured.
     describes = cfg.train.regime == "describe"
@@ -63,10 +64,10 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     trainer = StudentTrainer(
         model=model,
         args=TrainingArguments(
-            **loop.arguments(cfg.train, run, cfg.seed, checkpoint),
-            per_device_train_batch_size=cfg.train.micro_batch,
-            gradient_accumulation_steps=cfg.train.batch // cfg.train.micro_batch,
-            per_device_eval_batch_size=cfg.train.micro_batch,
+            **loop.arguments(train, run, cfg.seed, checkpoint),
+            per_device_train_batch_size=train.micro_batch,
+            gradient_accumulation_steps=train.batch // train.micro_batch,
+            per_device_eval_batch_size=train.micro_batch,
             label_names=["labels"],
         ),
         data_collator=collator.named,
@@ -77,8 +78,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         order=order,
         choice=choice,
     )
-    lower = "train.micro_batch"
-    loop.train_and_log(trainer, run, checkpoint, lower)
+    loop.train_and_log(trainer, run, checkpoint, memory.lower(train))
     backbone.save(model, processor, run.folder / "student", cfg.train.precision)
     log.info("the student is in %s", run.folder / "student")
     return loop.evaluated(run.folder)

@@ -26,6 +26,7 @@ class TrainConfig:
     precision: str = "bf16"
     """bf16 or fp32: what the passes compute in; adapters and optimizer stay fp32."""
     gradient_checkpointing: bool = True
+    """Whether activations are computed again in the backward pass: less memory, more time."""
     evaluations: int = 10
     """Evaluations, evenly spread over the run, each followed by a checkpoint."""
     keep: int = 2
@@ -72,20 +73,32 @@ class SftTrainConfig(TrainConfig):
     tiny base)."""
     batch: int = 16
     """Samples a step, over all its micro-batches and ranks."""
-    micro_batch: int = 1
-    """Samples that pass the model at once; moves memory and time, not what is learnt."""
+    micro_batch: int | str = 1
+    """Samples that pass the model at once; moves memory and time, not what is learnt. auto takes
+    the fastest number that fits, by trying the longest samples."""
+    gradient_checkpointing: bool | str = "auto"
+    """Whether activations are computed again in the backward pass: less memory, more time. auto
+    does so only where they do not fit."""
     permute_candidates: bool = False
     """Whether each epoch shows every item's candidates in an order of its own."""
     validation_items: int = 64
     """Training-split items of held-out training scenes that measure the run."""
 
     def check(self) -> list[str]:
-        problems = super().check() + too_small(
-            self, "train.", {"batch": 1, "micro_batch": 1, "validation_items": 1}
-        )
-        if self.batch % max(1, self.micro_batch):
+        problems = super().check() + too_small(self, "train.", {"batch": 1, "validation_items": 1})
+        if isinstance(self.micro_batch, str):
+            if self.micro_batch != "auto":
+                problems.append(f"train.micro_batch={self.micro_batch}: give a number or auto")
+        elif self.micro_batch < 1:
+            problems.append(f"train.micro_batch={self.micro_batch} must be 1 or more")
+        elif self.batch % self.micro_batch:
             problems.append(
                 f"train.micro_batch={self.micro_batch} must divide train.batch={self.batch}"
+            )
+        if self.gradient_checkpointing not in (True, False, "auto"):
+            problems.append(
+                f"train.gradient_checkpointing={self.gradient_checkpointing}: the options are "
+                "auto, true and false"
             )
         if self.regime not in REGIMES:
             problems.append(f"train.regime={self.regime}: the options are {', '.join(REGIMES)}")
