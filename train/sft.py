@@ -68,6 +68,9 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
             per_device_train_batch_size=train.micro_batch,
             gradient_accumulation_steps=train.batch // train.micro_batch,
             per_device_eval_batch_size=train.micro_batch,
+            dataloader_prefetch_factor=loop.prefetched(
+                train.workers, train.batch // train.micro_batch
+            ),
             label_names=["labels"],
         ),
         data_collator=collator.named,

@@ -32,7 +32,8 @@ class TrainConfig:
     keep: int = 2
     """Checkpoints kept."""
     workers: int = 0
-    """Processes that prepare batches."""
+    """Processes that prepare batches while the model computes; 0 leaves it to the trainer's own
+    process."""
     report_to: list[str] = field(default_factory=list)
     """Trackers of transformers' Trainer, such as tensorboard, wandb or trackio."""
 
