@@ -32,6 +32,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from train import backbone, loop, memory, samples
     from train.audit import audit
     from train.collate import Collator, letter_ids
+    from train.features import Features, Keyed
     from train.planned import ByLength
     from train.sft_trainer import Epochs, LetterChoice, StudentTrainer, TokenChoice, token_mean
 
@@ -56,6 +57,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     log.info(audit(model, processor, cfg.student, longest, collator))
     train = memory.settle(cfg.train, run.folder, model, collator, training, lengths)
     order = ByLength(lengths, train.batch, cfg.seed)
+    features = Features.of(model, train) if train.reuse_features else None
 
     # Descriptions end in no answer whose letter could be measured.
     describes = cfg.train.regime == "describe"
@@ -73,13 +75,14 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
             ),
             label_names=["labels"],
         ),
-        data_collator=collator.named,
+        data_collator=Keyed(collator) if features else collator.named,
         train_dataset=training,
         eval_dataset=validation,
         compute_loss_func=token_mean,
         callbacks=[Epochs(training, order)],
         order=order,
         choice=choice,
+        features=features,
     )
     loop.train_and_log(trainer, run, checkpoint, memory.lower(train))
     backbone.save(model, processor, run.folder / "student", cfg.train.precision)

@@ -17,6 +17,7 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 from conf.errors import UserError
 from conf.runs import write_json
 from train.collate import IGNORED
+from train.features import Features
 from train.planned import ByLength, Samples
 
 
@@ -44,8 +45,14 @@ class StudentTrainer(Trainer):
     that is told the samples, and stops where a loss is no number."""
 
     def __init__(
-        self, *args: Any, order: ByLength, choice: TokenChoice | LetterChoice, **settings: Any
+        self,
+        *args: Any,
+        order: ByLength,
+        choice: TokenChoice | LetterChoice,
+        features: Features | None = None,
+        **settings: Any,
     ) -> None:
+        """`features`: keeps the frozen tower's outputs; the collator is then `features.Keyed`."""
         super().__init__(
             *args,
             preprocess_logits_for_metrics=choice.shrink,
@@ -53,6 +60,7 @@ class StudentTrainer(Trainer):
             **settings,
         )
         self._order = order
+        self._features = features
 
     def _get_train_sampler(self, *_: Any) -> ByLength:
         return self._order
@@ -66,6 +74,8 @@ class StudentTrainer(Trainer):
     ) -> Any:
         """Raises UserError for a loss that is no number; the samples' ids are then in a file."""
         ids = inputs.pop("sample_ids")
+        if self._features is not None:
+            self._features.give(inputs)
         found = super().compute_loss(model, inputs, return_outputs, **settings)
         loss = found[0] if return_outputs else found
         if not torch.isfinite(loss):

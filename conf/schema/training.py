@@ -80,6 +80,9 @@ class SftTrainConfig(TrainConfig):
     gradient_checkpointing: bool | str = "auto"
     """Whether activations are computed again in the backward pass: less memory, more time. auto
     does so only where they do not fit."""
+    reuse_features: bool = False
+    """Whether what the frozen vision tower makes of a frame is kept in memory and used wherever
+    the frame is shown again; about 3 MB a frame of an 8B model, in half of the free memory."""
     permute_candidates: bool = False
     """Whether each epoch shows every item's candidates in an order of its own."""
     validation_items: int = 64
