@@ -2,18 +2,20 @@
 to the trainer (`auto`) is tried on the run's longest samples and noted in the run's folder.
 
 Neither changes what is learnt. Keeping activations is faster than recomputing them, so they are
-kept wherever that fits; the micro-batch then grows as long as it fits and makes a sample faster.
+kept wherever that fits; the micro-batch then grows as long as it fits and makes a step faster.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import torch
 from accelerate import PartialState
@@ -24,7 +26,7 @@ from conf.runs import write_json
 from conf.schema import SftTrainConfig
 from train.collate import Collator
 from train.loop import is_out_of_memory
-from train.planned import Samples
+from train.planned import ByLength, Samples
 from train.room import available, peak, start_peak
 from train.sft_trainer import token_mean
 
@@ -35,8 +37,8 @@ NOTE = "memory.json"
 SHARE = 0.8
 """Of the free memory that a step may take: blocks do not fill it without gaps, and which samples
 are longest is known only about."""
-FASTER = 0.95
-"""A bigger micro-batch must take less than this share of the time that a sample took before."""
+FASTER = 0.97
+"""A bigger micro-batch must take less than this share of the time that a step took before."""
 MOMENTS = 8
 """Bytes of AdamW's two fp32 moments of a trained weight."""
 
@@ -47,18 +49,15 @@ class Choice:
     gradient_checkpointing: bool
 
 
-@dataclass(frozen=True)
-class Tried:
-    """A forward and backward pass of `samples` samples: the most bytes that it held on top of what
-    was held before, and how long it took."""
+class Trial(Protocol):
+    """What a step takes with so many samples at once, recomputing activations or not."""
 
-    samples: int
-    bytes: int
-    seconds: float
+    def bytes(self, micro_batch: int, recompute: bool) -> int | None:
+        """The most that the longest samples hold, on top of what was held before; None where
+        memory ran out."""
 
-
-Try = Callable[[int, bool], Tried | None]
-"""Passes so many samples, recomputing activations or not; None where memory ran out."""
+    def seconds(self, micro_batch: int, recompute: bool) -> float:
+        """What all samples of a step take, one micro-batch after the other."""
 
 
 def settle(
@@ -81,20 +80,21 @@ def settle(
     # Ranks on CPUs share one memory.
     sharing = state.num_processes if state.device.type == "cpu" else 1
     limit = int(SHARE * available(state.device) / sharing) - optimizer_bytes(model)
-    with probe(model, collator, training, lengths, train.precision) as attempt:
-        choice, needed = choose(attempt, train, share, limit)
+    with probing(model):
+        trial = Passes(model, collator, training, lengths, train, share)
+        choice, needed = choose(trial, train, share, limit)
     # All ranks have to make the same steps.
     choice = least(gather_object([choice]))
-    log.info(
-        "micro-batch %d of %d samples, activations %s: %s",
-        choice.micro_batch,
-        train.batch,
-        "recomputed" if choice.gradient_checkpointing else "kept",
-        f"more than the {gib(limit)} that are free"
-        if needed is None
-        else f"{gib(needed)} of {gib(limit)}",
-    )
     if state.is_main_process:
+        log.info(
+            "micro-batch %d of %d samples, activations %s: %s",
+            choice.micro_batch,
+            train.batch,
+            "recomputed" if choice.gradient_checkpointing else "kept",
+            f"more than the {gib(limit)} that are free"
+            if needed is None
+            else f"{gib(needed)} of {gib(limit)}",
+        )
         write_json(folder / NOTE, asdict(choice))
     return replace(train, **asdict(choice))
 
@@ -115,7 +115,7 @@ def least(choices: Sequence[Choice]) -> Choice:
 
 
 def choose(
-    attempt: Try, train: SftTrainConfig, share: int, limit: int
+    trial: Trial, train: SftTrainConfig, share: int, limit: int
 ) -> tuple[Choice, int | None]:
     """What of a rank's `share` samples a step fits into `limit` bytes, and the bytes that it takes;
     the least that there is, and None, where nothing fits."""
@@ -123,30 +123,33 @@ def choose(
     candidates = sizes(share) if given == "auto" else [1]
     modes = (False, True) if asked == "auto" else (bool(asked),)
     for recompute in modes:
-        best = climb(lambda size, on=recompute: attempt(size, on), candidates, limit)
-        if best is not None:
-            size = best.samples if given == "auto" else int(given)
-            needed = best.bytes * size // best.samples
+        if (best := climb(trial, recompute, candidates, limit)) is not None:
+            tried, held = best
+            size = tried if given == "auto" else int(given)
+            needed = held * size // tried
             if needed <= limit:
                 return Choice(size, recompute), needed
     return Choice(1 if given == "auto" else int(given), modes[-1]), None
 
 
 def climb(
-    attempt: Callable[[int], Tried | None], candidates: Sequence[int], limit: int
-) -> Tried | None:
-    """The fastest of growing micro-batches that fits into `limit` bytes; none is tried that might
-    not, by what the one before took. On a CPU the kernel would end the process."""
-    best = None
+    trial: Trial, recompute: bool, candidates: Sequence[int], limit: int
+) -> tuple[int, int] | None:
+    """The fastest of growing micro-batches that fits into `limit` bytes, and its bytes; none is
+    tried that might not fit, by what the one before took: on a CPU the kernel would end the
+    process."""
+    best, best_seconds = None, math.inf
     for size in candidates:
-        if best is not None and best.bytes * size > limit * best.samples:
+        if best is not None and best[1] * size > limit * best[0]:
             break
-        tried = attempt(size)
-        if tried is None or tried.bytes > limit:
+        held = trial.bytes(size, recompute)
+        if held is None or held > limit:
             break
-        if best is not None and tried.seconds / size > FASTER * best.seconds / best.samples:
+        # One candidate needs no comparing.
+        seconds = trial.seconds(size, recompute) if len(candidates) > 1 else 0.0
+        if seconds > FASTER * best_seconds:
             break
-        best = tried
+        best, best_seconds = (size, held), seconds
     return best
 
 
@@ -160,44 +163,82 @@ def sizes(share: int) -> list[int]:
 
 
 @contextmanager
-def probe(
-    model: nn.Module,
-    collator: Collator,
-    training: Samples,
-    lengths: Sequence[int],
-    precision: str,
-) -> Iterator[Try]:
-    """Tries the longest samples on a model that has no gradients, and leaves it, and what is drawn
-    after, as if it had not."""
+def probing(model: nn.Module) -> Iterator[None]:
+    """Leave a model that has no gradients, and what is drawn after, as if nothing were tried."""
     device = next(model.parameters()).device
-    longest = sorted(range(len(lengths)), key=lambda k: -lengths[k])
     was_training = model.training
-
-    def attempt(count: int, recompute: bool) -> Tried | None:
-        switch(model, recompute)
-        batch = collator([training[longest[k % len(longest)]] for k in range(count)])
-        batch = {name: value.to(device) for name, value in batch.items()}
-        labels = batch.pop("labels")
-
-        def step() -> None:
-            try:
-                with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
-                    loss = token_mean(model(**batch), labels)
-                loss.backward()
-            finally:
-                model.zero_grad()
-
-        return measured(step, count, device)
-
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
         try:
             model.train()
-            yield attempt
+            yield
         finally:
             switch(model, False)
             model.train(was_training)
             if device.type == "cuda":
                 torch.cuda.empty_cache()
+
+
+class Passes:
+    """Trials by forward and backward passes of the run's own samples."""
+
+    def __init__(
+        self,
+        model: nn.Module,
+        collator: Collator,
+        training: Samples,
+        lengths: Sequence[int],
+        train: SftTrainConfig,
+        share: int,
+    ) -> None:
+        self._model = model
+        self._collator = collator
+        self._training = training
+        self._longest = sorted(range(len(lengths)), key=lambda k: -lengths[k])
+        self._step = list(ByLength(lengths, train.batch, 0))[:share]
+        self._bf16 = train.precision == "bf16"
+        self._device = next(model.parameters()).device
+
+    def bytes(self, micro_batch: int, recompute: bool) -> int | None:
+        switch(self._model, recompute)
+        longest = self._longest
+        batch = self._batch([longest[k % len(longest)] for k in range(micro_batch)])
+        held = start_peak(self._device)
+        try:
+            self._pass(batch)
+        except RuntimeError as error:
+            if not is_out_of_memory(error):
+                raise
+            return None
+        return max(0, peak(self._device) - held)
+
+    def seconds(self, micro_batch: int, recompute: bool) -> float:
+        switch(self._model, recompute)
+        # Making the samples is no part of it: workers may do that.
+        batches = [
+            self._batch(self._step[k : k + micro_batch])
+            for k in range(0, len(self._step), micro_batch)
+        ]
+        self._pass(batches[0])
+        started = time.perf_counter()
+        for batch in batches:
+            self._pass(batch)
+        return time.perf_counter() - started
+
+    def _batch(self, indices: Sequence[int]) -> dict[str, torch.Tensor]:
+        batch = self._collator([self._training[k] for k in indices])
+        return {name: value.to(self._device) for name, value in batch.items()}
+
+    def _pass(self, batch: dict[str, torch.Tensor]) -> None:
+        labels = batch["labels"]
+        inputs = {name: value for name, value in batch.items() if name != "labels"}
+        try:
+            with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
+                loss = token_mean(self._model(**inputs), labels)
+            loss.backward()
+        finally:
+            self._model.zero_grad()
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
 
 
 def switch(model: nn.Module, recompute: bool) -> None:
@@ -209,24 +250,6 @@ def switch(model: nn.Module, recompute: bool) -> None:
         getattr(model, f"{name}_enable")(**{f"{name}_kwargs": {"use_reentrant": False}})
     else:
         getattr(model, f"{name}_disable")()
-
-
-def measured(step: Callable[[], None], samples: int, device: torch.device) -> Tried | None:
-    """What a step takes; the better time of two, since the first warms up."""
-    held = start_peak(device)
-    seconds = []
-    try:
-        for _ in range(2):
-            started = time.perf_counter()
-            step()
-            if device.type == "cuda":
-                torch.cuda.synchronize(device)
-            seconds.append(time.perf_counter() - started)
-    except RuntimeError as error:
-        if not is_out_of_memory(error):
-            raise
-        return None
-    return Tried(samples, max(0, peak(device) - held), min(seconds))
 
 
 def lower(train: SftTrainConfig) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
@@ -14,23 +14,30 @@ from conf.schema import SftCommand, SftTrainConfig
 from train import loop, memory, room, sft
 from train.backbone import load_student
 from train.collate import Collator
-from train.memory import Choice, Tried, choose, climb, settle, sizes
+from train.memory import Choice, choose, settle, sizes
 from train.planned import Samples
 from train.samples import splits
 
 AUTO = SftTrainConfig(micro_batch="auto", gradient_checkpointing="auto")
 
 
-def linear(fixed: int, kept: int, recomputed: int, overhead: float = 0.0):
-    """A step that takes bytes and seconds in proportion to its samples, on top of fixed ones."""
+@dataclass
+class Linear:
+    """A step of 16 samples that holds bytes and takes seconds by its samples and micro-batches."""
 
-    def attempt(samples: int, recompute: bool) -> Tried:
-        each = recomputed if recompute else kept
-        return Tried(
-            samples, fixed + samples * each, overhead + samples * (1.3 if recompute else 1)
-        )
+    fixed: int = 100
+    kept: int = 1000
+    recomputed: int = 90
+    overhead: float = 0.0
+    """Seconds of a micro-batch, next to one of each sample."""
+    tried: list[tuple[int, bool]] = field(default_factory=list)
 
-    return attempt
+    def bytes(self, micro_batch: int, recompute: bool) -> int | None:
+        self.tried.append((micro_batch, recompute))
+        return self.fixed + micro_batch * (self.recomputed if recompute else self.kept)
+
+    def seconds(self, micro_batch: int, recompute: bool) -> float:
+        return 16 * (1.3 if recompute else 1.0) + 16 / micro_batch * self.overhead
 
 
 def test_sizes_divide_a_step() -> None:
@@ -42,56 +49,47 @@ def test_sizes_divide_a_step() -> None:
 
 @pytest.mark.parametrize("overhead", [0.0, 0.5, 100.0])
 def test_less_memory_never_takes_more(overhead) -> None:
-    attempt = linear(100, 1000, 90, overhead)
-    chosen = [choose(attempt, AUTO, 16, limit)[0] for limit in range(50, 20_000, 50)]
+    trial = Linear(overhead=overhead)
+    limits = range(50, 20_000, 50)
+    chosen = [choose(trial, AUTO, 16, limit)[0] for limit in limits]
     kept = [not c.gradient_checkpointing for c in chosen]
     # Activations are kept from the first limit on that one sample fits into.
-    assert kept == [limit >= 1100 for limit in range(50, 20_000, 50)]
+    assert kept == [limit >= 1100 for limit in limits]
     for mode in (True, False):
         micro = [c.micro_batch for c, k in zip(chosen, kept, strict=True) if k == mode]
         assert micro == sorted(micro)
         assert micro[0] == 1
-    # Where a pass has costs of its own, all that fits passes at once.
-    assert overhead < 100 or chosen[-1].micro_batch == 16
+    # Where a pass has costs of its own, more pass at once, until that saves no more.
+    assert chosen[-1].micro_batch == {0.0: 1, 0.5: 8, 100.0: 16}[overhead]
 
 
 @pytest.mark.parametrize("limit", range(100, 20_000, 700))
 def test_what_is_tried_and_what_is_chosen_fits(limit) -> None:
-    tried = []
-
-    def noted(samples: int, recompute: bool) -> Tried:
-        tried.append(linear(100, 1000, 90, 100.0)(samples, recompute))
-        return tried[-1]
-
-    choice, needed = choose(noted, AUTO, 16, limit)
+    trial = Linear(overhead=100.0)
+    choice, needed = choose(trial, AUTO, 16, limit)
     # One sample has to be tried; nothing beyond it that does not fit.
-    assert all(t.bytes <= limit for t in tried if t.samples > 1)
-    exact = linear(100, 1000, 90)(choice.micro_batch, choice.gradient_checkpointing).bytes
+    assert all(Linear().bytes(*tried) <= limit for tried in trial.tried if tried[0] > 1)
+    exact = Linear().bytes(choice.micro_batch, choice.gradient_checkpointing)
     assert needed is None or exact <= needed <= limit
     assert (needed is None) == (limit < 190)
 
 
-def test_a_bigger_micro_batch_must_be_faster() -> None:
-    assert climb(lambda n: linear(0, 1, 1)(n, False), sizes(16), 1000).samples == 1
-    assert climb(lambda n: linear(0, 1, 1, 100.0)(n, False), sizes(16), 1000).samples == 16
-
-
 def test_running_out_while_trying_is_not_fitting() -> None:
-    def attempt(samples: int, recompute: bool) -> Tried | None:
-        return linear(0, 1, 1, 100.0)(samples, recompute) if recompute and samples < 4 else None
+    class Small(Linear):
+        def bytes(self, micro_batch: int, recompute: bool) -> int | None:
+            return 1 if recompute and micro_batch < 4 else None
 
-    assert choose(attempt, AUTO, 16, 1000)[0] == Choice(2, True)
+    assert choose(Small(overhead=100.0), AUTO, 16, 1000)[0] == Choice(2, True)
 
 
 @pytest.mark.parametrize("micro_batch", [1, 4])
 def test_a_given_micro_batch_stays_and_is_counted_whole(micro_batch) -> None:
     given = replace(AUTO, micro_batch=micro_batch)
-    attempt = linear(0, 1000, 90)
     for limit, recompute in ((1000 * micro_batch, False), (1000 * micro_batch - 1, True)):
-        choice, _ = choose(attempt, given, 16, limit)
+        choice, _ = choose(Linear(fixed=0), given, 16, limit)
         assert choice == Choice(micro_batch, recompute)
     kept = replace(AUTO, gradient_checkpointing=False)
-    assert not choose(attempt, kept, 16, 1)[0].gradient_checkpointing
+    assert not choose(Linear(), kept, 16, 1)[0].gradient_checkpointing
 
 
 def test_the_ranks_agree_on_what_fits_all() -> None:
@@ -100,12 +98,13 @@ def test_the_ranks_agree_on_what_fits_all() -> None:
 
 
 def test_bytes_are_those_of_the_step() -> None:
-    """A step that holds 256 MiB takes those, whatever was held and freed before; the next one's
-    may lie beside what it left."""
+    """A step that holds 256 MiB takes those, whatever was held and freed before."""
     spent = torch.ones(64 << 20)
     del spent
-    found = memory.measured(lambda: torch.ones(64 << 20).sum(), 1, torch.device("cpu"))
-    assert 0.95 * (256 << 20) < found.bytes < 2.2 * (256 << 20)
+    held = room.start_peak(torch.device("cpu"))
+    torch.ones(64 << 20).sum()
+    found = room.peak(torch.device("cpu")) - held
+    assert 0.95 * (256 << 20) < found < 1.2 * (256 << 20)
 
 
 def test_a_containers_limit_holds(tmp_path, monkeypatch) -> None:
@@ -165,11 +164,10 @@ def test_where_memory_is_short_activations_are_recomputed(
     settings, student, tmp_path, monkeypatch
 ) -> None:
     model, *others = student
-    limits = []
-    with memory.probe(model, *others, "fp32") as attempt:
-        for recompute in (False, True):
-            limits.append(attempt(8, recompute).bytes)
-    assert limits[1] < limits[0]
+    with memory.probing(model):
+        trial = memory.Passes(model, *others, settings.train, 4)
+        kept, recomputed = (trial.bytes(8, recompute) for recompute in (False, True))
+    assert recomputed < kept
     monkeypatch.setattr(memory, "available", lambda _: 1 << 20)
     found = settle(settings.train, tmp_path, *student)
     assert (found.micro_batch, found.gradient_checkpointing) == (1, True)
@@ -177,7 +175,7 @@ def test_where_memory_is_short_activations_are_recomputed(
 
 def test_a_run_that_goes_on_takes_what_was_noted(settings, student, tmp_path, monkeypatch) -> None:
     memory.write_json(tmp_path / memory.NOTE, {"micro_batch": 2, "gradient_checkpointing": True})
-    monkeypatch.setattr(memory, "probe", None)
+    monkeypatch.setattr(memory, "Passes", None)
     found = settle(settings.train, tmp_path, *student)
     assert (found.micro_batch, found.gradient_checkpointing) == (2, True)
     given = replace(settings.train, micro_batch=4, gradient_checkpointing=False)
