@@ -185,7 +185,8 @@ def load_student(
 ) -> tuple[nn.Module, ProcessorMixin]:
     """A student ready to train: its base, with adapters where the preset has them."""
     base, processor = load_base(cfg, precision, corpus)
-    base.config.use_cache = False
+    # Each tower has a setting of its own.
+    base.config.use_cache = base.config.get_text_config().use_cache = False
     keep_differentiable(base)
     return (add_adapters(base, cfg.lora) if cfg.lora.rank else base), processor
 
@@ -294,7 +295,7 @@ def save(
 
     if not isinstance(model, peft.PeftModel):
         model = model.to(DTYPES[precision])
-        model.config.use_cache = True
+        model.config.use_cache = model.config.get_text_config().use_cache = True
         if weights is not None:
             weights = {name: weight.to(DTYPES[precision]) for name, weight in weights.items()}
     model.save_pretrained(folder, state_dict=weights)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import re
 from dataclasses import fields
@@ -87,6 +88,12 @@ def checkpointing(train: TrainConfig) -> dict[str, Any]:
     return {name: True, f"{name}_kwargs": {"use_reentrant": False}}
 
 
+def prefetched(workers: int, batches: int) -> int | None:
+    """Batches that each worker makes ahead: together at least the `batches` of a step, which the
+    trainer asks for all at once, so that they are made while the step before is computed."""
+    return max(2, math.ceil(batches / workers)) if workers else None
+
+
 def keep_to_one_gpu() -> None:
     """See the first GPU alone where no launcher has started several ranks: the trainer would spread
     each micro-batch over all of them, and train on more samples a step than the settings say."""
@@ -100,7 +107,8 @@ def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: st
     """Train from the start or a checkpoint, writing the journal and the curves.
 
     Raises:
-        UserError: memory runs out; `lower` says by which key less of it is taken.
+        UserError: memory runs out; `lower` says by which key less of it is taken. Or whatever
+            else a user can mend, also where a worker process found it.
     """
     trainer.remove_callback(ProgressCallback)
     trainer.remove_callback(PrinterCallback)
@@ -123,8 +131,16 @@ def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: st
             f"out of memory after step {trainer.state.global_step}: lower {lower}, or set "
             "train.gradient_checkpointing=true, in a run of its own (run=NAME)"
         ) from error
+    except UserError as error:
+        raise UserError(sentence(error)) from error
     if rank() == 0:
         curves_figure(read_journal(run.folder), run.folder / "curves.png")
+
+
+def sentence(error: UserError) -> str:
+    """An error's own words: torch puts a worker's traceback before them, all in one text."""
+    name = f"{UserError.__module__}.{UserError.__qualname__}: "
+    return str(error).rpartition(name)[2].strip()
 
 
 def is_last(checkpoint: Path) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,15 +27,17 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
 
     from train import ranks
 
-    accumulation = ranks.accumulation(cfg.train.batch, cfg.train.micro_batch)
+    smallest = 1 if cfg.train.micro_batch == "auto" else cfg.train.micro_batch
+    ranks.accumulation(cfg.train.batch, smallest)
     store, rationales = ranks.from_main(partial(prepared, cfg))
 
     from transformers import TrainingArguments, set_seed
 
     from data.frames import Frames
-    from train import backbone, loop, samples
+    from train import backbone, loop, memory, samples
     from train.audit import audit
     from train.collate import Collator, letter_ids
+    from train.features import Features, Keyed
     from train.packing import PackingCollator, rope_of
     from train.planned import ByLength
     from train.sft_trainer import Epochs, LetterChoice, StudentTrainer, TokenChoice, token_mean
@@ -66,33 +69,37 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
     longest = training[lengths.index(max(lengths))]
     log.info(audit(model, processor, cfg.student, longest, collator))
-    split = cfg.train.micro_batch, ranks.ranks()
-    order = ByLength(lengths, cfg.train.batch, cfg.seed, *split)
+    train = memory.settle(cfg.train, run.folder, model, packs or collator, training, lengths)
+    accumulation = ranks.accumulation(train.batch, train.micro_batch)
+    order = ByLength(lengths, train.batch, cfg.seed, train.micro_batch, ranks.ranks())
+    features = Features.of(model, train) if train.reuse_features else None
+    made = Keyed if features else attrgetter("named")
 
     checkpoint = loop.newest_checkpoint(run.folder)
     trainer = (SightTrainer if describes else StudentTrainer)(
         model=model,
         args=TrainingArguments(
-            **loop.arguments(cfg.train, run, cfg.seed, checkpoint),
-            per_device_train_batch_size=cfg.train.micro_batch,
+            **loop.arguments(train, run, cfg.seed, checkpoint),
+            per_device_train_batch_size=train.micro_batch,
             gradient_accumulation_steps=accumulation,
-            per_device_eval_batch_size=cfg.train.micro_batch,
+            per_device_eval_batch_size=train.micro_batch,
+            dataloader_prefetch_factor=loop.prefetched(train.workers, accumulation),
             label_names=["labels"],
             # Every pass goes through all adapters; a whole model's tower has nothing to do where
             # no frames are shown.
             ddp_find_unused_parameters=not cfg.student.lora.rank,
         ),
-        data_collator=collator.named,
-        training_collator=(packs or collator).named,
+        data_collator=made(collator),
+        training_collator=made(packs or collator),
         train_dataset=training,
         eval_dataset=validation,
         compute_loss_func=token_mean,
         callbacks=[Epochs(training, order)],
         order=order,
         choice=choice,
+        features=features,
     )
-    lower = "train.micro_batch"
-    loop.train_and_log(trainer, run, checkpoint, lower)
+    loop.train_and_log(trainer, run, checkpoint, memory.lower(train))
     weights = loop.gathered(trainer)
     if rank() == 0:
         backbone.save(model, processor, run.folder / "student", cfg.train.precision, weights)

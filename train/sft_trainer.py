@@ -18,6 +18,7 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 from conf.errors import UserError
 from conf.runs import rank, write_json
 from train.collate import IGNORED
+from train.features import Features
 from train.planned import ByLength, Samples
 
 
@@ -65,8 +66,10 @@ class StudentTrainer(Trainer):
         training_collator: Callable[[list[Any]], dict[str, Any]],
         order: ByLength,
         choice: TokenChoice | LetterChoice,
+        features: Features | None = None,
         **settings: Any,
     ) -> None:
+        """`features`: keeps the frozen tower's outputs; the collator is then `features.Keyed`."""
         super().__init__(
             *args,
             preprocess_logits_for_metrics=self._shrink,
@@ -76,6 +79,7 @@ class StudentTrainer(Trainer):
         self._order = order
         self._choice = choice
         self._training_collator = training_collator
+        self._features = features
 
     def get_train_dataloader(self) -> DataLoader:
         # An evaluation's samples are measured by their rows.
@@ -109,6 +113,8 @@ class StudentTrainer(Trainer):
     ) -> Any:
         """Raises UserError for a loss that is no number; the samples' ids are then in a file."""
         ids = inputs.pop("sample_ids")
+        if self._features is not None:
+            self._features.give(inputs)
         found = super().compute_loss(model, inputs, return_outputs, **settings)
         loss = found[0] if return_outputs else found
         if not torch.isfinite(loss):

@@ -28,12 +28,14 @@ class TrainConfig:
     precision: str = "bf16"
     """bf16 or fp32: what the passes compute in; adapters and optimizer stay fp32."""
     gradient_checkpointing: bool = True
+    """Whether activations are computed again in the backward pass: less memory, more time."""
     evaluations: int = 10
     """Evaluations, evenly spread over the run, each followed by a checkpoint."""
     keep: int = 2
     """Checkpoints kept."""
     workers: int = 0
-    """Processes that prepare batches."""
+    """Processes that prepare batches while the model computes; 0 leaves it to the trainer's own
+    process."""
     report_to: list[str] = field(default_factory=list)
     """Trackers of transformers' Trainer, such as tensorboard, wandb or trackio."""
 
@@ -74,8 +76,15 @@ class SftTrainConfig(TrainConfig):
     tiny base)."""
     batch: int = 16
     """Samples a step, over all its micro-batches and ranks."""
-    micro_batch: int = 1
-    """Samples that pass a rank's model at once; moves memory and time, not what is learnt."""
+    micro_batch: int | str = 1
+    """Samples that pass a rank's model at once; moves memory and time, not what is learnt. auto
+    takes the fastest number that fits, by trying the longest samples."""
+    gradient_checkpointing: bool | str = "auto"
+    """Whether activations are computed again in the backward pass: less memory, more time. auto
+    does so only where they do not fit."""
+    reuse_features: bool = False
+    """Whether what the frozen vision tower makes of a frame is kept in memory and used wherever
+    the frame is shown again; about 3 MB a frame of an 8B model, in half of the free memory."""
     packing: str = "auto"
     """Whether a micro-batch's samples stand in one row without padding, kept from seeing each
     other: true, false, or auto, where flash attention does so at no cost (never on a CPU, where it
@@ -86,15 +95,23 @@ class SftTrainConfig(TrainConfig):
     """Training-split items of held-out training scenes that measure the run."""
 
     def check(self) -> list[str]:
-        problems = super().check() + too_small(
-            self, "train.", {"batch": 1, "micro_batch": 1, "validation_items": 1}
-        )
-        if self.batch % max(1, self.micro_batch):
+        problems = super().check() + too_small(self, "train.", {"batch": 1, "validation_items": 1})
+        if isinstance(self.micro_batch, str):
+            if self.micro_batch != "auto":
+                problems.append(f"train.micro_batch={self.micro_batch}: give a number or auto")
+        elif self.micro_batch < 1:
+            problems.append(f"train.micro_batch={self.micro_batch} must be 1 or more")
+        elif self.batch % self.micro_batch:
             problems.append(
                 f"train.micro_batch={self.micro_batch} must divide train.batch={self.batch}"
             )
         if self.packing.lower() not in ("auto", "true", "false"):
             problems.append(f"train.packing={self.packing}: the options are auto, true and false")
+        if self.gradient_checkpointing not in (True, False, "auto"):
+            problems.append(
+                f"train.gradient_checkpointing={self.gradient_checkpointing}: the options are "
+                "auto, true and false"
+            )
         if self.regime not in REGIMES:
             problems.append(f"train.regime={self.regime}: the options are {', '.join(REGIMES)}")
         if self.packing.lower() == "true" and self.regime == "describe":

@@ -1,0 +1,214 @@
+"""What the trainer chooses for itself fits, moves nothing that is learnt, and leaves no trace."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from conf.entry import Run
+from conf.schema import SftCommand, SftTrainConfig
+from train import loop, memory, room, sft
+from train.backbone import load_student
+from train.collate import Collator
+from train.memory import Choice, choose, settle, sizes
+from train.planned import Samples
+from train.samples import splits
+
+AUTO = SftTrainConfig(micro_batch="auto", gradient_checkpointing="auto")
+
+
+@dataclass
+class Linear:
+    """A step of 16 samples that holds bytes and takes seconds by its samples and micro-batches."""
+
+    fixed: int = 100
+    kept: int = 1000
+    recomputed: int = 90
+    overhead: float = 0.0
+    """Seconds of a micro-batch, next to one of each sample."""
+    tried: list[tuple[int, bool]] = field(default_factory=list)
+
+    def bytes(self, micro_batch: int, recompute: bool) -> int | None:
+        self.tried.append((micro_batch, recompute))
+        return self.fixed + micro_batch * (self.recomputed if recompute else self.kept)
+
+    def seconds(self, micro_batch: int, recompute: bool) -> float:
+        return 16 * (1.3 if recompute else 1.0) + 16 / micro_batch * self.overhead
+
+
+def test_sizes_divide_a_step() -> None:
+    assert sizes(16) == [1, 2, 4, 8, 16]
+    assert sizes(15) == [1, 3, 15]
+    assert sizes(7) == [1, 7]
+    assert sizes(1) == [1]
+
+
+@pytest.mark.parametrize("overhead", [0.0, 0.5, 100.0])
+def test_less_memory_never_takes_more(overhead) -> None:
+    trial = Linear(overhead=overhead)
+    limits = range(50, 20_000, 50)
+    chosen = [choose(trial, AUTO, 16, limit)[0] for limit in limits]
+    kept = [not c.gradient_checkpointing for c in chosen]
+    # Activations are kept from the first limit on that one sample fits into.
+    assert kept == [limit >= 1100 for limit in limits]
+    for mode in (True, False):
+        micro = [c.micro_batch for c, k in zip(chosen, kept, strict=True) if k == mode]
+        assert micro == sorted(micro)
+        assert micro[0] == 1
+    # Where a pass has costs of its own, more pass at once, until that saves no more.
+    assert chosen[-1].micro_batch == {0.0: 1, 0.5: 8, 100.0: 16}[overhead]
+
+
+@pytest.mark.parametrize("limit", range(100, 20_000, 700))
+def test_what_is_tried_and_what_is_chosen_fits(limit) -> None:
+    trial = Linear(overhead=100.0)
+    choice, needed = choose(trial, AUTO, 16, limit)
+    # One sample has to be tried; nothing beyond it that does not fit.
+    assert all(Linear().bytes(*tried) <= limit for tried in trial.tried if tried[0] > 1)
+    exact = Linear().bytes(choice.micro_batch, choice.gradient_checkpointing)
+    assert needed is None or exact <= needed <= limit
+    assert (needed is None) == (limit < 190)
+
+
+def test_running_out_while_trying_is_not_fitting() -> None:
+    class Small(Linear):
+        def bytes(self, micro_batch: int, recompute: bool) -> int | None:
+            return 1 if recompute and micro_batch < 4 else None
+
+    assert choose(Small(overhead=100.0), AUTO, 16, 1000)[0] == Choice(2, True)
+
+
+@pytest.mark.parametrize("micro_batch", [1, 4])
+def test_a_given_micro_batch_stays_and_is_counted_whole(micro_batch) -> None:
+    given = replace(AUTO, micro_batch=micro_batch)
+    for limit, recompute in ((1000 * micro_batch, False), (1000 * micro_batch - 1, True)):
+        choice, _ = choose(Linear(fixed=0), given, 16, limit)
+        assert choice == Choice(micro_batch, recompute)
+    kept = replace(AUTO, gradient_checkpointing=False)
+    assert not choose(Linear(), kept, 16, 1)[0].gradient_checkpointing
+
+
+def test_the_ranks_agree_on_what_fits_all() -> None:
+    assert memory.least([Choice(8, False), Choice(4, True)]) == Choice(4, True)
+    assert memory.least([Choice(8, False)]) == Choice(8, False)
+
+
+def test_bytes_are_those_of_the_step() -> None:
+    """A step that holds 256 MiB takes those, whatever was held and freed before."""
+    spent = torch.ones(64 << 20)
+    del spent
+    held = room.start_peak(torch.device("cpu"))
+    torch.ones(64 << 20).sum()
+    found = room.peak(torch.device("cpu")) - held
+    assert 0.95 * (256 << 20) < found < 1.2 * (256 << 20)
+
+
+def test_a_containers_limit_holds(tmp_path, monkeypatch) -> None:
+    device = torch.device("cpu")
+    for name, text in (("max", "1000000"), ("current", "600000"), ("stat", "inactive_file 200000")):
+        (tmp_path / f"memory.{name}").write_text(f"{text}\n")
+    names = ("memory.max", "memory.current", "inactive_file")
+    monkeypatch.setattr(room, "CGROUPS", ((str(tmp_path), *names),))
+    assert room.available(device) == 600_000
+    (tmp_path / "memory.max").write_text("max\n")
+    assert room.available(device) > 1_000_000
+
+
+@pytest.fixture
+def settings(micro, micro_store, nf4_cfg) -> SftCommand:
+    train = SftTrainConfig(
+        lr=1e-3, max_steps=2, batch=4, micro_batch="auto", precision="fp32", evaluations=2,
+        validation_items=2, regime="answer_only",
+    )  # fmt: skip
+    # Dropout draws: a probe that shifts the generator would show.
+    student = replace(nf4_cfg, lora=replace(nf4_cfg.lora, dropout=0.1))
+    return SftCommand(
+        benchmark=micro,
+        store=str(micro_store.folder.parent),
+        workers=1,
+        student=student,
+        train=train,
+    )
+
+
+@pytest.fixture
+def student(settings, micro_store, frames):
+    model, processor = load_student(settings.student, "fp32", list)
+    training: Samples = splits(micro_store, [], settings, frames)[0]
+    lengths = training.lengths(processor.tokenizer, 96)
+    return model, Collator(processor, 1500), training, lengths
+
+
+def test_a_probe_leaves_no_trace(settings, student, tmp_path) -> None:
+    model = student[0]
+    model.eval()
+    before = {name: weight.clone() for name, weight in model.state_dict().items()}
+    torch.manual_seed(3)
+    drawn = torch.rand(3)
+    torch.manual_seed(3)
+    found = settle(settings.train, tmp_path, *student)
+    assert torch.equal(torch.rand(3), drawn)
+    assert all(torch.equal(weight, before[name]) for name, weight in model.state_dict().items())
+    assert all(parameter.grad is None for parameter in model.parameters())
+    assert not model.training
+    assert not model.is_gradient_checkpointing
+    assert settings.train.batch % found.micro_batch == 0
+    assert found.gradient_checkpointing is False
+
+
+def test_where_memory_is_short_activations_are_recomputed(
+    settings, student, tmp_path, monkeypatch
+) -> None:
+    model, *others = student
+    with memory.probing(model):
+        trial = memory.Passes(model, *others, settings.train, 4)
+        kept, recomputed = (trial.bytes(8, recompute) for recompute in (False, True))
+    assert recomputed < kept
+    monkeypatch.setattr(memory, "available", lambda _: 1 << 20)
+    found = settle(settings.train, tmp_path, *student)
+    assert (found.micro_batch, found.gradient_checkpointing) == (1, True)
+
+
+def test_a_run_that_goes_on_takes_what_was_noted(settings, student, tmp_path, monkeypatch) -> None:
+    memory.write_json(tmp_path / memory.NOTE, {"micro_batch": 2, "gradient_checkpointing": True})
+    monkeypatch.setattr(memory, "Passes", None)
+    found = settle(settings.train, tmp_path, *student)
+    assert (found.micro_batch, found.gradient_checkpointing) == (2, True)
+    given = replace(settings.train, micro_batch=4, gradient_checkpointing=False)
+    assert settle(given, tmp_path, *student) == given
+
+
+@pytest.mark.parametrize("note", ["{", "{}", '{"micro_batch": 3, "gradient_checkpointing": true}'])
+def test_a_note_that_does_not_hold_is_chosen_anew(settings, student, tmp_path, note) -> None:
+    (tmp_path / memory.NOTE).write_text(note)
+    found = settle(settings.train, tmp_path, *student)
+    told = json.loads((tmp_path / memory.NOTE).read_text())
+    assert told == {"micro_batch": found.micro_batch, "gradient_checkpointing": False}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("short", [False, True])
+def test_what_is_chosen_learns_what_a_given_one_learns(
+    settings, tmp_path, monkeypatch, short
+) -> None:
+    """The losses and gradients of a run that chose are those of one that was told."""
+    if short:
+        monkeypatch.setattr(memory, "available", lambda _: 1 << 20)
+    journals = []
+    plain = replace(settings.student, lora=replace(settings.student.lora, dropout=0.0))
+    fixed = replace(settings.train, micro_batch=4, gradient_checkpointing=False)
+    for name, train in (("auto", settings.train), ("given", fixed)):
+        folder: Path = tmp_path / name
+        folder.mkdir()
+        sft.main.__wrapped__(replace(settings, student=plain, train=train), Run(name, folder))
+        journals.append(loop.read_journal(folder))
+    chosen = json.loads((tmp_path / "auto" / memory.NOTE).read_text())
+    assert chosen["gradient_checkpointing"] == short
+    assert not (tmp_path / "given" / memory.NOTE).exists()
+    for one, two in zip(*journals, strict=True):
+        # The library tells the share of the epoch in micro-batches, of which the last are fewer.
+        assert one | {"epoch": 0} == pytest.approx(two | {"epoch": 0}, rel=1e-3)
