@@ -286,16 +286,16 @@ def load_trained(
 
 def check_adapters(folder: Path, base: nn.Module, cfg: StudentConfig) -> None:
     """Hold the adapters in a folder to the base, with adapters of its own or without, that they are
-    laid over, and to the preset's rank. A whole model has none.
+    laid over, and to the preset's rank. A whole model has none, nor have FSDP's checkpoints.
 
     Raises:
         UserError: they are of another base or rank.
         SafetensorError: they cannot be read.
     """
-    if not cfg.lora.rank:
+    if not (path := folder / "adapter_model.safetensors").exists():
         return
     modules = {name.removeprefix(PEFT): module for name, module in base.named_modules()}
-    with safe_open(folder / "adapter_model.safetensors", "pt") as file:
+    with safe_open(path, "pt") as file:
         shapes = {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118
     for name, shape in shapes.items():
         adapted, _, side = name.removeprefix(PEFT).partition(".lora_")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from conf.entry import Run, command
 from conf.runs import finished, rank
 from conf.schema import SftCommand
+from conf.trackers import check_trackers
 
 if TYPE_CHECKING:
     from data.records import Rationale
@@ -24,6 +25,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         log.info("%s is finished; delete it, or give run=NAME, to train anew", run.folder)
         return metrics
 
+    check_trackers(cfg.train.report_to)
+
     from train import ranks
 
     accumulation = ranks.accumulation(cfg.train.batch, cfg.train.micro_batch)
@@ -32,9 +35,10 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from transformers import TrainingArguments, set_seed
 
     from data.frames import Frames
-    from train import backbone, loop, samples
+    from train import backbone, checkpoints, loop, samples
     from train.audit import audit
     from train.collate import Collator, letter_ids
+    from train.generate import HeldOutAnswers
     from train.packing import PackingCollator, rope_of
     from train.planned import ByLength
     from train.sft_trainer import Epochs, LetterChoice, StudentTrainer, TokenChoice, token_mean
@@ -69,7 +73,13 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     split = cfg.train.micro_batch, ranks.ranks()
     order = ByLength(lengths, cfg.train.batch, cfg.seed, *split)
 
-    checkpoint = loop.newest_checkpoint(run.folder)
+    answers = None
+    if cfg.train.generated_items:
+        asked = processor, cfg.student, cfg.train.precision, cfg.train.generated_items
+        answers = HeldOutAnswers(*asked, run.folder)
+    checkpoint = checkpoints.newest_checkpoint(run.folder)
+    if checkpoint is not None:
+        backbone.check_adapters(checkpoint, model, cfg.student)
     trainer = (SightTrainer if describes else StudentTrainer)(
         model=model,
         args=TrainingArguments(
@@ -90,14 +100,15 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         callbacks=[Epochs(training, order)],
         order=order,
         choice=choice,
+        answers=answers,
     )
     lower = "train.micro_batch"
-    loop.train_and_log(trainer, run, checkpoint, lower)
+    best = loop.train_and_log(trainer, run, checkpoint, lower)
     weights = loop.gathered(trainer)
     if rank() == 0:
         backbone.save(model, processor, run.folder / "student", cfg.train.precision, weights)
     log.info("the student is in %s", run.folder / "student")
-    return loop.evaluated(run.folder)
+    return loop.evaluated(run.folder, best)
 
 
 def prepared(cfg: SftCommand) -> tuple[Store, list[Rationale]]:

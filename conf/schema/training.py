@@ -31,7 +31,12 @@ class TrainConfig:
     evaluations: int = 10
     """Evaluations, evenly spread over the run, each followed by a checkpoint."""
     keep: int = 2
-    """Checkpoints kept."""
+    """Checkpoints kept, the best one among them."""
+    best: str | None = None
+    """The measure by which the best checkpoint is kept and becomes the student or retriever, by its
+    name in metrics.jsonl, such as eval_answer_letter_accuracy, eval_reasoning_loss or
+    eval_recall@10; a loss is best when least, all others when greatest. null takes the last
+    step."""
     workers: int = 0
     """Processes that prepare batches."""
     report_to: list[str] = field(default_factory=list)
@@ -84,10 +89,15 @@ class SftTrainConfig(TrainConfig):
     """Whether each epoch shows every item's candidates in an order of its own."""
     validation_items: int = 64
     """Training-split items of held-out training scenes that measure the run."""
+    generated_items: int = 8
+    """How many of these the student answers in full at each evaluation, in each mode, all at once;
+    0 asks for no answers."""
 
     def check(self) -> list[str]:
         problems = super().check() + too_small(
-            self, "train.", {"batch": 1, "micro_batch": 1, "validation_items": 1}
+            self,
+            "train.",
+            {"batch": 1, "micro_batch": 1, "validation_items": 1, "generated_items": 0},
         )
         if self.batch % max(1, self.micro_batch):
             problems.append(
