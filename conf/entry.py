@@ -24,7 +24,7 @@ from omegaconf import DictConfig
 from conf.compose import preflight, register, short, strict
 from conf.errors import SettingsError, UserError
 from conf.help import help_text
-from conf.runs import Run, open_run, rank, ranks, run_name, write_json
+from conf.runs import Run, held, open_run, rank, ranks, run_name, write_json
 
 Metrics = dict[str, float]
 Main = Callable[[Any, Run], Metrics | None]
@@ -95,13 +95,15 @@ def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None
     task = HydraConfig.get()
     overrides = list(task.overrides.task)
     run = Run(run_name(settings.run, overrides), Path(os.path.relpath(task.runtime.output_dir)))
-    if rank() == 0:
-        open_run(run, asdict(settings), name, overrides)
-    else:
+    if rank() > 0:
         logging.disable(logging.WARNING)
-    metrics = main(settings, run)
-    if metrics is not None and rank() == 0:
-        write_json(run.folder / "metrics.json", metrics)
+        # The main rank holds the folder for all.
+        return main(settings, run)
+    with held(run.folder):
+        open_run(run, asdict(settings), name, overrides)
+        metrics = main(settings, run)
+        if metrics is not None:
+            write_json(run.folder / "metrics.json", metrics)
     return metrics
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
 import platform
 import re
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -107,6 +109,28 @@ def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[s
         write_json(run.folder / "run.json", _record(run.folder, settings, command, overrides))
     except OSError as error:
         raise UserError(f"cannot write the run's folder {run.folder}: {error.strerror}") from error
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Hold a run's folder against other processes.
+
+    Raises:
+        UserError: another process holds it.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        raise UserError(
+            f"{folder} is in use: another process of this command writes there. Wait for it, or "
+            "choose another folder with run=NAME"
+        ) from error
+    try:
+        yield
+    finally:
+        os.close(handle)
 
 
 def differences(folder: Path, settings: dict[str, Any]) -> list[str]:

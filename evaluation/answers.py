@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import torch
 from torch import nn
 from tqdm import tqdm
 from transformers import ProcessorMixin
@@ -17,13 +16,10 @@ from conf.runs import write_text
 from conf.schema import StudentConfig
 from data.frames import Frames
 from data.records import SelectionItem
-from evaluation.protocol import parse
-from train.backbone import DTYPES
+from train.choice import parse
 from train.collate import Collator
 from train.conversation import selection_sample
-
-ANSWER_TOKENS = 16
-"""New tokens at most in answer mode: the one line, and room to miss it."""
+from train.generate import generate, new_tokens
 
 
 @dataclass(frozen=True)
@@ -89,7 +85,7 @@ def ask_all(
     """Every item's answer in `mode`, as a student of `regime` is asked, its prefix shown as a
     `control` asks, greedily decoded; items that the log holds are not asked."""
     waiting = [i for i in items if (i.item_id, mode) not in log.answers]
-    limit = cfg.max_new_tokens if mode == "reasoning" else ANSWER_TOKENS
+    limit = new_tokens(mode, cfg)
     collator = Collator(processor, cfg.max_length)
     with tqdm(total=len(items), initial=len(items) - len(waiting), desc=mode, unit="item") as bar:
         for group in _groups(waiting, batch):
@@ -100,19 +96,6 @@ def ask_all(
             log.append([judge(i, mode, t) for i, t in zip(group, texts, strict=True)])
             bar.update(len(group))
     return [log.answers[i.item_id, mode] for i in items]
-
-
-def generate(
-    model: nn.Module, processor: ProcessorMixin, inputs: dict, limit: int, precision: str
-) -> list[str]:
-    """The texts that a model writes after left-padded prompts, `limit` tokens at most."""
-    device = next(model.parameters()).device
-    inputs = {name: value.to(device) for name, value in inputs.items() if name != "labels"}
-    autocast = torch.autocast(device.type, DTYPES[precision], enabled=precision == "bf16")
-    with torch.inference_mode(), autocast:
-        ids = model.generate(**inputs, max_new_tokens=limit, do_sample=False, use_cache=True)
-    new = ids[:, inputs["input_ids"].shape[1] :]
-    return processor.tokenizer.batch_decode(new, skip_special_tokens=True)
 
 
 def judge(item: SelectionItem, mode: str, text: str) -> Answer:

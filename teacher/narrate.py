@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from conf.entry import Run, command
+from conf.errors import UserError
 from conf.runs import write_json, write_text
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
@@ -118,11 +119,13 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
     into the store's rationales.parquet too.
 
     Raises:
-        UserError: rationales.jsonl is damaged or in use, or the servers fail for good.
+        UserError: rationales.jsonl is damaged, in use or of another benchmark, or the servers fail
+            for good.
     """
     items = store.selection("train")
     judge = Judge(cfg)
     with Journal(store.folder / JOURNAL) as journal:
+        check_items(journal, items)
         answers = defaultdict(list)
         for rationale in journal.rationales:
             wanted = cfg.fallback or not rationale.fallback
@@ -150,6 +153,18 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
         rationales = accepted_of(items, answers)
         save_accepted(rationales, store.folder / "rationales.parquet")
     return Narration(rationales, items, dict(answers), cfg.attempts, cfg.seed, too_short)
+
+
+def check_items(journal: Journal, items: list[SelectionItem]) -> None:
+    """Raises UserError where a journal has answers to items that are not among these: it was
+    narrated for another benchmark, and no answer is passed over in silence."""
+    strangers = {r.item_id for r in journal.rationales} - {item.item_id for item in items}
+    if strangers:
+        raise UserError(
+            f"{journal.path} has rationales for {len(strangers)} items that the training split "
+            f"there does not hold, such as {min(strangers)}: it is of another benchmark. Put the "
+            "file there that was narrated for this one, or delete it to narrate anew"
+        )
 
 
 def _open(given: list[Rationale], cfg: TeacherConfig) -> bool:

@@ -11,15 +11,19 @@ import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from torch import nn
 from transformers import (
+    AutoConfig,
     AutoModelForImageTextToText,
     AutoProcessor,
     BitsAndBytesConfig,
+    PreTrainedConfig,
     PreTrainedModel,
+    PreTrainedTokenizerBase,
     ProcessorMixin,
 )
 from transformers.utils import logging as transformers_logging
@@ -38,6 +42,8 @@ DTYPES = {"bf16": torch.bfloat16, "fp32": torch.float32}
 UNREADABLE = (OSError, ValueError, KeyError, TypeError, SafetensorError)
 """What the libraries raise at files that are missing, cut or of another kind."""
 BASE = "base.json"
+PEFT = "base_model.model."
+"""What peft puts before the names of the modules that it adapts."""
 MEBIBYTE = 1 << 20
 TOWERS = ("vision", "language", "embeddings and head")
 
@@ -56,7 +62,8 @@ def load_base(
     `corpus` gives the texts that a built model's tokenizer is trained on.
 
     Raises:
-        UserError: the model is neither a folder here nor in the hub's cache, and cannot be fetched.
+        UserError: the model is neither a folder here nor in the hub's cache, and cannot be fetched;
+            it has no vision tower, or a processor of another model.
     """
     if cfg.architecture is not None:
         processor = build_processor(corpus(), cfg.architecture.vocabulary, cfg.image_size)
@@ -71,7 +78,10 @@ def load_base(
     dtype = torch.float32 if whole else DTYPES[precision]
     quantization = nf4_config(dtype) if cfg.quantization == "nf4" else None
     try:
+        config = AutoConfig.from_pretrained(cfg.model, **origin)
+        check_tower("student", cfg.model, config)
         processor = AutoProcessor.from_pretrained(cfg.model, **origin)
+        check_processor("student", cfg.model, config, processor)
         model = AutoModelForImageTextToText.from_pretrained(
             cfg.model,
             dtype=dtype,
@@ -134,6 +144,50 @@ def damaged(folder: Path, error: Exception) -> UserError:
     return UserError(
         f"{folder} is damaged and cannot be read ({first}): delete the run's folder and train again"
     )
+
+
+def check_tower(group: str, model: str, config: PreTrainedConfig) -> None:
+    """Raises UserError where a base has no vision tower."""
+    if getattr(config, "vision_config", None) is None:
+        raise UserError(
+            f"{group}.model={model} ({config.model_type}) has no vision tower: give a "
+            "vision-language model, such as Qwen3-VL"
+        )
+
+
+def check_processor(
+    group: str,
+    model: str,
+    config: PreTrainedConfig,
+    processor: ProcessorMixin | PreTrainedTokenizerBase,
+) -> None:
+    """Raises UserError where a base's processor does not go with its weights."""
+    if problem := _mismatch(config, processor):
+        raise UserError(
+            f"{group}.model={model} holds a processor of another model, {type(processor).__name__} "
+            f"({problem}): put the processor and tokenizer files there that came with the weights"
+        )
+
+
+def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:
+    """How a processor does not go with a model; None where it does."""
+    for name in ("tokenizer", "image_processor", "video_processor"):
+        if not hasattr(processor, name):
+            return f"it has no {name.replace('_', ' ')}"
+    tokens, known = len(processor.tokenizer), config.get_text_config().vocab_size
+    if tokens > known:
+        return f"its tokenizer has {tokens} tokens, the model {known}"
+    for part in (processor.image_processor, processor.video_processor):
+        for name, own in (("patch_size", "patch_size"), ("merge_size", "spatial_merge_size")):
+            there, here = getattr(part, name, None), getattr(config.vision_config, own, None)
+            if there != here:
+                what = name.replace("_", " ")
+                return f"its {what} is {there}, that of the vision tower {here}"
+    for name in ("image_token_id", "video_token_id"):
+        there, here = getattr(processor, name, None), getattr(config, name, None)
+        if there != here:
+            return f"its {name} is {there}, the model's {here}"
+    return None
 
 
 def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
@@ -207,7 +261,8 @@ def load_trained(
     model.
 
     Raises:
-        UserError: `folder` holds no student, or its base is not on this machine.
+        UserError: `folder` holds no student, or one of another base or rank, or its base is not on
+            this machine.
     """
     import peft
 
@@ -217,6 +272,7 @@ def load_trained(
             raise UserError(f"{folder} holds no student: {weights} is missing")
         base, processor = load_base(cfg, precision, list)
         try:
+            check_adapters(folder, base, cfg)
             return peft.PeftModel.from_pretrained(base, folder).eval(), processor
         except UNREADABLE as error:
             raise damaged(folder, error) from error
@@ -227,6 +283,40 @@ def load_trained(
     )
     model, processor = load_base(whole, precision, list)
     return model.eval(), processor
+
+
+def check_adapters(folder: Path, base: nn.Module, cfg: StudentConfig) -> None:
+    """Hold the adapters in a folder to the base, with adapters of its own or without, that they are
+    laid over, and to the preset's rank. A whole model has none, nor have FSDP's checkpoints.
+
+    Raises:
+        UserError: they are of another base or rank.
+        SafetensorError: they cannot be read.
+    """
+    if not (path := folder / "adapter_model.safetensors").exists():
+        return
+    modules = {name.removeprefix(PEFT): module for name, module in base.named_modules()}
+    with safe_open(path, "pt") as file:
+        shapes = {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118
+    for name, shape in shapes.items():
+        adapted, _, side = name.removeprefix(PEFT).partition(".lora_")
+        # A is (rank, inputs), B is (outputs, rank).
+        rank, there = shape if side.startswith("A") else reversed(shape)
+        if rank != cfg.lora.rank:
+            raise UserError(
+                f"{folder} holds adapters of rank {rank}, and student.lora.rank is "
+                f"{cfg.lora.rank}: give student.lora.rank={rank}, or train in a run of its own "
+                "(run=NAME)"
+            )
+        module = modules.get(adapted)
+        here = module and getattr(module, "in_features" if side[0] == "A" else "out_features")
+        if here != there:
+            found = f"{there} wide there and {here} here" if module else "not in this one"
+            raise UserError(
+                f"{folder} holds adapters of another base than {cfg.model} ({adapted} is {found}): "
+                "give the base that they were trained over with student.model=FOLDER, or train "
+                "again"
+            )
 
 
 def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
@@ -252,11 +342,12 @@ def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
 
 def weights_digest(*models: str | Path | None) -> str:
     """A short hash of the safetensors of models in folders, by each file's name, size and last
-    mebibyte, which training changes; a hub's name stands for itself."""
+    mebibyte, which training changes, wherever the folder is; a hub's name stands for itself."""
     whole = hashlib.sha256()
-    for model in models:
-        whole.update(str(model).encode())
-        for path in sorted(Path(model).rglob("*.safetensors")) if model else []:
+    for k, model in enumerate(models):
+        folder = model is not None and Path(model).is_dir()
+        whole.update(f"{k} {'' if folder else model}".encode())
+        for path in sorted(Path(model).rglob("*.safetensors")) if folder else []:
             size = path.stat().st_size
             with open(path, "rb") as file:
                 file.seek(max(0, size - MEBIBYTE))
@@ -290,7 +381,11 @@ def save(
 ) -> None:
     """Write what was trained, the adapters or the whole model, and the processor that goes with
     it. A whole model is written in the precision that it computed in. `weights` are the model's
-    where it holds a part of them."""
+    where it holds a part of them.
+
+    Raises:
+        UserError: the disk does not take it.
+    """
     import peft
 
     if not isinstance(model, peft.PeftModel):
@@ -298,8 +393,35 @@ def save(
         model.config.use_cache = model.config.get_text_config().use_cache = True
         if weights is not None:
             weights = {name: weight.to(DTYPES[precision]) for name, weight in weights.items()}
-    model.save_pretrained(folder, state_dict=weights)
+    write(model, processor, folder, weights)
+
+
+def write(
+    model: nn.Module,
+    processor: ProcessorMixin,
+    folder: Path,
+    weights: dict[str, torch.Tensor] | None = None,
+) -> None:
+    """Write a model, or its adapters, and its processor as they are; `weights` where the model
+    holds a part of them.
+
+    Raises:
+        UserError: the disk does not take it.
+    """
+    try:
+        model.save_pretrained(folder, state_dict=weights)
+    except SafetensorError as error:
+        raise unwritten(folder.parent, str(error)) from error
     processor.save_pretrained(folder)
+
+
+def unwritten(folder: Path, why: str) -> UserError:
+    """What to tell a user whose disk did not take the weights. Unlike a full disk's OSError, what
+    the libraries raise names no file, and what filled the disk may be gone again."""
+    return UserError(
+        f"the weights cannot be written to {folder} ({why}); once that is mended, run the same "
+        "command again"
+    )
 
 
 @dataclass

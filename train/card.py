@@ -11,6 +11,7 @@ from huggingface_hub import ModelCardData
 from conf.schema import SftCommand
 from conf.sweep import AT_START
 from train.backbone import BASE
+from train.loop import BEST_STEP
 
 SHOWN_PACKAGES = ("torch", "transformers", "peft", "bitsandbytes")
 WHAT = {
@@ -28,6 +29,7 @@ def text(
     `measured` is how far the exported weights are from the trained student.
     """
     metrics = json.loads((folder / "metrics.json").read_text())
+    kept = _kept(settings, metrics)
     sections = [
         f"---\n{front_matter(settings, format)}\n---",
         f"# {name}",
@@ -36,8 +38,8 @@ def text(
         _table(("", ""), _training(settings, folder)),
         "## How it was measured",
         f"On the items of training scenes that it was not trained on, "
-        f"{settings.train.validation_items} at most, before the first step and after the last. A "
-        "letter is chosen by the letters' logits, with what stands before it given.",
+        f"{settings.train.validation_items} at most, before the first step and {kept}. "
+        "A letter is chosen by the letters' logits, with what stands before it given.",
         _table(("", "start", "end"), _curve(metrics)),
     ]
     if measured:
@@ -88,6 +90,13 @@ def _training(settings: SftCommand, folder: Path) -> Iterable[tuple[str, str]]:
         yield "code", f"commit {record['git']['commit']}{changed}"
     versions = record["packages"]
     yield "versions", ", ".join(f"{p} {versions[p]}" for p in SHOWN_PACKAGES if p in versions)
+
+
+def _kept(settings: SftCommand, metrics: dict[str, float]) -> str:
+    """Of which step the exported student is."""
+    if (step := metrics.get(BEST_STEP)) is None:
+        return "after the last"
+    return f"after step {step:g}, the best by {settings.train.best}"
 
 
 def _curve(metrics: dict[str, float]) -> Iterable[tuple[str, str, str]]:

@@ -9,6 +9,7 @@ from conf.entry import Run, command
 from conf.errors import UserError
 from conf.runs import finished
 from conf.schema import ContrastiveCommand
+from conf.trackers import check_trackers
 
 log = logging.getLogger(__name__)
 
@@ -18,6 +19,8 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     if (metrics := finished(run)) is not None:
         log.info("%s is finished; delete it, or give run=NAME, to train anew", run.folder)
         return metrics
+
+    check_trackers(cfg.train.report_to)
 
     from data.build import ensure_benchmark
 
@@ -36,7 +39,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from transformers import set_seed
 
     from data.frames import Frames
-    from train import backbone, loop, retriever
+    from train import backbone, checkpoints, loop, retriever
     from train.audit import audit_retriever
     from train.ranking import HeldOutRanking
     from train.samples import held_out_scenes, shuffled
@@ -83,7 +86,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
         preprocess_fn=model.preprocess, prompts=retriever.column_prompts(cfg.retriever, rows[0])
     )
     collator.resolve(training, frames, cfg.retriever)
-    checkpoint = loop.newest_checkpoint(run.folder)
+    checkpoint = checkpoints.newest_checkpoint(run.folder)
     trainer = SentenceTransformerTrainer(
         model=model,
         args=SentenceTransformerTrainingArguments(
@@ -98,10 +101,12 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
         loss=loss,
         data_collator=collator,
     )
-    loop.train_and_log(trainer, run, checkpoint, "train.mini_batch, which changes no gradient")
+    best = loop.train_and_log(
+        trainer, run, checkpoint, "train.mini_batch, which changes no gradient"
+    )
     model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)
     log.info("the retriever is in %s", run.folder / "retriever")
-    return loop.evaluated(run.folder)
+    return loop.evaluated(run.folder, best)
 
 
 if __name__ == "__main__":

@@ -169,7 +169,7 @@ def write_merged(trained: Trained, cfg: ExportStudentCommand, folder: Path) -> M
     del model
     log.info("merging")
     model, processor = merge(trained, cfg.format)
-    save(model, processor, folder)
+    backbone.write(model, processor, folder)
     del model
     log.info("asking the exported student")
     model, processor = backbone.load_merged(folder)
@@ -184,25 +184,6 @@ def write_merged(trained: Trained, cfg: ExportStudentCommand, folder: Path) -> M
                 "nothing was exported. Try format=fp32 or format=adapter"
             )
     return measured
-
-
-def save(model: PreTrainedModel, processor: ProcessorMixin, folder: Path) -> None:
-    """Write a whole model and its processor.
-
-    Raises:
-        UserError: the disk does not take it.
-    """
-    from safetensors import SafetensorError
-
-    try:
-        model.save_pretrained(folder)
-    except SafetensorError as error:
-        # Unlike a full disk's OSError, it names no file, and what filled the disk is gone again.
-        raise UserError(
-            f"the weights cannot be written to {folder.parent} ({error}); once that is mended, run "
-            "the same command again"
-        ) from error
-    processor.save_pretrained(folder)
 
 
 def validation(settings: SftCommand, store_folder: Path, workers: int) -> dict[str, Samples]:

@@ -6,13 +6,14 @@ import json
 import logging
 import math
 import os
-import re
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
+from tqdm.contrib.logging import logging_redirect_tqdm
 from transformers import (
     PrinterCallback,
     ProgressCallback,
@@ -28,14 +29,32 @@ from conf.processes import visible_gpus
 from conf.runs import rank, write_text
 from conf.schema import TrainConfig
 from conf.sweep import AT_START
+from train.backbone import unwritten
+from train.checkpoints import STATE
 from train.plots import curves_figure
 
 log = logging.getLogger(__name__)
 
 JOURNAL = "metrics.jsonl"
+WRITTEN = "samples.jsonl"
+"""What a student wrote at each evaluation of its run, one JSON line an answer."""
+BEST_STEP = "best_step"
+"""Name of the step whose checkpoint a run kept, among what it evaluated."""
 UNSHARED = ("_runtime", "_per_second", "total_flos", "train_loss")
 """Ends of the logged names that no two runs share: timings, and the trainer's mean over the run,
 which counts only the steps since it was resumed."""
+
+PROJECT = "dynapix"
+"""Under which trackers file a run."""
+SHOWN = {
+    "generated_parse_rate": "parsed",
+    "generated_accuracy": "right",
+    "letter_accuracy": "letter",
+    "token_accuracy": "token",
+    "loss": "loss",
+    "recall@10": "recall@10",
+}
+"""What the bar shows, by the end of its name, and what it is called there."""
 
 SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
 
@@ -46,7 +65,7 @@ def arguments(train: TrainConfig, run: Run, seed: int, checkpoint: Path | None) 
         # A share of the steps; 1 would mean every step.
         every = min(1 / train.evaluations, 0.9999)
     else:
-        every = json.loads((checkpoint / "trainer_state.json").read_text())["eval_steps"]
+        every = json.loads((checkpoint / STATE).read_text())["eval_steps"]
     return {
         "output_dir": str(run.folder),
         "seed": seed,
@@ -73,7 +92,12 @@ def arguments(train: TrainConfig, run: Run, seed: int, checkpoint: Path | None) 
         "dataloader_num_workers": train.workers,
         "dataloader_pin_memory": torch.cuda.is_available(),
         "remove_unused_columns": False,
+        # Here and not at the end alone: the best checkpoint is never thrown away.
+        "load_best_model_at_end": train.best is not None,
+        "metric_for_best_model": train.best,
         "report_to": list(train.report_to) or "none",
+        "run_name": run.name,
+        "project": PROJECT,
         "disable_tqdm": False,
     }
 
@@ -103,28 +127,42 @@ def keep_to_one_gpu() -> None:
         log.info("training on GPU %s of %d; several take accelerate launch", gpus[0], len(gpus))
 
 
-def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: str) -> None:
-    """Train from the start or a checkpoint, writing the journal and the curves.
+def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: str) -> int | None:
+    """Train from the start or a checkpoint, writing the journal and the curves. Where train.best
+    names a measure, the trainer's model is the best checkpoint's in the end, whose step is given.
 
     Raises:
-        UserError: memory runs out; `lower` says by which key less of it is taken. Or whatever
-            else a user can mend, also where a worker process found it.
+        UserError: memory runs out (`lower` says by which key less of it is taken), the disk takes
+            no checkpoint, no evaluation has the named measure, or whatever else a user can mend,
+            also where a worker process found it.
     """
     trainer.remove_callback(ProgressCallback)
     trainer.remove_callback(PrinterCallback)
     trainer.add_callback(Bar())
     if rank() == 0:
         trainer.add_callback(Journal(run.folder))
+    trainer.add_callback(NamedMeasure())
     check_fsdp(trainer, checkpoint)
+    # What a tracker keeps on disk belongs to the run; TensorBoard's is there by itself.
+    os.environ.setdefault("WANDB_DIR", str(run.folder))
+    os.environ.setdefault("WANDB_PROJECT", PROJECT)
     if checkpoint is not None:
         log.info("going on from %s", checkpoint)
     try:
         if checkpoint is not None and is_last(checkpoint):
             # The trainer would take a step more.
-            load(trainer, checkpoint)
+            trainer.state = TrainerState.load_from_json(str(checkpoint / STATE))
+            best = trainer.state.best_global_step or trainer.state.global_step
+            load(trainer, checkpoint.with_name(f"checkpoint-{best}"))
         else:
-            trainer.train(resume_from_checkpoint=str(checkpoint) if checkpoint else None)
+            # What is told meanwhile stands above the bar.
+            with logging_redirect_tqdm():
+                trainer.train(resume_from_checkpoint=str(checkpoint) if checkpoint else None)
+    except SafetensorError as error:
+        raise unwritten(run.folder, str(error)) from error
     except RuntimeError as error:
+        if is_unwritten(error):
+            raise unwritten(run.folder, "a file was cut short; the disk may be full") from error
         if not is_out_of_memory(error):
             raise
         raise UserError(
@@ -135,6 +173,11 @@ def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: st
         raise UserError(sentence(error)) from error
     if rank() == 0:
         curves_figure(read_journal(run.folder), run.folder / "curves.png")
+    best = trainer.state.best_global_step
+    if best:
+        named = f"{trainer.args.metric_for_best_model} is best, {trainer.state.best_metric:.4g}"
+        log.info("what is kept is the checkpoint of step %d, where %s", best, named)
+    return best
 
 
 def sentence(error: UserError) -> str:
@@ -145,7 +188,7 @@ def sentence(error: UserError) -> str:
 
 def is_last(checkpoint: Path) -> bool:
     """Whether a checkpoint is that of a run's last step."""
-    state = json.loads((checkpoint / "trainer_state.json").read_text())
+    state = json.loads((checkpoint / STATE).read_text())
     return state["global_step"] >= state["max_steps"]
 
 
@@ -191,10 +234,19 @@ def is_out_of_memory(error: RuntimeError) -> bool:
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
-def evaluated(folder: Path) -> dict[str, float]:
-    """First and last value of everything that a run evaluated: `<name>` and `<name>_at_start`."""
+def is_unwritten(error: RuntimeError) -> bool:
+    """Whether torch could not write a file whole; it has no other sign of a full disk."""
+    return "PytorchStreamWriter" in str(error) or "unexpected pos" in str(error)
+
+
+def evaluated(folder: Path, best: int | None = None) -> dict[str, float]:
+    """What a run evaluated at first and of what it kept: `<name>_at_start` and `<name>`. What it
+    kept is that of its last step, or of the step `best`, which is then given too."""
     records = [r for r in read_journal(folder) if any(k.startswith("eval_") for k in r)]
     results: dict[str, float] = {}
+    if best is not None:
+        records = [r for r in records if r["step"] <= best]
+        results[BEST_STEP] = float(best)
     for record in records:
         for key, value in record.items():
             if key.startswith("eval_"):
@@ -206,16 +258,17 @@ def evaluated(folder: Path) -> dict[str, float]:
 
 class Journal(TrainerCallback):
     """Appends what the trainer logs to the run's metrics.jsonl, and on resuming drops the lines
-    past the checkpoint, so that the file is that of an undisturbed run."""
+    past the checkpoint from it and from samples.jsonl, so that both are an undisturbed run's."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / JOURNAL
 
     def on_train_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
-        kept = [r for r in read_journal(self._path.parent) if r["step"] <= state.global_step]
         resumed = state.global_step > 0
-        lines = [json.dumps(r) + "\n" for r in kept] if resumed else []
-        write_text(self._path, "".join(lines))
+        for path in (self._path, self._path.with_name(WRITTEN)):
+            kept = [r for r in read_lines(path) if resumed and r["step"] <= state.global_step]
+            if kept or path.exists():
+                write_text(path, "".join(json.dumps(r) + "\n" for r in kept))
 
     def on_log(self, args, state: TrainerState, control: TrainerControl, logs=None, **_) -> None:
         values = {k: v for k, v in (logs or {}).items() if not k.endswith(UNSHARED)}
@@ -225,29 +278,54 @@ class Journal(TrainerCallback):
             file.write(json.dumps({"step": state.global_step, **values}) + "\n")
 
 
+class NamedMeasure(TrainerCallback):
+    """Holds train.best against what the evaluation at the start measured, before the first step."""
+
+    def on_step_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        best = args.metric_for_best_model
+        if best is None or state.best_global_step:
+            return
+        names = {k for r in state.log_history for k in r if k.startswith("eval_")}
+        names = sorted(k for k in names if not k.endswith((*UNSHARED, "_preparation_time")))
+        if f"eval_{best.removeprefix('eval_')}" not in names:
+            raise UserError(
+                f"train.best={best} is nothing that an evaluation of this run measures; the "
+                f"options are {', '.join(names)}"
+            )
+
+
 class Bar(ProgressCallback):
     """The trainer's bar with its newest figures in it."""
 
-    SHOWN = ("loss", "accuracy", "recall@10")
-
     def __init__(self, max_str_len: int = 100) -> None:
         super().__init__(max_str_len)
-        self._figures: dict[str, str] = {}
+        self._figures: dict[str, dict[str, str]] = {"": {}}
 
     def on_prediction_step(self, args, state, control, **_) -> None:
         """An evaluation's own bar would break the line of the run's."""
 
     def on_log(self, args, state, control, logs=None, **_) -> None:
         for name, value in (logs or {}).items():
-            if name.endswith(self.SHOWN) and not name.endswith(UNSHARED):
-                self._figures[name.removeprefix("eval_")] = f"{value:.3g}"
+            shown = next((end for end in SHOWN if name.endswith(end)), None)
+            if shown and not name.endswith(UNSHARED):
+                mode = name.removesuffix(shown).removeprefix("eval_").strip("_")
+                self._figures.setdefault(mode, {})[SHOWN[shown]] = f"{value:.3g}"
         if self.training_bar is not None:
-            self.training_bar.set_postfix(self._figures)
+            told = [
+                " ".join([mode, *(f"{name}={value}" for name, value in figures.items())]).strip()
+                for mode, figures in self._figures.items()
+                if figures
+            ]
+            self.training_bar.set_postfix_str(", ".join(told))
 
 
 def read_journal(folder: Path) -> list[dict[str, Any]]:
     """The lines of a run's metrics.jsonl; one torn by a kill is passed over."""
-    path = folder / JOURNAL
+    return read_lines(folder / JOURNAL)
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """The JSON lines of a file that tell their step."""
     if not path.exists():
         return []
     records = []
@@ -259,20 +337,6 @@ def read_journal(folder: Path) -> list[dict[str, Any]]:
         if isinstance(record, dict) and "step" in record:
             records.append(record)
     return records
-
-
-def newest_checkpoint(folder: Path) -> Path | None:
-    """The newest whole checkpoint below a run's folder. The trainer writes its state last, so a
-    checkpoint without a readable one was cut off."""
-    named = [(re.fullmatch(r"checkpoint-(\d+)", p.name), p) for p in folder.glob("checkpoint-*")]
-    for _, path in sorted(((int(m[1]), p) for m, p in named if m), reverse=True):
-        try:
-            json.loads((path / "trainer_state.json").read_text())
-        except (OSError, ValueError):
-            log.warning("%s was cut off: going on from the one before it", path)
-            continue
-        return path
-    return None
 
 
 def check_not_empty(samples: int, what: str) -> None:

@@ -17,6 +17,7 @@ from sentence_transformers.sentence_transformer.data_collator import (
     SentenceTransformerDataCollator,
 )
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
+from transformers import AutoConfig
 
 from conf.schema import RetrieverConfig
 from data.frames import Frames
@@ -24,7 +25,9 @@ from data.records import FPS, FRAMES, FrameRef, RetrievalQuery, shown_frames
 from train.backbone import (
     DTYPES,
     UNREADABLE,
+    check_processor,
     check_reachable,
+    check_tower,
     damaged,
     keep_differentiable,
     load_failure,
@@ -48,7 +51,8 @@ def load_retriever(
     that it is loaded as any other.
 
     Raises:
-        UserError: the model is not on this machine and cannot be fetched.
+        UserError: the model is not on this machine and cannot be fetched; it has no vision tower,
+            or a processor of another model.
     """
     source = cfg.model
     if cfg.architecture is not None:
@@ -59,6 +63,8 @@ def load_retriever(
     check_reachable("retriever", source)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     try:
+        config = AutoConfig.from_pretrained(source, **origin)
+        check_tower("retriever", source, config)
         backbone = Transformer(
             source,
             model_kwargs={**weight_options(cfg, precision), **origin},
@@ -68,6 +74,7 @@ def load_retriever(
         )
     except UNREADABLE as error:
         raise load_failure("retriever", cfg.model, error) from error
+    check_processor("retriever", source, config, backbone.processor)
     pin_sizes(backbone.processor, cfg.image_size, cfg.frames)
     width = backbone.get_embedding_dimension()
     model = SentenceTransformer(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from conf.entry import Run, command
 from conf.runs import finished, rank
 from conf.schema import SftCommand
+from conf.trackers import check_trackers
 
 if TYPE_CHECKING:
     from data.records import Rationale
@@ -25,6 +26,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         log.info("%s is finished; delete it, or give run=NAME, to train anew", run.folder)
         return metrics
 
+    check_trackers(cfg.train.report_to)
+
     from train import ranks
 
     smallest = 1 if cfg.train.micro_batch == "auto" else cfg.train.micro_batch
@@ -34,10 +37,11 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from transformers import TrainingArguments, set_seed
 
     from data.frames import Frames
-    from train import backbone, loop, memory, samples
+    from train import backbone, checkpoints, loop, memory, samples
     from train.audit import audit
     from train.collate import Collator, letter_ids
     from train.features import Features, Keyed
+    from train.generate import HeldOutAnswers
     from train.packing import PackingCollator, rope_of
     from train.planned import ByLength
     from train.sft_trainer import Epochs, LetterChoice, StudentTrainer, TokenChoice, token_mean
@@ -75,7 +79,13 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     features = Features.of(model, train) if train.reuse_features else None
     made = Keyed if features else attrgetter("named")
 
-    checkpoint = loop.newest_checkpoint(run.folder)
+    answers = None
+    if cfg.train.generated_items:
+        asked = processor, cfg.student, cfg.train.precision, cfg.train.generated_items
+        answers = HeldOutAnswers(*asked, run.folder)
+    checkpoint = checkpoints.newest_checkpoint(run.folder)
+    if checkpoint is not None:
+        backbone.check_adapters(checkpoint, model, cfg.student)
     trainer = (SightTrainer if describes else StudentTrainer)(
         model=model,
         args=TrainingArguments(
@@ -98,13 +108,14 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         order=order,
         choice=choice,
         features=features,
+        answers=answers,
     )
-    loop.train_and_log(trainer, run, checkpoint, memory.lower(train))
+    best = loop.train_and_log(trainer, run, checkpoint, memory.lower(train))
     weights = loop.gathered(trainer)
     if rank() == 0:
         backbone.save(model, processor, run.folder / "student", cfg.train.precision, weights)
     log.info("the student is in %s", run.folder / "student")
-    return loop.evaluated(run.folder)
+    return loop.evaluated(run.folder, best)
 
 
 def prepared(cfg: SftCommand) -> tuple[Store, list[Rationale]]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.distributed.fsdp import register_fsdp_forward_method
 from torch.nn import Module
 from torch.nn.functional import cross_entropy
 from torch.utils.data import DataLoader
@@ -19,6 +20,7 @@ from conf.errors import UserError
 from conf.runs import rank, write_json
 from train.collate import IGNORED
 from train.features import Features
+from train.generate import HeldOutAnswers
 from train.planned import ByLength, Samples
 
 
@@ -53,8 +55,9 @@ front."""
 
 class StudentTrainer(Trainer):
     """A Trainer that takes its samples in an `order` of ours and makes training batches with a
-    `training_collator`, measures an evaluation by a `choice` that is told the samples, and stops
-    where a loss is no number.
+    `training_collator`, measures an evaluation by a `choice` that is told the samples and by the
+    `answers` that the student writes, if any are to be written, and stops where a loss is no
+    number.
 
     The loss of an evaluation is the mean over all supervised tokens of its samples; the trainer's
     own would hang on how they are split into micro-batches and ranks.
@@ -67,6 +70,7 @@ class StudentTrainer(Trainer):
         order: ByLength,
         choice: TokenChoice | LetterChoice,
         features: Features | None = None,
+        answers: HeldOutAnswers | None = None,
         **settings: Any,
     ) -> None:
         """`features`: keeps the frozen tower's outputs; the collator is then `features.Keyed`."""
@@ -80,6 +84,8 @@ class StudentTrainer(Trainer):
         self._choice = choice
         self._training_collator = training_collator
         self._features = features
+        self._answers = answers
+        self._asked = False
 
     def get_train_dataloader(self) -> DataLoader:
         # An evaluation's samples are measured by their rows.
@@ -104,9 +110,26 @@ class StudentTrainer(Trainer):
         # The trainer names this after its own mean, which it thereby takes the place of.
         return {**told, "loss": total / count}
 
-    def evaluation_loop(self, dataloader: DataLoader, *args: Any, **settings: Any) -> Any:
+    def evaluation_loop(
+        self, dataloader: DataLoader, *args: Any, metric_key_prefix: str = "eval", **settings: Any
+    ) -> Any:
         self._measured: Samples = dataloader.dataset
-        return super().evaluation_loop(dataloader, *args, **settings)
+        settings["metric_key_prefix"] = metric_key_prefix
+        found = super().evaluation_loop(dataloader, *args, **settings)
+        if self._answers is not None:
+            # All ranks ask alike: a sharded model needs every one of them, and its root's weights.
+            if not self._asked:
+                register_fsdp_forward_method(self.model, "generate")
+                self._asked = True
+            written = self._answers.measure(
+                self.model,
+                metric_key_prefix.removeprefix("eval_"),
+                self._measured,
+                self.state.global_step,
+                keep=self.is_world_process_zero(),
+            )
+            found.metrics.update({f"{metric_key_prefix}_{k}": v for k, v in written.items()})
+        return found
 
     def compute_loss(
         self, model: Module, inputs: dict[str, Any], return_outputs: bool = False, **settings: Any

@@ -32,7 +32,12 @@ class TrainConfig:
     evaluations: int = 10
     """Evaluations, evenly spread over the run, each followed by a checkpoint."""
     keep: int = 2
-    """Checkpoints kept."""
+    """Checkpoints kept, the best one among them."""
+    best: str | None = None
+    """The measure by which the best checkpoint is kept and becomes the student or retriever, by its
+    name in metrics.jsonl, such as eval_answer_letter_accuracy, eval_reasoning_loss or
+    eval_recall@10; a loss is best when least, all others when greatest. null takes the last
+    step."""
     workers: int = 0
     """Processes that prepare batches while the model computes; 0 leaves it to the trainer's own
     process."""
@@ -93,9 +98,14 @@ class SftTrainConfig(TrainConfig):
     """Whether each epoch shows every item's candidates in an order of its own."""
     validation_items: int = 64
     """Training-split items of held-out training scenes that measure the run."""
+    generated_items: int = 8
+    """How many of these the student answers in full at each evaluation, in each mode, all at once;
+    0 asks for no answers."""
 
     def check(self) -> list[str]:
-        problems = super().check() + too_small(self, "train.", {"batch": 1, "validation_items": 1})
+        problems = super().check() + too_small(
+            self, "train.", {"batch": 1, "validation_items": 1, "generated_items": 0}
+        )
         if isinstance(self.micro_batch, str):
             if self.micro_batch != "auto":
                 problems.append(f"train.micro_batch={self.micro_batch}: give a number or auto")

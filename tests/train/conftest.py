@@ -64,7 +64,12 @@ def saved_base(tmp_path_factory: pytest.TempPathFactory, processor: ProcessorMix
 @pytest.fixture(scope="session")
 def nf4_cfg(saved_base: str) -> StudentConfig:
     return StudentConfig(
-        name="nf4", model=saved_base, image_size=96, max_length=1500, lora=LoraConfig(rank=4)
+        name="nf4",
+        model=saved_base,
+        image_size=96,
+        max_length=1500,
+        max_new_tokens=24,
+        lora=LoraConfig(rank=4),
     )
 
 

@@ -243,7 +243,7 @@ def test_a_disk_that_takes_no_more_is_told(model, processor, tmp_path) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
         with pytest.raises(UserError, match=r"cannot be written to .* \(os error 27\)"):
-            export.save(model, processor, tmp_path / "student")
+            backbone.write(model, processor, tmp_path / "student")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 

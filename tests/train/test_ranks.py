@@ -78,8 +78,10 @@ def planned(settings: SftCommand, folder: Path, **changes: Any) -> dict[str, Any
         f"checkpoints={folder.parents[1]}", "workers=1",
         *(f"student.{key}={getattr(student, key)}" for key in ("name", "model", "quantization")),
         *(f"student.{key}={getattr(student, key)}" for key in ("image_size", "max_length")),
+        f"student.max_new_tokens={student.max_new_tokens}",
         f"student.lora.rank={student.lora.rank}",
-        *(f"train.{key}={value}" for key, value in asdict(train).items() if key != "report_to"),
+        *(f"train.{key}={value}" for key, value in asdict(train).items()
+          if key not in ("report_to", "best")),
     ]  # fmt: skip
     unless = {"fsdp": False, "after": None, "fails_on": None}
     return {**unless, "overrides": overrides, "folder": folder, **changes}

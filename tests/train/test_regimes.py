@@ -6,18 +6,16 @@ from dataclasses import replace
 
 import pytest
 
-from conf.errors import UserError
-from conf.schema import SelectCommand, SftTrainConfig, TeacherConfig
+from conf.schema import SftTrainConfig, TeacherConfig
 from conf.schema.training import REGIMES
 from data.records import LETTERS
 from data.store import Store
-from evaluation import select
-from evaluation.protocol import parse_choice
 from teacher.claims import find_claims
 from teacher.narrate import ensure_rationales
 from teacher.predicates import predicates_of
 from teacher.sections import SECTIONS, parts
 from teacher.validate import validate
+from train.choice import parse_choice
 from train.conversation import answer_line, instruction, response
 from train.planned import Samples
 from train.samples import HELD_OUT, Supervised, held_out_scenes, supervised_items
@@ -120,17 +118,6 @@ def test_an_epoch_reaches_the_samples(micro_store, frames, student_cfg) -> None:
         shown.append([samples[k].response for k in range(len(samples))])
         assert shown[-1] == [told(s.in_epoch(epoch)) for s in asked]
     assert shown[0] != shown[1]
-
-
-def test_a_mode_that_was_not_trained_is_told(tmp_path, monkeypatch) -> None:
-    from conf.schema import SftCommand
-    from train import trained
-
-    settings = SftCommand(train=SftTrainConfig(regime="answer_only"))
-    monkeypatch.setattr(trained, "settings_of", lambda *_: settings)
-    cfg = SelectCommand(model=str(tmp_path), modes=["reasoning"])
-    with pytest.raises(UserError, match=r"answer mode alone .* give modes=\[answer\]"):
-        select.main.__wrapped__(cfg, None)
 
 
 class Names:

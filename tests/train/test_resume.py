@@ -22,7 +22,8 @@ from conf.schema import (
 )
 from train import contrastive, samples, sft
 from train.backbone import check_base, note_base
-from train.loop import newest_checkpoint, read_journal
+from train.checkpoints import newest_checkpoint
+from train.loop import read_journal
 from train.planned import ByLength, Samples
 from train.sft_trainer import Epochs
 
@@ -181,18 +182,24 @@ def test_a_batch_beyond_the_queries_is_refused(contrastive_settings, tmp_path) -
         contrastive.main.__wrapped__(settings, Run("run", tmp_path))
 
 
-def test_other_folders_are_no_checkpoints(tmp_path) -> None:
-    for name in ("checkpoint-best", "checkpoint-10-old", "checkpoint-7"):
+def test_other_folders_are_no_checkpoints(tmp_path, caplog) -> None:
+    for name in ("checkpoint-best", "checkpoint-10-old", "checkpoint-"):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "trainer_state.json").write_text("{}")
-    (tmp_path / "checkpoint-9").mkdir()
-    assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-7"
+    assert newest_checkpoint(tmp_path) is None
+    assert not caplog.records
     (tmp_path / "metrics.jsonl").write_bytes(b'3\n{"step": 1, "loss": 2}\n\xff\n{"step": 2, "lo')
     assert read_journal(tmp_path) == [{"step": 1, "loss": 2}]
 
 
 @pytest.mark.slow
 def test_a_retriever_goes_on_as_if_undisturbed(contrastive_settings, tmp_path) -> None:
-    whole, killed = train_twice(contrastive.main, contrastive_settings, tmp_path)
+    train = replace(contrastive_settings.train, best="mrr")
+    settings = replace(contrastive_settings, train=train)
+    whole, killed = train_twice(contrastive.main, settings, tmp_path)
+    measured = {r["step"]: r["eval_mrr"] for r in read_journal(whole) if "eval_mrr" in r}
+    best = max((2, 4), key=measured.get)
+    kept = load_file(whole / f"checkpoint-{best}" / "model.safetensors")
+    weights = load_file(whole / "retriever" / "model.safetensors")
+    assert all(torch.equal(kept[name], weight) for name, weight in weights.items())
     same_weights(*(f / "retriever" / "model.safetensors" for f in (whole, killed)))
     same_journals(whole, killed)

@@ -3,7 +3,7 @@ import random
 
 import pytest
 
-from evaluation.protocol import Choice, Reason, parse, parse_choice
+from train.choice import Choice, Reason, parse, parse_choice
 
 NO, CUT, SEV, REF, BAD, MAL = Reason
 

@@ -1,0 +1,241 @@
+"""Reads a model's answer to a selection item. It finds a letter or says why there is none, and
+never makes one up: an answer that names several letters, or names one only in passing, is none."""
+
+from __future__ import annotations
+
+import json
+import re
+import unicodedata
+from dataclasses import dataclass
+from enum import StrEnum
+
+from data.records import LETTERS
+
+
+class Reason(StrEnum):
+    """Why an answer has no letter, or (`CUT_OFF`, `MALFORMED` beside a letter) why its record is
+    invalid although the choice in it stands."""
+
+    NO_ANSWER = "no answer"
+    CUT_OFF = "cut off"
+    SEVERAL = "several"
+    REFUSAL = "refusal"
+    BAD_LETTER = "bad letter"
+    MALFORMED = "malformed"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The chosen letter, upper case, or None; and what was wrong, None where nothing was."""
+
+    letter: str | None
+    reason: Reason | None = None
+
+
+_TOKEN = re.compile(
+    r"""(?P<string>"(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*')|(?P<open>[{\[])|(?P<close>[}\]])"""
+    r"""|(?P<colon>:)|(?P<cut>["'])|(?P<bare>[^\s"'{}\[\]:,]+)""",
+    re.DOTALL,
+)
+_RECORD = re.compile(r"""\{\s*["']""")
+_LIST = re.compile(r"\[[^\[\]{}]*\]")
+_BARE_VALUE = re.compile(r"""[^\n}]*?(?=,\s*["'}]|[\n}])""")
+_VALUE_ENDS = re.compile(r"""\s*(?:[,}\]"']|$)""")
+
+_ANSWER = re.compile(
+    r"(?:^|[.!?;]\s)[ \t*_#>`\-]*(?:(?:so|thus|hence|therefore),?\s+)?(?:(?:the|my)\s+)?"
+    r"(?:(?:final|correct|best|forced)[\s_]+)*(?:answer|choice)[*_`]*"
+    r"\s*(?:\bis\b\s*:?|[:=])(?P<value>\s*[^\n]*)",
+    re.IGNORECASE | re.MULTILINE,
+)
+_ONE = re.compile(
+    r"(?:the\s+)?(?:(?:correct|best|right|final)\s+)?"
+    r"(?:(?:option|candidate|image|choice|frame|letter|answer)(?:\s+is)?[\s:#.\-]\s*)?"
+    r"(?P<letter>[^\W_])(?!\w)\s*(?P<rest>$|(?:[.,:;!?/|&+=]|[\-–—](?!\w)|because\b|since\b).*)",
+    re.IGNORECASE | re.DOTALL,
+)
+_STANDALONE = re.compile(
+    r"(?<![\w'])(?!I\b)[A-Z](?![\w'])(?!(?<=A)\s+(?!or\b|and\b|vs\b|to\b)[a-z])"
+)
+_BETWEEN = frozenset(
+    ("or", "and", "vs", "to", "either", "both", "but", "maybe", "possibly", "perhaps", "option")
+)
+
+_EMPTY = frozenset(("", "null"))
+_DECLINES = frozenset(("none", "n/a", "na", "nil", "no", "neither", "unknown", "unsure", "abstain"))
+_REFUSAL = re.compile(
+    r"(?:can\s?not|can'?t|unable to|impossible to|hard to|not able to)\s+(?:be\s+)?"
+    r"(?:reliably\s+)?(?:determine|tell|answer|decide|choose|select|pick|identify|say|know|see|view|"
+    r"assist|help|provide|comply)|i'?m sorry|i am sorry|refuse to|do not know|don'?t know|"
+    r"not (?:enough|sufficient)|insufficient|none of|no (?:correct|valid|suitable|clear|single) "
+    r"(?:answer|option|choice|candidate|image)",
+    re.IGNORECASE,
+)
+
+
+def parse_choice(raw: str) -> str | None:
+    """The letter that a model's output chooses, or None. See `parse`."""
+    return parse(raw).letter
+
+
+def parse(raw: str, letters: str = LETTERS) -> Choice:
+    """Reads an output: a structured record, prose that ends in "Answer: B", or a lone letter.
+
+    Only what follows the last `</think>` counts. Where a chat template opens `<think>` itself, put
+    it back in front, or a thought that was cut off is read as an answer. A record (JSON with
+    `choice` or `forced_choice`) is the only source where there is one; records or answer lines
+    that disagree give no letter.
+
+    Args:
+        raw: the whole output.
+        letters: the letters on offer, upper case.
+    """
+    text = unicodedata.normalize("NFKC", raw)
+    text = text.rpartition("</think>")[2]
+    if "<think>" in text:
+        return Choice(None, Reason.CUT_OFF)
+    found, prose, flag = _records(text)
+    if found:
+        choice = _agree([_read(value, letters) for value in found])
+        return Choice(choice.letter, flag) if choice.letter else choice
+    if flag is Reason.CUT_OFF:
+        return Choice(None, flag)
+    lines = [m["value"] for m in _ANSWER.finditer(prose)]
+    if not lines:
+        return _lone(prose, letters)
+    choice = _agree([_read(value, letters) for value in lines])
+    if choice.reason is Reason.NO_ANSWER and not lines[-1].strip():
+        return Choice(None, Reason.CUT_OFF)
+    return choice
+
+
+def _records(text: str) -> tuple[list[str], str, Reason | None]:
+    """The choices of all records, the text outside them, and what is wrong with a record."""
+    values, prose, flag, at = [], [], None, 0
+    while match := _RECORD.search(text, at):
+        found, end = _choices(text, match.start())
+        values += found
+        prose.append(text[at : match.start()])
+        at = len(text) if end is None else end
+        if end is None:
+            flag = Reason.CUT_OFF
+        elif found and not _is_json(text[match.start() : end]):
+            flag = flag or Reason.MALFORMED
+    return values, "\n".join([*prose, text[at:]]), flag
+
+
+def _choices(text: str, start: int) -> tuple[list[str], int | None]:
+    """Values of the choice keys of the record that opens at `start`, and where it ends (None if it
+    does not). A choice counts only in the record's outermost level, but one further in can
+    contradict it: what looks like a nested record may follow one that was broken off."""
+    found: list[tuple[int, str]] = []
+    depth, key, awaits = 0, "", False
+    for token in _TOKEN.finditer(text, start):
+        kind = token.lastgroup
+        if kind == "cut":
+            break
+        if kind == "colon":
+            awaits, key = _is_choice(key), ""
+            continue
+        if awaits:
+            value = _value(text, token)
+            if value is None:
+                break
+            found.append((depth, value))
+            awaits = False
+        elif kind == "string":
+            key = _unquote(token[0])
+        if kind == "open":
+            depth += 1
+        elif kind == "close":
+            depth -= 1
+            if depth == 0:
+                return _outermost(found), token.end()
+    return _outermost(found), None
+
+
+def _outermost(found: list[tuple[int, str]]) -> list[str]:
+    return [value for _, value in found] if any(depth == 1 for depth, _ in found) else []
+
+
+def _value(text: str, token: re.Match[str]) -> str | None:
+    """The value that begins at a token; None where the text breaks off inside it."""
+    if token.lastgroup == "string":
+        return _unquote(token[0]) if _VALUE_ENDS.match(text, token.end()) else ""
+    if token.lastgroup == "bare":
+        match = _BARE_VALUE.match(text, token.start())
+    else:
+        match = _LIST.match(text, token.start())
+        if match is None and token[0] != "[":
+            return ""
+    return match[0] if match else None
+
+
+def _is_choice(key: str) -> bool:
+    return re.sub(r"[\W_]", "", key).lower() in ("choice", "forcedchoice")
+
+
+def _unquote(token: str) -> str:
+    try:
+        return json.loads(token, strict=False)
+    except ValueError:
+        return token[1:-1]
+
+
+def _is_json(text: str) -> bool:
+    try:
+        json.loads(text)
+    except (ValueError, RecursionError):
+        return False
+    return True
+
+
+def _agree(choices: list[Choice]) -> Choice:
+    """What several statements come to. One that says nothing takes nothing from the others."""
+    spoken = {c for c in choices if c.reason is not Reason.NO_ANSWER}
+    if not spoken:
+        return Choice(None, Reason.NO_ANSWER)
+    return spoken.pop() if len(spoken) == 1 else Choice(None, Reason.SEVERAL)
+
+
+def _bare(value: str) -> str:
+    """A value without its quotes, brackets and markdown; apostrophes inside words stay."""
+    value = re.sub(r"\\(?:boxed|text)\b|[*_`\"“”()\[\]{}<>$\\]+|(?<!\w)'|'(?!\w)", " ", value)
+    return " ".join(value.split())
+
+
+def _read(value: str, letters: str) -> Choice:
+    """The letter that a short statement chooses."""
+    value = _bare(value)
+    if value.lower() in _EMPTY:
+        return Choice(None, Reason.NO_ANSWER)
+    if value.lower() in _DECLINES:
+        return Choice(None, Reason.REFUSAL)
+    one, named = _ONE.fullmatch(value), _letters_named(value)
+    if len(named | {one["letter"].upper()} if one else named) > 1:
+        return Choice(None, Reason.SEVERAL)
+    if one:
+        letter = one["letter"].upper()
+        return Choice(letter) if letter in letters else Choice(None, Reason.BAD_LETTER)
+    return Choice(None, Reason.REFUSAL if _REFUSAL.search(value) else Reason.NO_ANSWER)
+
+
+def _letters_named(value: str) -> set[str]:
+    """Every letter that stands alone; lower case ones only where nothing but letters is said."""
+    words = re.findall(r"\w+", value.lower())
+    letters = {w.upper() for w in words if len(w) == 1}
+    if all(len(w) == 1 or w in _BETWEEN for w in words):
+        return letters
+    return set(_STANDALONE.findall(value))
+
+
+def _lone(text: str, letters: str) -> Choice:
+    """The answer of a text that is nothing but a letter, such as "(B)" or "Option b"."""
+    value = _bare(text)
+    if len(value.split()) > 5:
+        refused = _REFUSAL.search(value)
+        return Choice(None, Reason.REFUSAL if refused else Reason.NO_ANSWER)
+    choice, one = _read(value, letters), _ONE.fullmatch(value)
+    if choice.letter and one["rest"].strip(" .,:;!?"):
+        return Choice(None, Reason.NO_ANSWER)
+    return choice
