@@ -24,7 +24,7 @@ PACKAGES = {
     "swanlab": "swanlab",
 }
 """The package that is imported for each of the Trainer's names."""
-EXTRAS = ("tensorboard", "wandb", "trackio")
+EXTRAS = ("tensorboard", "wandb")
 """Those that this project has an extra for, of the same name."""
 
 
