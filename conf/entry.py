@@ -99,7 +99,11 @@ def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None
         logging.disable(logging.WARNING)
         # The main rank holds the folder for all.
         return main(settings, run)
-    with held(run.folder):
+    in_use = (
+        f"{run.folder} is in use: another process of this command writes there. Wait for it, or "
+        "choose another folder with run=NAME"
+    )
+    with held(run.folder, in_use):
         open_run(run, asdict(settings), name, overrides)
         metrics = main(settings, run)
         if metrics is not None:

@@ -112,21 +112,18 @@ def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[s
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Hold a run's folder against other processes.
+def held(folder: Path, otherwise: str) -> Iterator[None]:
+    """Hold a folder against other processes.
 
     Raises:
-        UserError: another process holds it.
+        UserError: another process holds it; `otherwise` says so.
     """
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         os.close(handle)
-        raise UserError(
-            f"{folder} is in use: another process of this command writes there. Wait for it, or "
-            "choose another folder with run=NAME"
-        ) from error
+        raise UserError(otherwise) from error
     try:
         yield
     finally:

@@ -26,11 +26,11 @@ from tqdm import tqdm
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import write_text
+from conf.runs import held, write_text
 from conf.schema import ExportCommand
 from data.columns import Rows, features
 from data.controls import MATCHED
-from data.growing import held
+from data.growing import being_built
 from data.parallel import Workers
 from data.records import POOLS, SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from data.store import DATABASES, Store, digest, sealed, write_atomically
@@ -128,7 +128,7 @@ def export(store: Store, folder: Path, plan: dict[str, Any]) -> None:
 
     growing = folder.with_name(f".{folder.name}.partial")
     growing.mkdir(parents=True, exist_ok=True)
-    with held(growing, folder):
+    with held(growing, being_built(folder)):
         _begin(growing, plan)
         columns = features(plan["images"])
         rows = Rows(store, plan["images"])

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from conf.errors import UserError
+from conf.runs import held
 from conf.schema import BenchmarkConfig
 from data.bullet import GENERATOR_VERSION
 from data.records import SPLITS
@@ -27,7 +26,7 @@ def growing_folder(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path]:
     growing = folder.with_name(f".{folder.name}.partial")
     growing.mkdir(parents=True, exist_ok=True)
     plan = _plan(cfg)
-    with held(growing, folder):
+    with held(growing, being_built(folder)):
         if (growing / PLAN).exists():
             _check_same_plan(json.loads((growing / PLAN).read_text()), plan, growing)
         for leftover in growing.rglob(".*.partial"):
@@ -55,25 +54,9 @@ def _plan(cfg: BenchmarkConfig) -> dict[str, Any]:
     }
 
 
-@contextmanager
-def held(growing: Path, folder: Path) -> Iterator[None]:
-    """Hold the folder `growing` in which `folder` is made.
-
-    Raises:
-        UserError: another process holds it.
-    """
-    handle = os.open(growing, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(handle)
-        raise UserError(
-            f"{folder} is being built by another process; run this again when it is done"
-        ) from error
-    try:
-        yield
-    finally:
-        os.close(handle)
+def being_built(folder: Path) -> str:
+    """What a second process is told that would make `folder` at the same time."""
+    return f"{folder} is being built by another process; run this again when it is done"
 
 
 def _check_same_plan(there: dict[str, Any], plan: dict[str, Any], growing: Path) -> None:

@@ -227,10 +227,10 @@ def test_a_mode_that_was_not_trained_is_told(trained, tmp_path) -> None:
 
 
 def test_a_folder_is_one_process_s_at_a_time(tmp_path) -> None:
-    with held(tmp_path), pytest.raises(UserError, match=r"is in use: another process"), \
-            held(tmp_path):  # fmt: skip
+    with held(tmp_path, "first"), pytest.raises(UserError, match="second"), \
+            held(tmp_path, "second"):  # fmt: skip
         pass
-    with held(tmp_path):
+    with held(tmp_path, "third"):
         pass
 
 
