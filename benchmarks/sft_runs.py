@@ -19,11 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from datasets import Dataset
 from PIL import Image
 from torch import nn
-from torch.utils.data import Dataset as TorchDataset
-from torch.utils.data import SequentialSampler, Subset
+from torch.utils.data import Dataset, SequentialSampler, Subset
 from transformers import (
     PrinterCallback,
     ProcessorMixin,
@@ -48,7 +46,8 @@ class Variant:
     """A trainer and its switches.
 
     `attention` is one of transformers' implementations, None what the trainer's user gets without
-    asking. `collator` is TRL's: ours, or its own for samples that show images alone.
+    asking. `collator` is ours; of our trainer's "every row", which lets unsupervised rows pass the
+    head too; of TRL's its "own", for samples that show images alone.
     """
 
     name: str
@@ -112,7 +111,8 @@ def ours(
     train = work.train
     if variant.attention is not None:
         work.model.get_base_model().set_attn_implementation(variant.attention)
-    collator = Collator(work.processor, work.max_length)
+    kind = EveryRow if variant.collator == "every row" else Collator
+    collator = kind(work.processor, work.max_length)
     rope = rope_of(work.model, train.packing)
     packs = rope and PackingCollator(work.processor, work.max_length, rope)
     arguments = loop.arguments(train, Run("benchmark", folder), SEED, None)
@@ -138,11 +138,13 @@ def ours(
 def trls(variant: Variant, work: Work, clock: Clock, folder: Path) -> Trainer:
     """TRL's trainer, as SFTConfig comes in all that a variant and the hyperparameters leave open.
     It takes rows of `datasets` only, so a row is the place of its sample."""
+    import datasets
     from trl import SFTConfig, SFTTrainer
 
     train, own = work.train, variant.collator == "own"
     work.model.get_base_model().set_attn_implementation(variant.attention or "sdpa")
-    rows = Dataset.from_dict({"row": range(len(work.samples))})
+    rows = datasets.Dataset.from_dict({"row": range(len(work.samples))})
+    collator = EveryRow(work.processor, work.max_length)
     if own:
         rows = rows.with_transform(partial(shown, work.samples))
     return SFTTrainer(
@@ -174,25 +176,24 @@ def trls(variant: Variant, work: Work, clock: Clock, folder: Path) -> Trainer:
             report_to="none",
             disable_tqdm=True,
         ),
-        data_collator=None if own else WholeRows(work),
+        data_collator=None if own else partial(collator.rows, work.samples),
         train_dataset=rows,
         processing_class=work.processor,
         callbacks=[clock],
     )
 
 
-class WholeRows:
-    """Our prompts and responses with a label for every position: TRL's head takes those that are
-    supervised by itself."""
+class EveryRow(Collator):
+    """Makes batches in which every position has a label and passes the head."""
 
-    def __init__(self, work: Work) -> None:
-        self._work = work
+    def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
+        encoded = [encode(s, self._processor, self._max_length) for s in samples]
+        return pad(encoded, self._processor.tokenizer.pad_token_id)
 
-    def __call__(self, rows: Sequence[dict[str, int]]) -> dict[str, Any]:
-        work = self._work
-        samples = [work.samples[row["row"]] for row in rows]
-        encoded = [encode(sample, work.processor, work.max_length) for sample in samples]
-        return pad(encoded, work.processor.tokenizer.pad_token_id)
+    def rows(self, samples: Subset, rows: Sequence[dict[str, int]]) -> dict[str, Any]:
+        """A batch of the samples at `rows`. TRL's head takes those positions that are supervised
+        by itself."""
+        return self([samples[row["row"]] for row in rows])
 
 
 def shown(samples: Subset, rows: dict[str, list[int]]) -> dict[str, list[Any]]:
@@ -205,10 +206,10 @@ def shown(samples: Subset, rows: dict[str, list[int]]) -> dict[str, list[Any]]:
     }
 
 
-class AsImages(TorchDataset):
+class AsImages(Dataset):
     """Samples that show their clips' frames as images: without times, in twice the tokens."""
 
-    def __init__(self, samples: TorchDataset) -> None:
+    def __init__(self, samples: Dataset) -> None:
         self._samples = samples
 
     def __getitem__(self, index: int) -> Sample:
