@@ -9,7 +9,7 @@
 turns: medians over the rounds of samples a second and of the process's peak memory, and of each
 round's ratio to ours. TRL is measured as it comes, with each setting that could help it, with the
 MALLOC_* variables set, by which its user has what our trainer asks of glibc itself, and on what its
-own collator can show, frames as images.
+own collator can show, frames as images. The loss is the last step's, by each one's own convention.
 
 `loss` trains over the unquantised base in fp32 and holds the losses of all steps against TRL's,
 ours in its convention: the mean over a micro-batch's tokens, and then over micro-batches.
@@ -85,9 +85,9 @@ def main() -> None:
         command.add_argument("--rounds", type=int, default=3)
         command.add_argument("--store", default="store", help="where the tiny benchmark is")
         command.set_defaults(measure=measure)
-    one = commands.add_parser("one", help="one variant, for the others")
-    one.add_argument("variant", type=json.loads)
-    one.set_defaults(measure=lambda args: print(json.dumps(train_one(**args.variant)), flush=True))
+    single = commands.add_parser("one", help="one variant, for the others")
+    single.add_argument("variant", type=json.loads)
+    single.set_defaults(measure=print_one)
     args = parser.parse_args()
     args.measure(args)
 
@@ -137,8 +137,8 @@ def measure_loss(args: argparse.Namespace) -> None:
     mine = in_process(args, OURS, {}, convention="trl", **exact)["losses"]
     theirs = in_process(args, DEFAULT, VARIANTS[DEFAULT], **exact)["losses"]
     print(f"{'step':>4}{'ours':>12}{'TRL':>12}{'apart':>12}")
-    for step, (one, other) in enumerate(zip(mine, theirs, strict=True), 1):
-        print(f"{step:>4}{one:>12.6f}{other:>12.6f}{abs(one - other):>12.1e}")
+    for step, (loss, other) in enumerate(zip(mine, theirs, strict=True), 1):
+        print(f"{step:>4}{loss:>12.6f}{other:>12.6f}{abs(loss - other):>12.1e}")
 
 
 def measure_start(args: argparse.Namespace) -> None:
@@ -164,26 +164,41 @@ def start_ours(store: str, measured: int) -> float:
         settings += ["train.max_steps=1", "train.evaluations=1"]
         settings += [f"train.validation_items={measured}"]
         journal = Path(folder) / "sft" / "first" / "metrics.jsonl"
-        started = time.perf_counter()
-        with child([sys.executable, "-m", "train.sft", *settings]) as process:
+        with started([sys.executable, "-m", "train.sft", *settings]) as (process, since):
             while not (journal.exists() and '"loss"' in journal.read_text()):
                 if process.poll():
                     raise RuntimeError("train.sft has failed")
                 time.sleep(0.01)
-            return time.perf_counter() - started
+            return time.perf_counter() - since
 
 
 def start_trls(store: str) -> float:
     """Seconds until TRL, given the same samples, has trained for a step."""
     variant = {"name": DEFAULT, "steps": 1, "store": store, **VARIANTS[DEFAULT]}
-    started = time.perf_counter()
-    with child(
-        [sys.executable, "-m", "benchmarks.sft", "one", json.dumps(variant)], stdout=subprocess.PIPE
-    ) as process:
-        assert process.stdout is not None
-        if not process.stdout.readline():
+    with started(one(variant)) as (process, since):
+        if not any(line.startswith("{") for line in process.stdout or ()):
             raise RuntimeError("TRL has failed")
-        return time.perf_counter() - started
+        return time.perf_counter() - since
+
+
+@contextmanager
+def started(command: list[str]) -> Iterator[tuple[subprocess.Popen[str], float]]:
+    """A process that ends with the block, and when it was started. Nothing that it says but an
+    error is shown."""
+    with tempfile.TemporaryFile("w+") as said:
+        since = time.perf_counter()
+        process = subprocess.Popen(
+            command, env=environment({}), text=True, stdout=subprocess.PIPE, stderr=said
+        )
+        try:
+            yield process, since
+        except RuntimeError:
+            said.seek(0)
+            print(said.read(), file=sys.stderr)
+            raise
+        finally:
+            process.kill()
+            process.wait()
 
 
 def in_process(
@@ -191,28 +206,29 @@ def in_process(
 ) -> dict[str, Any]:
     """What `train_one` gives in a process of its own."""
     variant = {"name": name, "steps": args.steps + 1, "store": args.store, **switches, **settings}
-    command = [sys.executable, "-m", "benchmarks.sft", "one", json.dumps(variant)]
-    with child(command, switches.get("environment", {}), stdout=subprocess.PIPE) as process:
-        told, _ = process.communicate()
-    if process.returncode:
-        raise RuntimeError(f"{name} has failed")
-    return json.loads(told.splitlines()[-1])
-
-
-@contextmanager
-def child(
-    command: list[str], environment: dict[str, str] | None = None, **settings: Any
-) -> Iterator[subprocess.Popen[str]]:
-    """A process that is ended with the block; its warnings are kept from the table."""
-    offline = {"HF_HUB_OFFLINE": "1", "TRL_EXPERIMENTAL_SILENCE": "1"}
-    process = subprocess.Popen(
-        command, env={**os.environ, **offline, **(environment or {})}, text=True, **settings
+    done = subprocess.run(
+        one(variant),
+        env=environment(switches.get("environment", {})),
+        text=True,
+        capture_output=True,
     )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
+    if done.returncode:
+        print(done.stderr, file=sys.stderr)
+        raise RuntimeError(f"{name} has failed")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def one(variant: dict[str, Any]) -> list[str]:
+    """The command that trains a variant in a process of its own."""
+    return [sys.executable, "-m", "benchmarks.sft", "one", json.dumps(variant)]
+
+
+def environment(own: dict[str, str]) -> dict[str, str]:
+    return {**os.environ, "HF_HUB_OFFLINE": "1", **own}
+
+
+def print_one(args: argparse.Namespace) -> None:
+    print(json.dumps(train_one(**args.variant)), flush=True)
 
 
 def train_one(
