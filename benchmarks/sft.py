@@ -51,6 +51,7 @@ OURS, DEFAULT = "ours", "TRL as it comes"
 PLAIN = {"trainer": "trl"}
 VARIANTS: dict[str, dict[str, Any]] = {
     OURS: {},
+    "ours, micro-batch 4": {"micro_batch": 4},
     "ours, recomputing": {"recompute": True},
     DEFAULT: PLAIN | {"recompute": True},
     "TRL, activations kept": PLAIN,
