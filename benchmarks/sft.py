@@ -46,7 +46,7 @@ MALLOC = {
     "MALLOC_TRIM_THRESHOLD_": str((1 << 31) - 1),
     "MALLOC_TOP_PAD_": str(64 << 20),
 }
-"""What `train.backbone.keep_big_blocks` sets, as a user can before a process starts."""
+"""What `train.room.keep_big_blocks` sets, as a user can before a process starts."""
 OURS, DEFAULT = "ours", "TRL as it comes"
 PLAIN = {"trainer": "trl"}
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -249,7 +249,7 @@ def train_one(
     from data.build import ensure_benchmark
     from data.frames import Frames
     from teacher.narrate import ensure_rationales
-    from train import backbone, samples
+    from train import backbone, room, samples
     from train.planned import ByLength
 
     variant = sft_runs.Variant(**switches)
@@ -258,7 +258,7 @@ def train_one(
     built = ensure_benchmark(cfg.benchmark, Path(store), cfg.workers)
     rationales = ensure_rationales(built, cfg.teacher)
     if variant.trainer == "ours":
-        backbone.keep_big_blocks()
+        room.keep_big_blocks()
     set_seed(sft_runs.SEED)
     model, processor = backbone.load_student(cfg.student, precision, list)
     training, _ = samples.splits(built, rationales, cfg, Frames(built, cfg.student.image_size))

@@ -40,7 +40,7 @@ from conf.compose import compose
 from conf.errors import UserError
 from conf.schema import SftCommand, StudentConfig
 from data.records import LETTERS
-from train import backbone, loop, memory
+from train import backbone, loop, memory, room, towers
 from train.attention import choose_attention, flash_attention
 from train.collate import Collator
 from train.conversation import Clip, Sample, answer_line, conversation, instruction
@@ -107,7 +107,7 @@ def main() -> None:
     warnings.simplefilter("ignore", FutureWarning)
     logging.disable(logging.WARNING)
     loop.keep_to_one_gpu()
-    backbone.keep_big_blocks()
+    room.keep_big_blocks()
     for base in args.base or ["nf4", "bf16"]:
         measure(args.student, base, args.steps)
 
@@ -123,7 +123,7 @@ def measure(name: str, base: str, steps: int) -> None:
     work = Work(model, processor, Subset(shown, places), settings.train, student.max_length)
     bench = Bench(work, student, step_flops(model, processor, shown, student), product_rate(device))
     print(f"\n{name} over {base} on {device_name()}, {bench.limit / 1e12:.1f} TFLOP/s of products")
-    print(backbone.tower_table(backbone.count_towers(model)))
+    print(towers.tower_table(towers.count_towers(model)))
     print(f"{len(shown)} samples a step, {bench.flops / 1e12:.1f} TFLOP")
     print(f"{'':<48}{'s/step':>9}{'samples/s':>11}{'of peak':>9}{'peak GiB':>10}", flush=True)
     found = [(variant.trainer, bench.line(variant, steps)) for variant in variants()]
@@ -230,7 +230,7 @@ def built(name: str, cfg: StudentConfig, device: torch.device) -> tuple[nn.Modul
     model.config.use_cache = False
     backbone.keep_differentiable(model)
     student = backbone.add_adapters(model, cfg.lora).to(device)
-    backbone.check_towers(backbone.count_towers(student), cfg)
+    towers.check_towers(towers.count_towers(student), cfg)
     said = [instruction("reasoning", "cot"), *(answer_line(x) for x in LETTERS), SAID]
     processor = build_processor(said * 20, 512, cfg.image_size)
     backbone.pin_sizes(processor, cfg.image_size, cfg.frames)

@@ -29,14 +29,14 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     from evaluation.embedding import rank_all
     from evaluation.figures import retrieval_figure
     from evaluation.tables import RECALLS, UNTRAINED, RetrievalRow, retrieval_table
-    from train import backbone, retriever
+    from train import compatible, retriever, room
 
-    backbone.keep_big_blocks()
+    room.keep_big_blocks()
     frames = Frames(store, preset.image_size)
     rows: list[RetrievalRow] = []
     if folder is not None:
         log.info("ranking with the retriever of %s", folder)
-        backbone.check_base(folder, preset.model)
+        compatible.check_base(folder, preset.model)
         model = retriever.load_trained(preset, precision, folder / "retriever")
         rows += rank_all(model, preset, store, frames, cfg.batch, run_title(folder))
     log.info("ranking with the untrained %s", preset.name)

@@ -35,15 +35,15 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from data.frames import Frames
     from evaluation import answers, figures, tables
     from evaluation.metrics import accuracy_by, accuracy_table
-    from train import backbone
+    from train import backbone, compatible, room
 
     items = spread(store.selection("test", cfg.suite), cfg.limit, cfg.seed)
     if not items:
         suite = cfg.suite or store.suite
         raise UserError(f"{store.folder} has no test items of the {suite} suite to measure on")
-    backbone.keep_big_blocks()
+    room.keep_big_blocks()
     if folder is not None:
-        backbone.check_base(folder, student.model)
+        compatible.check_base(folder, student.model)
         weights = product_folder(folder, "student")
         model, processor = backbone.load_trained(student, precision, weights)
     else:
@@ -52,7 +52,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     name = run_title(folder) if folder else f"{student.name} base"
     asked = ", ".join(filter(None, (store.name, cfg.suite, cfg.control)))
     frames = Frames(store, student.image_size)
-    digest = backbone.weights_digest(student.model, weights)
+    digest = compatible.weights_digest(student.model, weights)
     measured = f"{digest} on {store.identity}, {asked}"
     journal = answers.AnswerLog(run.folder / "answers.jsonl", measured, items)
     rows, subtypes, metrics = [], {}, {}

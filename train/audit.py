@@ -12,10 +12,10 @@ from conf.errors import UserError
 from conf.schema import RetrieverConfig, StudentConfig
 from data.frames import Frames
 from data.records import RetrievalQuery
-from train.backbone import check_towers, count_towers, tower_table
 from train.collate import IGNORED, Collator
 from train.conversation import Sample
 from train.retriever import frame_input, query_input
+from train.towers import check_towers, count_towers, tower_table
 
 
 def audit(

@@ -1,37 +1,30 @@
-"""Load a student: base, 4-bit weights, adapters; and the audit of what was loaded."""
+"""Load a student, its base, 4-bit weights and adapters, and write what was trained."""
 
 from __future__ import annotations
 
-import ctypes
-import hashlib
-import json
 import re
-import sys
 import warnings
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from torch import nn
 from transformers import (
     AutoConfig,
     AutoModelForImageTextToText,
     AutoProcessor,
     BitsAndBytesConfig,
-    PreTrainedConfig,
     PreTrainedModel,
-    PreTrainedTokenizerBase,
     ProcessorMixin,
 )
 from transformers.utils import logging as transformers_logging
 
 from conf.errors import UserError
-from conf.runs import write_json
-from conf.schema import LoraConfig, RetrieverConfig, StudentConfig
+from conf.schema import LoraConfig, StudentConfig
 from train.attention import choose_attention
+from train.compatible import check_adapters, check_processor, check_tower
 from train.tiny import build_model, build_processor
 from train.trained import EXPORT
 
@@ -41,11 +34,6 @@ named both as it stands in the generative model and in the bare one."""
 DTYPES = {"bf16": torch.bfloat16, "fp32": torch.float32}
 UNREADABLE = (OSError, ValueError, KeyError, TypeError, SafetensorError)
 """What the libraries raise at files that are missing, cut or of another kind."""
-BASE = "base.json"
-PEFT = "base_model.model."
-"""What peft puts before the names of the modules that it adapts."""
-MEBIBYTE = 1 << 20
-TOWERS = ("vision", "language", "embeddings and head")
 
 Corpus = Callable[[], Iterable[str]]
 
@@ -146,50 +134,6 @@ def damaged(folder: Path, error: Exception) -> UserError:
     )
 
 
-def check_tower(group: str, model: str, config: PreTrainedConfig) -> None:
-    """Raises UserError where a base has no vision tower."""
-    if getattr(config, "vision_config", None) is None:
-        raise UserError(
-            f"{group}.model={model} ({config.model_type}) has no vision tower: give a "
-            "vision-language model, such as Qwen3-VL"
-        )
-
-
-def check_processor(
-    group: str,
-    model: str,
-    config: PreTrainedConfig,
-    processor: ProcessorMixin | PreTrainedTokenizerBase,
-) -> None:
-    """Raises UserError where a base's processor does not go with its weights."""
-    if problem := _mismatch(config, processor):
-        raise UserError(
-            f"{group}.model={model} holds a processor of another model, {type(processor).__name__} "
-            f"({problem}): put the processor and tokenizer files there that came with the weights"
-        )
-
-
-def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:
-    """How a processor does not go with a model; None where it does."""
-    for name in ("tokenizer", "image_processor", "video_processor"):
-        if not hasattr(processor, name):
-            return f"it has no {name.replace('_', ' ')}"
-    tokens, known = len(processor.tokenizer), config.get_text_config().vocab_size
-    if tokens > known:
-        return f"its tokenizer has {tokens} tokens, the model {known}"
-    for part in (processor.image_processor, processor.video_processor):
-        for name, own in (("patch_size", "patch_size"), ("merge_size", "spatial_merge_size")):
-            there, here = getattr(part, name, None), getattr(config.vision_config, own, None)
-            if there != here:
-                what = name.replace("_", " ")
-                return f"its {what} is {there}, that of the vision tower {here}"
-    for name in ("image_token_id", "video_token_id"):
-        there, here = getattr(processor, name, None), getattr(config, name, None)
-        if there != here:
-            return f"its {name} is {there}, the model's {here}"
-    return None
-
-
 def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
     """Keep frames of image_size x image_size px at the nearest size on the tower's grid, in an
     image and in a video of up to `frames` alike. By default a video is shrunk to a budget that an
@@ -285,40 +229,6 @@ def load_trained(
     return model.eval(), processor
 
 
-def check_adapters(folder: Path, base: nn.Module, cfg: StudentConfig) -> None:
-    """Hold the adapters in a folder to the base, with adapters of its own or without, that they are
-    laid over, and to the preset's rank. A whole model has none, nor have FSDP's checkpoints.
-
-    Raises:
-        UserError: they are of another base or rank.
-        SafetensorError: they cannot be read.
-    """
-    if not (path := folder / "adapter_model.safetensors").exists():
-        return
-    modules = {name.removeprefix(PEFT): module for name, module in base.named_modules()}
-    with safe_open(path, "pt") as file:
-        shapes = {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118
-    for name, shape in shapes.items():
-        adapted, _, side = name.removeprefix(PEFT).partition(".lora_")
-        # A is (rank, inputs), B is (outputs, rank).
-        rank, there = shape if side.startswith("A") else reversed(shape)
-        if rank != cfg.lora.rank:
-            raise UserError(
-                f"{folder} holds adapters of rank {rank}, and student.lora.rank is "
-                f"{cfg.lora.rank}: give student.lora.rank={rank}, or train in a run of its own "
-                "(run=NAME)"
-            )
-        module = modules.get(adapted)
-        here = module and getattr(module, "in_features" if side[0] == "A" else "out_features")
-        if here != there:
-            found = f"{there} wide there and {here} here" if module else "not in this one"
-            raise UserError(
-                f"{folder} holds adapters of another base than {cfg.model} ({adapted} is {found}): "
-                "give the base that they were trained over with student.model=FOLDER, or train "
-                "again"
-            )
-
-
 def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
     """A student merged into its base, as `train.export` wrote it: in the precision of its weights,
     and with nothing that the standard classes do not read themselves.
@@ -338,38 +248,6 @@ def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
         ) from error
     processor.tokenizer.padding_side = "left"
     return model.to("cuda" if torch.cuda.is_available() else "cpu").eval(), processor
-
-
-def weights_digest(*models: str | Path | None) -> str:
-    """A short hash of the safetensors of models in folders, by each file's name, size and last
-    mebibyte, which training changes, wherever the folder is; a hub's name stands for itself."""
-    whole = hashlib.sha256()
-    for k, model in enumerate(models):
-        folder = model is not None and Path(model).is_dir()
-        whole.update(f"{k} {'' if folder else model}".encode())
-        for path in sorted(Path(model).rglob("*.safetensors")) if folder else []:
-            size = path.stat().st_size
-            with open(path, "rb") as file:
-                file.seek(max(0, size - MEBIBYTE))
-                whole.update(f"{path.name} {size}".encode() + file.read())
-    return whole.hexdigest()[:16]
-
-
-def note_base(folder: Path, model: str | None) -> None:
-    """Note in a run's folder which weights it is trained over, and hold them to an earlier note:
-    a run that goes on goes on over the same."""
-    check_base(folder, model)
-    write_json(folder / BASE, weights_digest(model))
-
-
-def check_base(folder: Path, model: str | None) -> None:
-    """Raises UserError where a run's base is not the one that it was trained over."""
-    note = folder / BASE
-    if note.exists() and json.loads(note.read_text()) != weights_digest(model):
-        raise UserError(
-            f"the weights in {model} are not those that {folder} is trained over: put those back, "
-            "or delete that run and train again"
-        )
 
 
 def save(
@@ -422,90 +300,3 @@ def unwritten(folder: Path, why: str) -> UserError:
         f"the weights cannot be written to {folder} ({why}); once that is mended, run the same "
         "command again"
     )
-
-
-@dataclass
-class Tower:
-    """Parameters of one part of a model."""
-
-    parameters: int = 0
-    four_bit: int = 0
-    lora: int = 0
-    trainable: int = 0
-
-
-def count_towers(model: nn.Module) -> dict[str, Tower]:
-    """Parameters by tower. A 4-bit weight counts as the entries it stands for, not its bytes."""
-    towers = {name: Tower() for name in TOWERS}
-    for name, parameter in model.named_parameters():
-        tower = towers[_tower_of(name)]
-        entries, four_bit = _entries(parameter)
-        tower.parameters += entries
-        tower.four_bit += entries if four_bit else 0
-        tower.lora += entries if "lora_" in name else 0
-        tower.trainable += entries if parameter.requires_grad else 0
-    return towers
-
-
-def _entries(parameter: nn.Parameter) -> tuple[int, bool]:
-    """How many entries a parameter stands for, and whether it holds them in 4 bits."""
-    if type(parameter).__name__ != "Params4bit":
-        return parameter.numel(), False
-    if parameter.quant_state is not None:
-        return parameter.quant_state.shape.numel(), True
-    # Weights are packed as they are loaded; on the meta device they keep their own shape.
-    return parameter.numel(), parameter.is_meta
-
-
-def _tower_of(name: str) -> str:
-    if re.search(r"(^|\.)visual\.", name):
-        return "vision"
-    return "language" if re.search(r"(^|\.)layers\.\d+\.", name) else "embeddings and head"
-
-
-def check_towers(towers: dict[str, Tower], cfg: StudentConfig | RetrieverConfig) -> None:
-    """Hold what was loaded against what the preset says.
-
-    Raises:
-        UserError: a tower is quantised, adapted or trained that should not be, or is not that
-            should.
-    """
-    nf4, lora = cfg.quantization == "nf4", cfg.lora.rank > 0
-    problems = []
-    for name, tower in towers.items():
-        language = name == "language"
-        for what, found, wanted in (
-            ("4-bit", tower.four_bit > 0, nf4 and language),
-            ("LoRA", tower.lora > 0, lora and language),
-            ("trainable", tower.trainable > 0, language or not lora),
-        ):
-            if found != wanted:
-                problems.append(f"{name} has {'some' if found else 'no'} {what} parameters")
-        if lora and tower.trainable != tower.lora:
-            problems.append(f"{name} trains {tower.trainable - tower.lora} that are not LoRA")
-    if problems:
-        raise UserError(
-            f"the loaded model is not what preset {cfg.name} says: {'; '.join(problems)}. Look at "
-            "the quantization and lora.targets of the preset"
-        )
-
-
-def tower_table(towers: dict[str, Tower]) -> str:
-    columns = [f.name for f in fields(Tower)]
-    lines = [f"{'':<22}" + "".join(f"{c.replace('four_bit', '4-bit'):>14}" for c in columns)]
-    for name, tower in towers.items():
-        lines.append(f"{name:<22}" + "".join(f"{getattr(tower, c):>14,}" for c in columns))
-    return "\n".join(lines)
-
-
-def keep_big_blocks() -> None:
-    """Tell glibc to keep the memory of big tensors between steps. By default it gives every block
-    back to the kernel at once, and on a CPU half of a training step goes into page faults."""
-    if not sys.platform.startswith("linux"):
-        return
-    trim_threshold, top_pad, mmap_threshold = -1, -2, -3
-    libc = ctypes.CDLL(None)
-    if hasattr(libc, "mallopt"):
-        libc.mallopt(mmap_threshold, 1 << 30)
-        libc.mallopt(trim_threshold, (1 << 31) - 1)
-        libc.mallopt(top_pad, 64 << 20)

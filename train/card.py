@@ -10,7 +10,7 @@ from huggingface_hub import ModelCardData
 
 from conf.schema import SftCommand
 from conf.sweep import AT_START
-from train.backbone import BASE
+from train.compatible import BASE
 from train.loop import BEST_STEP
 
 SHOWN_PACKAGES = ("torch", "transformers", "peft", "bitsandbytes")

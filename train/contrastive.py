@@ -39,12 +39,12 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from transformers import set_seed
 
     from data.frames import Frames
-    from train import backbone, checkpoints, loop, retriever
+    from train import checkpoints, compatible, loop, retriever, room
     from train.audit import audit_retriever
     from train.ranking import HeldOutRanking
     from train.samples import held_out_scenes, shuffled
 
-    backbone.keep_big_blocks()
+    room.keep_big_blocks()
     loop.keep_to_one_gpu()
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
@@ -64,7 +64,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
         )
 
     log.info("loading retriever %s", cfg.retriever.name)
-    backbone.note_base(run.folder, cfg.retriever.model)
+    compatible.note_base(run.folder, cfg.retriever.model)
     model = retriever.load_retriever(
         cfg.retriever,
         cfg.train.precision,

@@ -64,14 +64,14 @@ def main(cfg: ExportStudentCommand, run: Run) -> Measured:
     trained = find(cfg)
 
     from data.store import digest
-    from train import backbone
     from train.card import text
+    from train.compatible import check_base
     from train.trained import EXPORT, export_record
 
     adapters = trained.student / "adapter_model.safetensors"
     if not adapters.exists():
         raise UserError(f"{trained.student} holds no adapters: delete the run and train again")
-    backbone.check_base(trained.folder, trained.settings.student.model)
+    check_base(trained.folder, trained.settings.student.model)
     weights = digest(adapters)
     folder = run.folder / "student"
     if folder.exists():
@@ -141,7 +141,7 @@ def renamed_when_whole(folder: Path) -> Iterator[Path]:
 
 def write_adapter(trained: Trained, folder: Path) -> Measured:
     """Copy the adapters and the processor, and the hash of the base that they were trained over."""
-    from train.backbone import BASE
+    from train.compatible import BASE
 
     shutil.copytree(trained.student, folder, dirs_exist_ok=True)
     if (trained.folder / BASE).exists():

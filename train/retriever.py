@@ -25,15 +25,14 @@ from data.records import FPS, FRAMES, FrameRef, RetrievalQuery, shown_frames
 from train.backbone import (
     DTYPES,
     UNREADABLE,
-    check_processor,
     check_reachable,
-    check_tower,
     damaged,
     keep_differentiable,
     load_failure,
     nf4_config,
     pin_sizes,
 )
+from train.compatible import check_processor, check_tower
 from train.tiny import build_model, build_processor
 
 PROCESSING = {

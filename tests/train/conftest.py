@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import pytest
 from transformers import PreTrainedModel, ProcessorMixin
 
-from conf.schema import ArchitectureConfig, LoraConfig, RetrieverConfig, StudentConfig
+from conf.schema import (
+    ArchitectureConfig,
+    BenchmarkConfig,
+    LoraConfig,
+    RetrieverConfig,
+    SftCommand,
+    SftTrainConfig,
+    StudentConfig,
+    TeacherConfig,
+)
 from data.frames import Frames
 from data.store import Store
 from train import samples
@@ -76,3 +88,26 @@ def nf4_cfg(saved_base: str) -> StudentConfig:
 @pytest.fixture(scope="session")
 def frames(micro_store: Store) -> Frames:
     return Frames(micro_store, 96)
+
+
+@pytest.fixture(scope="session")
+def few_steps(
+    micro: BenchmarkConfig, micro_store: Store, nf4_cfg: StudentConfig
+) -> Callable[..., SftCommand]:
+    """Settings of `train.sft` for a few steps over the small base, some of train's others."""
+
+    def settings(**train: object) -> SftCommand:
+        few = SftTrainConfig(
+            lr=1e-3, max_steps=4, batch=2, micro_batch=2, precision="fp32", evaluations=2,
+            gradient_checkpointing=False, validation_items=2, generated_items=0,
+        )  # fmt: skip
+        return SftCommand(
+            benchmark=micro,
+            store=str(micro_store.folder.parent),
+            workers=1,
+            teacher=TeacherConfig(name="template"),
+            student=nf4_cfg,
+            train=replace(few, **train),
+        )
+
+    return settings

@@ -16,7 +16,7 @@ from hydra.core.config_store import ConfigStore
 
 from conf.errors import UserError
 from conf.runs import rank
-from train import samples, sft, sft_trainer
+from train import samples, sft, student
 
 
 def let_cpus_share() -> None:
@@ -60,7 +60,7 @@ def main() -> None:
         if rank() == 0 and run["after"]:
             shutil.copytree(run["after"], Path(run["folder"]) / Path(run["after"]).name)
         if rank() == run["fails_on"]:
-            sft_trainer.token_mean = fail
+            student.token_mean = fail
         sys.argv[1:] = run["overrides"]
         sft.main()
 

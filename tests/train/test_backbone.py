@@ -15,6 +15,7 @@ from train import backbone
 from train.collate import Collator
 from train.conversation import selection_sample
 from train.sft_trainer import token_mean
+from train.towers import check_towers, count_towers
 
 
 def test_a_built_model_is_read_back_bit_for_bit(model, processor, tmp_path) -> None:
@@ -30,14 +31,14 @@ def test_a_built_model_is_read_back_bit_for_bit(model, processor, tmp_path) -> N
 
 def test_nf4_spares_tower_and_head_and_lora_is_in_the_language_tower(nf4_cfg) -> None:
     model, _ = backbone.load_student(nf4_cfg, "fp32", list)
-    towers = backbone.count_towers(model)
-    backbone.check_towers(towers, nf4_cfg)
+    counts = count_towers(model)
+    check_towers(counts, nf4_cfg)
     hidden, forward, rank = 64, 128, 4
     layer = 4 * hidden * hidden + 3 * hidden * forward
     lora = rank * (4 * 2 * hidden + 3 * (hidden + forward))
-    assert towers["language"].four_bit == 2 * layer
-    assert towers["language"].lora == towers["language"].trainable == 2 * lora
-    assert towers["vision"].four_bit == towers["vision"].trainable == 0
+    assert counts["language"].four_bit == 2 * layer
+    assert counts["language"].lora == counts["language"].trainable == 2 * lora
+    assert counts["vision"].four_bit == counts["vision"].trainable == 0
     trained = [p for p in model.parameters() if p.requires_grad]
     assert {p.dtype for p in trained} == {torch.float32}
 
@@ -81,7 +82,7 @@ def test_the_audit_stops_a_model_that_is_not_what_the_preset_says(nf4_cfg, chang
     loaded = nf4_cfg if "quantization" in change else replace(nf4_cfg, **change)
     model, _ = backbone.load_student(loaded, "fp32", list)
     with pytest.raises(UserError, match=message):
-        backbone.check_towers(backbone.count_towers(model), replace(nf4_cfg, **change))
+        check_towers(count_towers(model), replace(nf4_cfg, **change))
 
 
 def test_a_trained_student_answers_as_it_did_when_it_was_saved(

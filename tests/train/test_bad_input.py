@@ -29,34 +29,20 @@ from conf.schema import (
     RetrieverConfig,
     SelectCommand,
     SftCommand,
-    SftTrainConfig,
     StudentConfig,
-    TeacherConfig,
 )
-from data.store import Store
 from evaluation import select
 from teacher.journal import Journal
 from teacher.narrate import JOURNAL, ensure_rationales
-from train import backbone, retriever, sft
+from train import backbone, compatible, retriever, sft
 from train.checkpoints import newest_checkpoint
 from train.loop import is_unwritten
 from train.tiny import build_model
 
 
 @pytest.fixture(scope="module")
-def settings(micro, micro_store: Store, nf4_cfg) -> SftCommand:
-    train = SftTrainConfig(
-        regime="answer_only", lr=1e-3, max_steps=2, batch=2, micro_batch=2, precision="fp32",
-        gradient_checkpointing=False, evaluations=2, validation_items=2, generated_items=0,
-    )  # fmt: skip
-    return SftCommand(
-        benchmark=micro,
-        store=str(micro_store.folder.parent),
-        workers=1,
-        teacher=TeacherConfig(name="template"),
-        student=nf4_cfg,
-        train=train,
-    )
+def settings(few_steps) -> SftCommand:
+    return few_steps(regime="answer_only", max_steps=2)
 
 
 @pytest.fixture(scope="module")
@@ -101,13 +87,13 @@ def test_adapters_of_another_base_are_told(settings, trained, wider, saved_base,
     with pytest.raises(UserError, match=r"another base than .* 64 wide there and 128 here"):
         backbone.load_trained(over, "fp32", trained / "student")
     with pytest.raises(UserError, match=r"are not those that .* is trained over"):
-        backbone.check_base(trained, wider)
+        compatible.check_base(trained, wider)
     shutil.copytree(trained / "checkpoint-1", tmp_path / "checkpoint-1")
     with pytest.raises(UserError, match="checkpoint-1 holds adapters of another base than"):
         sft.main.__wrapped__(replace(settings, student=over), Run("run", tmp_path))
     # The same base elsewhere is the same base.
     shutil.copytree(saved_base, tmp_path / "moved")
-    backbone.check_base(trained, str(tmp_path / "moved"))
+    compatible.check_base(trained, str(tmp_path / "moved"))
 
 
 @pytest.mark.slow

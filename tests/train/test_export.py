@@ -30,7 +30,7 @@ from conf.schema import (
     TeacherConfig,
 )
 from evaluation import select
-from train import backbone, export
+from train import backbone, compatible, export
 from train.collate import encode
 from train.conversation import selection_sample
 from train.trained import run_title, settings_of
@@ -53,7 +53,7 @@ def finished_run(settings: SftCommand, root: Path) -> Path:
     """A run of train.sft as it ends, with adapters that weigh as much as their base."""
     folder = root / "sft" / "run"
     open_run(Run("run", folder), asdict(settings), "train.sft", [])
-    backbone.note_base(folder, settings.student.model)
+    compatible.note_base(folder, settings.student.model)
     torch.manual_seed(0)
     model, processor = backbone.load_student(settings.student, settings.train.precision, list)
     with torch.no_grad():

@@ -11,7 +11,6 @@ from torch import nn
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import SftCommand, SftTrainConfig
 from train import sft
 from train.backbone import load_student
 from train.collate import Collator
@@ -127,25 +126,16 @@ def test_a_trained_tower_is_refused(model) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 1])
-def test_a_run_learns_the_same(micro, micro_store, nf4_cfg, tmp_path, workers) -> None:
+def test_a_run_learns_the_same(few_steps, tmp_path, workers) -> None:
     """Over two epochs, evaluations included."""
-    train = SftTrainConfig(
-        lr=1e-3, max_steps=4, batch=4, micro_batch=2, precision="fp32", evaluations=2,
-        gradient_checkpointing=False, validation_items=4, regime="answer_only", workers=workers,
-    )  # fmt: skip
-    settings = SftCommand(
-        benchmark=micro,
-        store=str(micro_store.folder.parent),
-        workers=1,
-        student=nf4_cfg,
-        train=train,
-    )
     journals = []
     for reuse in (False, True):
         folder = tmp_path / str(reuse)
         folder.mkdir()
-        told = replace(settings, train=replace(train, reuse_features=reuse))
-        sft.main.__wrapped__(told, Run(str(reuse), folder))
+        settings = few_steps(
+            regime="answer_only", batch=4, validation_items=4, workers=workers, reuse_features=reuse
+        )
+        sft.main.__wrapped__(settings, Run(str(reuse), folder))
         journals.append(read_journal(folder))
     for one, two in zip(*journals, strict=True):
         assert one == pytest.approx(two, rel=1e-4)

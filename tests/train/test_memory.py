@@ -120,20 +120,17 @@ def test_a_containers_limit_holds(tmp_path, monkeypatch) -> None:
 
 
 @pytest.fixture
-def settings(micro, micro_store, nf4_cfg) -> SftCommand:
-    train = SftTrainConfig(
-        lr=1e-3, max_steps=2, batch=4, micro_batch="auto", precision="fp32", evaluations=2,
-        validation_items=2, regime="answer_only",
-    )  # fmt: skip
-    # Dropout draws: a probe that shifts the generator would show.
-    student = replace(nf4_cfg, lora=replace(nf4_cfg.lora, dropout=0.1))
-    return SftCommand(
-        benchmark=micro,
-        store=str(micro_store.folder.parent),
-        workers=1,
-        student=student,
-        train=train,
+def settings(few_steps) -> SftCommand:
+    auto = few_steps(
+        regime="answer_only",
+        max_steps=2,
+        batch=4,
+        micro_batch="auto",
+        gradient_checkpointing="auto",
     )
+    # Dropout draws: a probe that shifts the generator would show.
+    lora = replace(auto.student.lora, dropout=0.1)
+    return replace(auto, student=replace(auto.student, lora=lora))
 
 
 @pytest.fixture

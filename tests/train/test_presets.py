@@ -38,10 +38,10 @@ from teacher.claims import LONGEST
 from teacher.narrate import ensure_rationales
 from train import backbone
 from train.audit import audit
-from train.backbone import Tower
 from train.collate import Collator, encode
 from train.conversation import Clip, Sample, conversation, response, selection_sample
 from train.samples import supervised_items
+from train.towers import Tower, check_towers, count_towers
 
 RELEASED = {"qwen3_vl_8b": 8_767_123_696, "qwen3_vl_2b": 2_127_532_032}
 """Parameters in the safetensors of Qwen/Qwen3-VL-8B-Instruct and Qwen/Qwen3-VL-2B-Instruct."""
@@ -172,9 +172,9 @@ def test_the_tree_has_the_size_of_the_released_model(preset) -> None:
 
 @presets
 def test_the_audit_counts_what_the_sizes_say(preset) -> None:
-    towers = backbone.count_towers(adapted(preset))
+    towers = count_towers(adapted(preset))
     assert towers == towers_of(config_of(preset), RANK)
-    backbone.check_towers(towers, student(preset))
+    check_towers(towers, student(preset))
 
 
 @presets
@@ -227,7 +227,7 @@ def test_a_wrong_skip_list_is_stopped(spared, message) -> None:
     cfg = student("qwen3_vl_2b")
     model = backbone.add_adapters(base_of(cfg.name, quantization), cfg.lora)
     with pytest.raises(UserError, match=f"preset qwen3_vl_2b says: {message}"):
-        backbone.check_towers(backbone.count_towers(model), cfg)
+        check_towers(count_towers(model), cfg)
 
 
 @pytest.mark.parametrize(
@@ -242,7 +242,7 @@ def test_adapters_outside_the_language_tower_are_stopped(targets, message) -> No
     cfg = student("qwen3_vl_2b")
     model = backbone.add_adapters(base_of(cfg.name, nf4()), replace(cfg.lora, targets=targets))
     with pytest.raises(UserError, match=message):
-        backbone.check_towers(backbone.count_towers(model), cfg)
+        check_towers(count_towers(model), cfg)
 
 
 @pytest.mark.parametrize("targets", ["q_proj", "model.(language_model", r".*\.input_layernorm"])

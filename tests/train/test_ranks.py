@@ -23,7 +23,7 @@ from torch.utils.data import BatchSampler
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import SftCommand, SftTrainConfig, TeacherConfig
+from conf.schema import SftCommand
 from train import loop, ranks, samples, sft
 from train.collate import IGNORED, Collator
 from train.conversation import selection_sample
@@ -37,19 +37,8 @@ SHARDED = ("--use_fsdp", "--fsdp_version=2", "--fsdp_auto_wrap_policy=TRANSFORME
 
 
 @pytest.fixture
-def settings(micro, micro_store, nf4_cfg) -> SftCommand:
-    train = SftTrainConfig(
-        lr=1e-3, max_steps=4, batch=4, micro_batch=2, precision="fp32", evaluations=2,
-        gradient_checkpointing=False, validation_items=3, permute_candidates=True,
-    )  # fmt: skip
-    return SftCommand(
-        benchmark=micro,
-        store=str(micro_store.folder.parent),
-        workers=1,
-        teacher=TeacherConfig(name="template"),
-        student=nf4_cfg,
-        train=train,
-    )
+def settings(few_steps) -> SftCommand:
+    return few_steps(batch=4, validation_items=3, generated_items=8, permute_candidates=True)
 
 
 @pytest.fixture

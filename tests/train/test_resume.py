@@ -17,12 +17,10 @@ from conf.schema import (
     ContrastiveCommand,
     ContrastiveTrainConfig,
     SftCommand,
-    SftTrainConfig,
-    TeacherConfig,
 )
 from train import contrastive, samples, sft
-from train.backbone import check_base, note_base
 from train.checkpoints import newest_checkpoint
+from train.compatible import check_base, note_base
 from train.loop import read_journal
 from train.planned import ByLength, Samples
 from train.sft_trainer import Epochs
@@ -33,13 +31,8 @@ def common(micro, store) -> dict:
 
 
 @pytest.fixture
-def sft_settings(micro, micro_store, nf4_cfg) -> SftCommand:
-    train = SftTrainConfig(
-        lr=1e-3, max_steps=4, batch=4, micro_batch=2, precision="fp32",
-        gradient_checkpointing=False, evaluations=2, validation_items=4, permute_candidates=True,
-    )  # fmt: skip
-    teacher = TeacherConfig(name="template")
-    return SftCommand(**common(micro, micro_store), teacher=teacher, student=nf4_cfg, train=train)
+def sft_settings(few_steps) -> SftCommand:
+    return few_steps(batch=4, validation_items=4, generated_items=8, permute_candidates=True)
 
 
 @pytest.fixture

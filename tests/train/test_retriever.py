@@ -16,8 +16,9 @@ from conf.schema import LoraConfig
 from data.records import FPS, shown_frames
 from train import retriever
 from train.audit import audit_retriever
-from train.backbone import count_towers, keep_differentiable
+from train.backbone import keep_differentiable
 from train.retriever import LateFrames, column_prompts, frame_input, query_input
+from train.towers import count_towers
 
 
 def load(micro_store, cfg, folder) -> SentenceTransformer:

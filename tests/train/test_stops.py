@@ -12,7 +12,7 @@ import torch
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import SftCommand, SftTrainConfig
+from conf.schema import SftCommand
 from data.records import SelectionItem
 from data.store import Store
 from train import loop, samples, sft
@@ -20,18 +20,8 @@ from train.samples import shows_only, splits
 
 
 @pytest.fixture
-def settings(micro, micro_store, nf4_cfg) -> SftCommand:
-    train = SftTrainConfig(
-        lr=1e-3, max_steps=3, batch=2, micro_batch=2, precision="fp32",
-        gradient_checkpointing=False, evaluations=1, validation_items=2, regime="answer_only",
-    )  # fmt: skip
-    return SftCommand(
-        benchmark=micro,
-        store=str(micro_store.folder.parent),
-        workers=1,
-        student=nf4_cfg,
-        train=train,
-    )
+def settings(few_steps) -> SftCommand:
+    return few_steps(regime="answer_only", max_steps=3, evaluations=1)
 
 
 @pytest.mark.slow
@@ -50,7 +40,7 @@ def test_too_little_memory_is_told_with_the_key_to_lower(settings, tmp_path, mon
     def greedy(*_, **__) -> torch.Tensor:
         return torch.empty(1 << 50)
 
-    monkeypatch.setattr("train.sft_trainer.token_mean", greedy)
+    monkeypatch.setattr("train.student.token_mean", greedy)
     with pytest.raises(UserError, match=r"out of memory after step 0: lower train\.micro_batch"):
         sft.main.__wrapped__(settings, Run("run", tmp_path))
 

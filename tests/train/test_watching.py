@@ -22,8 +22,7 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 from conf import trackers
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import SftCommand, SftTrainConfig, TeacherConfig
-from data.store import Store
+from conf.schema import SftCommand
 from evaluation.answers import AnswerLog, ask_all
 from train import backbone, sft
 from train.conversation import conversation
@@ -33,19 +32,13 @@ from train.planned import Planned, Samples
 
 
 @pytest.fixture(scope="module")
-def settings(micro, micro_store: Store, nf4_cfg) -> SftCommand:
-    train = SftTrainConfig(
-        lr=1e-3, max_steps=4, batch=2, micro_batch=2, precision="fp32", keep=1,
-        gradient_checkpointing=False, evaluations=2, validation_items=4, generated_items=2,
-        best="eval_answer_generated_parse_rate", report_to=["tensorboard"],
-    )  # fmt: skip
-    return SftCommand(
-        benchmark=micro,
-        store=str(micro_store.folder.parent),
-        workers=1,
-        teacher=TeacherConfig(name="template"),
-        student=nf4_cfg,
-        train=train,
+def settings(few_steps) -> SftCommand:
+    return few_steps(
+        validation_items=4,
+        generated_items=2,
+        keep=1,
+        best="eval_answer_generated_parse_rate",
+        report_to=["tensorboard"],
     )
 
 

@@ -1,0 +1,132 @@
+"""Holds against each other what is put together to be trained or measured: a base, its processor,
+adapters, and the run that they belong to."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from safetensors import safe_open
+from torch import nn
+from transformers import PreTrainedConfig, PreTrainedTokenizerBase, ProcessorMixin
+
+from conf.errors import UserError
+from conf.runs import write_json
+from conf.schema import StudentConfig
+
+BASE = "base.json"
+PEFT = "base_model.model."
+"""What peft puts before the names of the modules that it adapts."""
+MEBIBYTE = 1 << 20
+
+
+def check_tower(group: str, model: str, config: PreTrainedConfig) -> None:
+    """Raises UserError where a base has no vision tower."""
+    if getattr(config, "vision_config", None) is None:
+        raise UserError(
+            f"{group}.model={model} ({config.model_type}) has no vision tower: give a "
+            "vision-language model, such as Qwen3-VL"
+        )
+
+
+def check_processor(
+    group: str,
+    model: str,
+    config: PreTrainedConfig,
+    processor: ProcessorMixin | PreTrainedTokenizerBase,
+) -> None:
+    """Raises UserError where a base's processor does not go with its weights."""
+    if problem := _mismatch(config, processor):
+        raise UserError(
+            f"{group}.model={model} holds a processor of another model, {type(processor).__name__} "
+            f"({problem}): put the processor and tokenizer files there that came with the weights"
+        )
+
+
+def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:
+    """How a processor does not go with a model; None where it does."""
+    for name in ("tokenizer", "image_processor", "video_processor"):
+        if not hasattr(processor, name):
+            return f"it has no {name.replace('_', ' ')}"
+    tokens, known = len(processor.tokenizer), config.get_text_config().vocab_size
+    if tokens > known:
+        return f"its tokenizer has {tokens} tokens, the model {known}"
+    for part in (processor.image_processor, processor.video_processor):
+        for name, own in (("patch_size", "patch_size"), ("merge_size", "spatial_merge_size")):
+            there, here = getattr(part, name, None), getattr(config.vision_config, own, None)
+            if there != here:
+                what = name.replace("_", " ")
+                return f"its {what} is {there}, that of the vision tower {here}"
+    for name in ("image_token_id", "video_token_id"):
+        there, here = getattr(processor, name, None), getattr(config, name, None)
+        if there != here:
+            return f"its {name} is {there}, the model's {here}"
+    return None
+
+
+def check_adapters(folder: Path, base: nn.Module, cfg: StudentConfig) -> None:
+    """Hold the adapters in a folder to the base, with adapters of its own or without, that they are
+    laid over, and to the preset's rank. A whole model has none, nor have FSDP's checkpoints.
+
+    Raises:
+        UserError: they are of another base or rank.
+        SafetensorError: they cannot be read.
+    """
+    if not (path := folder / "adapter_model.safetensors").exists():
+        return
+    modules = {name.removeprefix(PEFT): module for name, module in base.named_modules()}
+    with safe_open(path, "pt") as file:
+        shapes = {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118
+    for name, shape in shapes.items():
+        adapted, _, side = name.removeprefix(PEFT).partition(".lora_")
+        # A is (rank, inputs), B is (outputs, rank).
+        rank, there = shape if side.startswith("A") else reversed(shape)
+        if rank != cfg.lora.rank:
+            raise UserError(
+                f"{folder} holds adapters of rank {rank}, and student.lora.rank is "
+                f"{cfg.lora.rank}: give student.lora.rank={rank}, or train in a run of its own "
+                "(run=NAME)"
+            )
+        module = modules.get(adapted)
+        here = module and getattr(module, "in_features" if side[0] == "A" else "out_features")
+        if here != there:
+            found = f"{there} wide there and {here} here" if module else "not in this one"
+            raise UserError(
+                f"{folder} holds adapters of another base than {cfg.model} ({adapted} is {found}): "
+                "give the base that they were trained over with student.model=FOLDER, or train "
+                "again"
+            )
+
+
+def weights_digest(*models: str | Path | None) -> str:
+    """A short hash of the safetensors of models in folders, by each file's name, size and last
+    mebibyte, which training changes, wherever the folder is; a hub's name stands for itself."""
+    whole = hashlib.sha256()
+    for k, model in enumerate(models):
+        folder = model is not None and Path(model).is_dir()
+        whole.update(f"{k} {'' if folder else model}".encode())
+        for path in sorted(Path(model).rglob("*.safetensors")) if folder else []:
+            size = path.stat().st_size
+            with open(path, "rb") as file:
+                file.seek(max(0, size - MEBIBYTE))
+                whole.update(f"{path.name} {size}".encode() + file.read())
+    return whole.hexdigest()[:16]
+
+
+def note_base(folder: Path, model: str | None) -> None:
+    """Note in a run's folder which weights it is trained over, and hold them to an earlier note:
+    a run that goes on goes on over the same."""
+    check_base(folder, model)
+    write_json(folder / BASE, weights_digest(model))
+
+
+def check_base(folder: Path, model: str | None) -> None:
+    """Raises UserError where a run's base is not the one that it was trained over."""
+    note = folder / BASE
+    if note.exists() and json.loads(note.read_text()) != weights_digest(model):
+        raise UserError(
+            f"the weights in {model} are not those that {folder} is trained over: put those back, "
+            "or delete that run and train again"
+        )

@@ -1,0 +1,145 @@
+"""A student's training, from its base to the weights that are written."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+from transformers import ProcessorMixin, TrainingArguments, set_seed
+
+from conf.entry import Run
+from conf.runs import rank
+from conf.schema import SftCommand, SftTrainConfig
+from data.frames import Frames
+from data.records import Rationale
+from data.store import Store
+from train import backbone, checkpoints, compatible, loop, memory, ranks, room, samples
+from train.audit import audit
+from train.collate import Collator, letter_ids
+from train.features import Features, Keyed
+from train.generate import HeldOutAnswers
+from train.packing import PackingCollator, rope_of
+from train.planned import ByLength, Samples
+from train.sft_trainer import Epochs, LetterChoice, StudentTrainer, TokenChoice, token_mean
+from train.sights import SightCollator, SightTrainer, seen_words
+
+log = logging.getLogger(__name__)
+
+
+def train_student(
+    cfg: SftCommand, run: Run, store: Store, rationales: list[Rationale]
+) -> dict[str, float]:
+    """Train a student in its run's folder and give what it measured there."""
+    room.keep_big_blocks()
+    loop.keep_to_one_gpu()
+    # Adapters are drawn before the trainer sets its seed.
+    set_seed(cfg.seed)
+    log.info("loading student %s", cfg.student.name)
+    if rank() == 0:
+        compatible.note_base(run.folder, cfg.student.model)
+    model, processor = backbone.load_student(
+        cfg.student, cfg.train.precision, lambda: samples.corpus(store, rationales)
+    )
+    training, validation = split(cfg, store, rationales)
+    ways = ways_of(cfg, model, processor)
+    lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
+    longest = training[lengths.index(max(lengths))]
+    log.info(audit(model, processor, cfg.student, longest, ways.collator))
+    train = memory.settle(cfg.train, run.folder, model, ways.packs, training, lengths)
+    order = ByLength(lengths, train.batch, cfg.seed, train.micro_batch, ranks.ranks())
+    checkpoint = checkpoints.newest_checkpoint(run.folder)
+    if checkpoint is not None:
+        compatible.check_adapters(checkpoint, model, cfg.student)
+
+    features = Features.of(model, train) if train.reuse_features else None
+    made = Keyed if features else attrgetter("named")
+    trainer = ways.trainer(
+        model=model,
+        args=arguments(train, run, cfg, checkpoint),
+        data_collator=made(ways.collator),
+        training_collator=made(ways.packs),
+        train_dataset=training,
+        eval_dataset=validation,
+        compute_loss_func=token_mean,
+        callbacks=[Epochs(training, order)],
+        order=order,
+        choice=ways.choice,
+        features=features,
+        answers=answers(cfg, processor, run.folder),
+    )
+    best = loop.train_and_log(trainer, run, checkpoint, memory.lower(train))
+    weights = loop.gathered(trainer)
+    if rank() == 0:
+        backbone.save(model, processor, run.folder / "student", cfg.train.precision, weights)
+    log.info("the student is in %s", run.folder / "student")
+    return loop.evaluated(run.folder, best)
+
+
+def split(
+    cfg: SftCommand, store: Store, rationales: list[Rationale]
+) -> tuple[Samples, dict[str, Samples]]:
+    """The samples trained on, and those of held-out scenes by mode.
+
+    Raises:
+        UserError: there are none.
+    """
+    if cfg.train.regime not in ("answer_only", "describe"):
+        loop.check_not_empty(len(rationales), f"accepted rationales of teacher {cfg.teacher.name}")
+    frames = Frames(store, cfg.student.image_size)
+    training, validation = samples.splits(store, rationales, cfg, frames)
+    loop.check_not_empty(len(training), f"samples for train.regime={cfg.train.regime}")
+    loop.check_not_empty(sum(map(len, validation.values())), "items of held-out training scenes")
+    return training, validation
+
+
+@dataclass(frozen=True)
+class Ways:
+    """How samples of a regime become batches, packed ones (`packs`) where the attention takes them,
+    and what is learnt and measured on them."""
+
+    collator: Collator
+    packs: Collator | PackingCollator
+    choice: TokenChoice | LetterChoice
+    trainer: Callable[..., StudentTrainer]
+
+
+def ways_of(cfg: SftCommand, model: nn.Module, processor: ProcessorMixin) -> Ways:
+    if cfg.train.regime == "describe":
+        # Descriptions end in no answer whose letter could be measured, and teach to see.
+        collator = SightCollator(processor, cfg.student.max_length)
+        return Ways(collator, collator, TokenChoice(seen_words(processor)), SightTrainer)
+    collator = Collator(processor, cfg.student.max_length)
+    rope = rope_of(model, cfg.train.packing)
+    packs = PackingCollator(processor, cfg.student.max_length, rope) if rope else collator
+    return Ways(collator, packs, LetterChoice(letter_ids(processor)), StudentTrainer)
+
+
+def arguments(
+    train: SftTrainConfig, run: Run, cfg: SftCommand, checkpoint: Path | None
+) -> TrainingArguments:
+    accumulation = ranks.accumulation(train.batch, train.micro_batch)
+    shared: dict[str, Any] = loop.arguments(train, run, cfg.seed, checkpoint)
+    return TrainingArguments(
+        **shared,
+        per_device_train_batch_size=train.micro_batch,
+        gradient_accumulation_steps=accumulation,
+        per_device_eval_batch_size=train.micro_batch,
+        dataloader_prefetch_factor=loop.prefetched(train.workers, accumulation),
+        label_names=["labels"],
+        # Every pass goes through all adapters; a whole model's tower has nothing to do where no
+        # frames are shown.
+        ddp_find_unused_parameters=not cfg.student.lora.rank,
+    )
+
+
+def answers(cfg: SftCommand, processor: ProcessorMixin, folder: Path) -> HeldOutAnswers | None:
+    """What is asked of the student at each evaluation; None where the settings ask nothing."""
+    count = cfg.train.generated_items
+    if not count:
+        return None
+    return HeldOutAnswers(processor, cfg.student, cfg.train.precision, count, folder)
