@@ -56,8 +56,7 @@ def train_retriever(
         cfg.retriever,
         cfg.train.precision,
         corpus=retriever.corpus(store.retrieval("train"), cfg.retriever),
-        # Ranks build the same one, each for itself.
-        folder=run.folder / (f"untrained-{rank()}" if rank() else "untrained"),
+        folder=run.folder / "untrained",
     )
     longest = retriever.longest_query(training, model.tokenizer)
     log.info(audit_retriever(model, cfg.retriever, longest, frames))

@@ -7,6 +7,7 @@ saved is a plain `SentenceTransformer`.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from train.backbone import (
     pin_sizes,
 )
 from train.compatible import check_processor, check_tower
+from train.ranks import from_main
 from train.tiny import build_model, build_processor
 
 PROCESSING = {
@@ -51,10 +53,7 @@ def load_retriever(
     """
     source = cfg.model
     if cfg.architecture is not None:
-        processor = build_processor(corpus, cfg.architecture.vocabulary, cfg.image_size)
-        build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
-        processor.save_pretrained(folder)
-        source = str(folder)
+        source = from_main(partial(built, cfg, corpus, folder))
     check_reachable("retriever", source)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     try:
@@ -93,6 +92,15 @@ def load_retriever(
             )
         )
     return model
+
+
+def built(cfg: RetrieverConfig, corpus: list[str], folder: Path) -> str:
+    """The folder of a base that is built from a seed and written there."""
+    assert cfg.architecture is not None
+    processor = build_processor(corpus, cfg.architecture.vocabulary, cfg.image_size)
+    build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
+    processor.save_pretrained(folder)
+    return str(folder)
 
 
 def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> SentenceTransformer:
