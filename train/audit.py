@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from itertools import groupby
 
-from sentence_transformers import SentenceTransformer
+from sentence_transformers import MultiVectorEncoder, SentenceTransformer
+from sentence_transformers.multi_vector_encoder.modules import HierarchicalTokenPooling
 from torch import nn
 from transformers import ProcessorMixin
 
@@ -14,7 +16,8 @@ from data.frames import Frames
 from data.records import RetrievalQuery
 from train.collate import IGNORED, Collator
 from train.conversation import Sample
-from train.retriever import frame_input, query_input
+from train.late import scored_tokens
+from train.retriever import Retriever, frame_input, query_input
 from train.towers import check_towers, count_towers, tower_table
 
 
@@ -50,9 +53,10 @@ def audit(
 
 
 def audit_retriever(
-    model: SentenceTransformer, cfg: RetrieverConfig, query: RetrievalQuery, frames: Frames
+    model: Retriever, cfg: RetrieverConfig, query: RetrievalQuery, frames: Frames
 ) -> str:
-    """The same for a retriever: counts, grids, the longest query and a frame, decoded.
+    """The same for a retriever: counts, grids, the longest query and a frame, decoded; where it has
+    many vectors, what is scored of them between >>> and <<<.
 
     Raises:
         UserError: the counts are not what the preset says, the model is narrower than its widest
@@ -61,7 +65,7 @@ def audit_retriever(
     towers = count_towers(model)
     check_towers(towers, cfg)
     width = model.get_embedding_dimension()
-    if max(cfg.widths) > width:
+    if cfg.late is None and max(cfg.widths) > width:
         raise UserError(
             f"retriever.widths={cfg.widths} starts wider than the model's embeddings of {width}"
         )
@@ -74,19 +78,45 @@ def audit_retriever(
             f"{cfg.max_length}: raise it, or lower retriever.image_size or retriever.frames"
         )
     shown = model.preprocess([frame_input(query.target, frames)], prompt=cfg.frame_instruction)
-    decode = processor.tokenizer.decode
     return "\n".join(
         [
             f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'whole'})",
             tower_table(towers),
             f"frames of {cfg.image_size} x {cfg.image_size} px become "
             f"{grids(asked | {k: shown[k] for k in ('image_grid_thw',)}, processor)}",
-            f"the longest query has {length} tokens and is embedded at the last one:",
-            squeeze(decode(asked["input_ids"][0])),
-            f"a frame of {shown['input_ids'].shape[1]} tokens:",
-            squeeze(decode(shown["input_ids"][0])),
+            *(embedded_at_last if cfg.late is None else embedded_at_scored)(model, asked, shown),
         ]
     )
+
+
+def embedded_at_last(model: SentenceTransformer, asked: dict, shown: dict) -> list[str]:
+    """A query and a frame, decoded."""
+    query, frame = (features["input_ids"][0] for features in (asked, shown))
+    decode = model.tokenizer.decode
+    return [
+        f"the longest query has {len(query)} tokens and is embedded at the last one:",
+        squeeze(decode(query)),
+        f"a frame of {len(frame)} tokens:",
+        squeeze(decode(frame)),
+    ]
+
+
+def embedded_at_scored(model: MultiVectorEncoder, asked: dict, shown: dict) -> list[str]:
+    """A query and a frame, decoded, what is scored of each between >>> and <<<."""
+    told = []
+    for what, features in (("the longest query", asked), ("a frame", shown)):
+        ids, attended = features["input_ids"], features["attention_mask"]
+        scored = scored_tokens(model).scored(ids, attended)[0].tolist()
+        runs = [
+            (kept, model.tokenizer.decode([token for token, _ in run]))
+            for kept, run in groupby(zip(ids[0].tolist(), scored, strict=True), lambda one: one[1])
+        ]
+        told += [
+            f"{what} has {len(scored)} tokens, {sum(scored)} of them scored:",
+            squeeze("".join(f">>>{text}<<<" if kept else text for kept, text in runs)),
+        ]
+    pools = [module for module in model if isinstance(module, HierarchicalTokenPooling)]
+    return [*told, *(f"a frame keeps one of {p.pool_factor} of its vectors" for p in pools)]
 
 
 def grids(batch: dict, processor: ProcessorMixin) -> str:

@@ -9,7 +9,8 @@ from typing import Any
 
 from datasets import Dataset
 from sentence_transformers import (
-    SentenceTransformer,
+    MultiVectorEncoderTrainer,
+    MultiVectorEncoderTrainingArguments,
     SentenceTransformerTrainer,
     SentenceTransformerTrainingArguments,
 )
@@ -30,9 +31,11 @@ from train import checkpoints, compatible, loop, ranks, retriever, room
 from train.audit import audit_retriever
 from train.batches import Batch, Composed, batch_of
 from train.inputs import Inputs
+from train.late_loss import LateRankingLoss
 from train.negatives import Weighing
-from train.ranking import HeldOutRanking
+from train.ranking import HeldOutRanking, LateHeldOutRanking
 from train.ranking_loss import RankingLoss
+from train.retriever import Retriever
 from train.samples import held_out_scenes, shuffled
 
 log = logging.getLogger(__name__)
@@ -62,11 +65,14 @@ def train_retriever(
     log.info(audit_retriever(model, cfg.retriever, longest, frames))
 
     checkpoint = checkpoints.newest_checkpoint(run.folder)
-    trainer = RetrieverTrainer(
+    late = cfg.retriever.late is not None
+    trainer = (LateTrainer if late else RetrieverTrainer)(
         model=model,
         args=arguments(cfg, run, checkpoint, share),
         train_dataset=Dataset.from_list([{"query": k} for k in range(len(training))]),
-        evaluator=HeldOutRanking(validation, frames, cfg.retriever, cfg.train.mini_batch),
+        evaluator=(LateHeldOutRanking if late else HeldOutRanking)(
+            validation, frames, cfg.retriever, cfg.train.mini_batch
+        ),
         loss=loss_of(cfg, model, frames, store),
         data_collator=ByName(cfg, training, model),
         sampler=Composed(
@@ -113,10 +119,10 @@ def split(
 
 
 def loss_of(
-    cfg: ContrastiveCommand, model: SentenceTransformer, frames: Frames, store: Store
-) -> MatryoshkaLoss:
-    train = cfg.train
-    ranking = RankingLoss(
+    cfg: ContrastiveCommand, model: Retriever, frames: Frames, store: Store
+) -> MatryoshkaLoss | LateRankingLoss:
+    train, late = cfg.train, cfg.retriever.late is not None
+    ranking = (LateRankingLoss if late else RankingLoss)(
         model,
         Inputs(model, frames, cfg.retriever, train.precision),
         Weighing(store, train.mask_identical, train.mask_near, train.hard_weight),
@@ -126,14 +132,18 @@ def loss_of(
         reuse_features=train.reuse_features,
         ahead=train.workers,
     )
+    if late:
+        return ranking
     return MatryoshkaLoss(model, ranking, list(cfg.retriever.widths), train.width_weights)
 
 
 def arguments(
     cfg: ContrastiveCommand, run: Run, checkpoint: Path | None, share: int
-) -> SentenceTransformerTrainingArguments:
+) -> SentenceTransformerTrainingArguments | MultiVectorEncoderTrainingArguments:
+    late = cfg.retriever.late is not None
     shared: dict[str, Any] = loop.arguments(cfg.train, run, cfg.seed, checkpoint)
-    return SentenceTransformerTrainingArguments(
+    made = MultiVectorEncoderTrainingArguments if late else SentenceTransformerTrainingArguments
+    return made(
         # Batches are names alone; what they stand for is made while the model computes.
         **{**shared, "dataloader_num_workers": 0},
         per_device_train_batch_size=share,
@@ -145,7 +155,7 @@ class ByName(SentenceTransformerDataCollator):
     """Makes a `Batch` of the places of queries, under the one name that the trainer looks for."""
 
     def __init__(
-        self, cfg: ContrastiveCommand, queries: Sequence[RetrievalQuery], model: SentenceTransformer
+        self, cfg: ContrastiveCommand, queries: Sequence[RetrievalQuery], model: Retriever
     ) -> None:
         super().__init__(preprocess_fn=model.preprocess)
         self._train = cfg.train
@@ -161,8 +171,9 @@ class ByName(SentenceTransformerDataCollator):
         }
 
 
-class RetrieverTrainer(SentenceTransformerTrainer):
-    """The library's trainer over batches that hold names, composed by a sampler of ours."""
+class NamedBatches:
+    """What a trainer of the library's needs for batches that hold names, composed by a sampler of
+    ours."""
 
     def __init__(self, *args: Any, sampler: Composed, **settings: Any) -> None:
         self._sampler = sampler
@@ -173,3 +184,11 @@ class RetrieverTrainer(SentenceTransformerTrainer):
 
     def collect_features(self, inputs: dict[str, Batch]) -> tuple[list[Batch], None]:
         return [inputs["batch"]], None
+
+
+class RetrieverTrainer(NamedBatches, SentenceTransformerTrainer):
+    """Of a retriever with one vector."""
+
+
+class LateTrainer(NamedBatches, MultiVectorEncoderTrainer):
+    """Of a retriever with many."""

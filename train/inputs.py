@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -13,7 +14,7 @@ from conf.schema import RetrieverConfig
 from data.frames import Frames
 from train.batches import Batch
 from train.planned import STAMP, TOKEN
-from train.prefixes import pool_ends, shared_input
+from train.prefixes import give_own, shared_input
 from train.retriever import frame_input
 
 MEDIA = {
@@ -35,7 +36,7 @@ class Inputs:
         self._device = model.device
         self._shown = (cfg.image_size // TOKEN) ** 2 + STAMP
         model[0].register_forward_pre_hook(give_seen)
-        model[0].register_forward_hook(pool_ends)
+        model[0].register_forward_hook(partial(give_own, last=cfg.late is None))
 
     def of_prefixes(self, batch: Batch, first: int, last: int) -> dict[str, Any]:
         """Of the queries of a range of the batch's prefixes."""

@@ -19,8 +19,9 @@ from data.frames import Frames
 from data.records import RetrievalQuery
 from train.retriever import query_input
 
-ENDS = "ends"
-"""Where in a batch's rows its queries end: (Q, 2) rows and columns."""
+OWN = "own"
+"""Where in a batch's rows each query's tokens stand, its last one last: (Q, 1 + L) its row and the
+columns; what is left of them on the left is -1."""
 HIDDEN = torch.finfo(torch.bfloat16).min
 """What is added to the score of a token that is not seen: finite in every precision, so that a row
 of padding has a softmax."""
@@ -29,13 +30,13 @@ of padding has a softmax."""
 @dataclass(frozen=True)
 class Row:
     """A prefix and its questions: (L,) ids and token types, (3, L) positions, (L, L) who sees whom,
-    and each question's last place."""
+    and where each query's tokens stand."""
 
     ids: torch.Tensor
     types: torch.Tensor
     positions: torch.Tensor
     sees: torch.Tensor
-    ends: list[int]
+    own: list[torch.Tensor]
 
 
 def shared_input(
@@ -97,7 +98,7 @@ def branched(
             [positions[:, :start], *(begin + torch.arange(n).expand(3, -1) for n in lengths)], dim=1
         ),
         sees=sees.tril(),
-        ends=(start + torch.tensor(lengths).cumsum(0) - 1).tolist(),
+        own=[((owner == 0) | (owner == k)).nonzero()[:, 0] for k in range(1, len(branches) + 1)],
     )
 
 
@@ -118,15 +119,27 @@ def stacked(rows: Sequence[Row]) -> dict[str, torch.Tensor]:
         "mm_token_type_ids": types,
         "position_ids": positions,
         "attention_mask": torch.where(sees, 0.0, HIDDEN)[:, None],
-        ENDS: torch.tensor([(k, end) for k, row in enumerate(rows) for end in row.ends]),
+        OWN: own_places(rows),
     }
 
 
-def pool_ends(module: Any, _: Any, features: dict[str, Any]) -> dict[str, Any]:
-    """After the transformer, as a hook of its forward: give the pooling a row a query, whose only
-    token is the query's last."""
-    if (ends := features.pop(ENDS, None)) is not None:
-        rows, columns = ends.T
-        features["token_embeddings"] = features["token_embeddings"][rows, columns][:, None]
-        features["attention_mask"] = torch.ones(len(ends), 1, device=ends.device)
+def own_places(rows: Sequence[Row]) -> torch.Tensor:
+    length = max(len(own) for row in rows for own in row.own)
+    return torch.stack(
+        [
+            torch.cat([torch.tensor([k]), torch.full((length - len(own),), -1), own])
+            for k, row in enumerate(rows)
+            for own in row.own
+        ]
+    )
+
+
+def give_own(module: Any, _: Any, features: dict[str, Any], *, last: bool) -> dict[str, Any]:
+    """After the transformer, as a hook of its forward: give what follows it a row a query, of the
+    tokens that the query would have alone, or of its `last` one."""
+    if (own := features.pop(OWN, None)) is not None:
+        rows, columns = own[:, :1], own[:, -1:] if last else own[:, 1:]
+        for name in ("token_embeddings", "input_ids"):
+            features[name] = features[name][rows, columns.clamp(min=0)]
+        features["attention_mask"] = (columns >= 0).long()
     return features

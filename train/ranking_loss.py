@@ -69,15 +69,19 @@ class RankingLoss(CachedMultipleNegativesRankingLoss):
         # Of its own features the library reads here how many rows they have, and their lengths.
         rows = [
             {
-                "attention_mask": filled(lengths),
-                "make": partial(make, batch),
+                "attention_mask": filled(self._inputs.prefix_lengths(batch)),
+                "make": partial(self._inputs.of_prefixes, batch),
                 "kept": {},
-                "name": name,
-            }
-            for lengths, make, name in (
-                (self._inputs.prefix_lengths(batch), self._inputs.of_prefixes, batch.query_names),
-                (self._inputs.frame_lengths(batch), self._inputs.of_frames, batch.frame_names),
-            )
+                "name": batch.query_names,
+                "task": "query",
+            },
+            {
+                "attention_mask": filled(self._inputs.frame_lengths(batch)),
+                "make": partial(self._inputs.of_frames, batch),
+                "kept": {},
+                "name": batch.frame_names,
+                "task": "document",
+            },
         ]
         return self.forward_cached(rows, labels)
 
@@ -114,15 +118,27 @@ class RankingLoss(CachedMultipleNegativesRankingLoss):
                     given = self._inputs.seen(given)
                     kept[ranges[k]] = {name: on_cpu(value) for name, value in given.items()}
                 with torch.set_grad_enabled(with_grad):
-                    embedded = self.model(given)["sentence_embedding"]
+                    embedded = self.embed(given, sentence_feature["task"])
             if not with_grad and not torch.isfinite(embedded).all():
                 raise self._lost(embedded, sentence_feature["name"](*ranges[k]))
             yield embedded, state
 
+    def embed(self, given: dict[str, Any], task: str) -> torch.Tensor:
+        """(rows, width) of a mini-batch of queries (`task` is query) or of frames (document)."""
+        return self.model(given)["sentence_embedding"]
+
+    def joined(self, parts: list[torch.Tensor]) -> torch.Tensor:
+        """What was embedded a mini-batch at a time."""
+        return torch.cat(parts)
+
+    def similarity(self, queries: torch.Tensor, frames: torch.Tensor) -> torch.Tensor:
+        """(queries, frames) before they are scaled."""
+        return cos_sim(queries, frames)
+
     @staticmethod
     def _lost(embedded: torch.Tensor, names: Sequence[str]) -> UserError:
         """What to tell a user whose model gives no numbers any more."""
-        first = (~torch.isfinite(embedded).all(dim=1)).nonzero()[0].item()
+        first = (~torch.isfinite(embedded.flatten(1)).all(dim=1)).nonzero()[0].item()
         return UserError(
             f"the embedding of {names[first]} is no number: a lower train.lr or "
             "train.precision=fp32 may help; what was trained up to the last checkpoint is kept"
@@ -137,8 +153,8 @@ class RankingLoss(CachedMultipleNegativesRankingLoss):
     ) -> torch.Tensor:
         """The mean over a rank's queries of the cross entropy of each one's target among all frames
         that the batch names, on all ranks. Scores of some rows at a time are kept."""
-        queries, frames = torch.cat(reps[0]), torch.cat(reps[1])
-        # (B, 1 + negatives, width): a frame that several queries name gathers its gradients.
+        queries, frames = self.joined(reps[0]), self.joined(reps[1])
+        # (B, 1 + negatives, ...): a frame that several queries name gathers its gradients.
         documents = frames[self._columns.T.to(frames.device)]
         if self.gather_across_devices:
             documents = all_gather_with_grad(documents)
@@ -148,7 +164,7 @@ class RankingLoss(CachedMultipleNegativesRankingLoss):
         losses = []
         for start in range(0, len(queries), self.mini_batch_size):
             rows = slice(start, start + self.mini_batch_size)
-            scores = cos_sim(queries[rows], shown) * self.scale
+            scores = self.similarity(queries[rows], shown) * self.scale
             if self._added is not None:
                 scores = scores + self._added[rows].to(scores.device)
             loss = cross_entropy(scores, own[rows], reduction="sum") / len(queries)

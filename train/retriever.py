@@ -1,8 +1,8 @@
 """The retriever as sentence-transformers sees it: queries of a video and a text, frames as images.
 
 Inputs follow Qwen3-VL-Embedding: the instruction as system message, the video before the text, a
-generation prompt at the end, and the last token's state, normalised, as the embedding. What is
-saved is a plain `SentenceTransformer`.
+generation prompt at the end, and the last token's state, normalised, as the embedding, or as
+`train.late` says. What is saved is a plain `SentenceTransformer` or `MultiVectorEncoder`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from sentence_transformers import SentenceTransformer
+from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
 from transformers import AutoConfig
 
@@ -30,8 +30,12 @@ from train.backbone import (
     pin_sizes,
 )
 from train.compatible import check_processor, check_tower
+from train.late import keep_projection_exact, late_modules, load_late
 from train.ranks import from_main
 from train.tiny import build_model, build_processor
+
+Retriever = SentenceTransformer | MultiVectorEncoder
+"""With one vector, or with many."""
 
 PROCESSING = {
     # The library's default cuts a long input, through its frames if need be; the audit refuses it.
@@ -43,7 +47,7 @@ PROCESSING = {
 
 def load_retriever(
     cfg: RetrieverConfig, precision: str, corpus: list[str], folder: Path
-) -> SentenceTransformer:
+) -> Retriever:
     """A retriever ready to train. One that is built from a seed is written to `folder` first, so
     that it is loaded as any other.
 
@@ -70,19 +74,23 @@ def load_retriever(
         raise load_failure("retriever", cfg.model, error) from error
     check_processor("retriever", source, config, backbone.processor)
     pin_sizes(backbone.processor, cfg.image_size, cfg.frames)
-    width = backbone.get_embedding_dimension()
-    model = SentenceTransformer(
-        modules=[backbone, Pooling(width, pooling_mode="lasttoken"), Normalize()],
-        prompts={"query": cfg.query_instruction, "document": cfg.frame_instruction},
-        device="cuda" if torch.cuda.is_available() else "cpu",
-    )
+    whole = {
+        "prompts": {"query": cfg.query_instruction, "document": cfg.frame_instruction},
+        "device": "cuda" if torch.cuda.is_available() else "cpu",
+    }
+    if cfg.late is not None:
+        model = MultiVectorEncoder(modules=late_modules(backbone, cfg.late), **whole)
+        keep_projection_exact(model)
+    else:
+        pooling = Pooling(backbone.get_embedding_dimension(), pooling_mode="lasttoken")
+        model = SentenceTransformer(modules=[backbone, pooling, Normalize()], **whole)
     # Rows name queries by number: there is no text of theirs that a model card could show.
     model.model_card_data.generate_widget_examples = False
     keep_differentiable(backbone)
     if cfg.lora.rank:
         import peft
 
-        model.requires_grad_(False)
+        backbone.requires_grad_(False)
         model.add_adapter(
             peft.LoraConfig(
                 r=cfg.lora.rank,
@@ -103,20 +111,22 @@ def built(cfg: RetrieverConfig, corpus: list[str], folder: Path) -> str:
     return str(folder)
 
 
-def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> SentenceTransformer:
+def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retriever:
     """The retriever that `train.contrastive` saved in `folder`, its adapters over the same 4-bit
     weights that they were trained on.
 
     Raises:
         UserError: `folder` holds no whole retriever, or its base is not on this machine.
     """
+    options = {
+        "model_kwargs": weight_options(cfg, precision),
+        "trust_remote_code": cfg.trust_remote_code,
+        "local_files_only": True,
+    }
     try:
-        return SentenceTransformer(
-            str(folder),
-            model_kwargs=weight_options(cfg, precision),
-            trust_remote_code=cfg.trust_remote_code,
-            local_files_only=True,
-        )
+        if cfg.late is not None:
+            return load_late(folder, **options)
+        return SentenceTransformer(str(folder), **options)
     except UNREADABLE as error:
         raise damaged(folder, error) from error
 

@@ -11,6 +11,8 @@ from conf.errors import UserError
 from conf.schema import RetrieverConfig, StudentConfig
 
 TOWERS = ("vision", "language", "embeddings and head")
+PROJECTION = "projection"
+"""Of a multi-vector retriever: no tower of its base's, so it is always trained, and whole."""
 
 
 @dataclass
@@ -27,7 +29,7 @@ def count_towers(model: nn.Module) -> dict[str, Tower]:
     """Parameters by tower. A 4-bit weight counts as the entries it stands for, not its bytes."""
     towers = {name: Tower() for name in TOWERS}
     for name, parameter in model.named_parameters():
-        tower = towers[_tower_of(name)]
+        tower = towers.setdefault(_tower_of(name), Tower())
         entries, four_bit = _entries(parameter)
         tower.parameters += entries
         tower.four_bit += entries if four_bit else 0
@@ -49,6 +51,8 @@ def _entries(parameter: nn.Parameter) -> tuple[int, bool]:
 def _tower_of(name: str) -> str:
     if re.search(r"(^|\.)visual\.", name):
         return "vision"
+    if re.fullmatch(r"\d+\.linear\.weight", name):
+        return PROJECTION
     return "language" if re.search(r"(^|\.)layers\.\d+\.", name) else "embeddings and head"
 
 
@@ -62,15 +66,15 @@ def check_towers(towers: dict[str, Tower], cfg: StudentConfig | RetrieverConfig)
     nf4, lora = cfg.quantization == "nf4", cfg.lora.rank > 0
     problems = []
     for name, tower in towers.items():
-        language = name == "language"
+        language, projection = name == "language", name == PROJECTION
         for what, found, wanted in (
             ("4-bit", tower.four_bit > 0, nf4 and language),
             ("LoRA", tower.lora > 0, lora and language),
-            ("trainable", tower.trainable > 0, language or not lora),
+            ("trainable", tower.trainable > 0, language or projection or not lora),
         ):
             if found != wanted:
                 problems.append(f"{name} has {'some' if found else 'no'} {what} parameters")
-        if lora and tower.trainable != tower.lora:
+        if lora and not projection and tower.trainable != tower.lora:
             problems.append(f"{name} trains {tower.trainable - tower.lora} that are not LoRA")
     if problems:
         raise UserError(

@@ -27,7 +27,13 @@ from conf.schema.commands import (
     SftCommand,
     StatisticsCommand,
 )
-from conf.schema.models import ArchitectureConfig, LoraConfig, RetrieverConfig, StudentConfig
+from conf.schema.models import (
+    ArchitectureConfig,
+    LateConfig,
+    LoraConfig,
+    RetrieverConfig,
+    StudentConfig,
+)
 from conf.schema.teacher import TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainConfig
 
@@ -42,6 +48,7 @@ __all__ = [
     "ExportCommand",
     "ExportStudentCommand",
     "GalleryCommand",
+    "LateConfig",
     "LoraConfig",
     "NarrateCommand",
     "Quota",

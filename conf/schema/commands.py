@@ -208,6 +208,11 @@ class ContrastiveCommand(CommandConfig):
                 f"train.width_weights={weights} must give each of the {len(widths)} "
                 f"retriever.widths={list(widths)} a weight of 0 or more"
             )
+        if weights is not None and self.retriever.late is not None:
+            problems.append(
+                "train.width_weights with retriever.late: its vectors have one width, leave the "
+                "weights null"
+            )
         if self.train.reuse_features and not self.retriever.lora.rank:
             problems.append(
                 "train.reuse_features=true: without adapters the vision tower is trained, and what "

@@ -68,6 +68,17 @@ class StudentConfig:
 
 
 @dataclass
+class LateConfig:
+    """A retriever of many vectors: one a token of the frame, or of the query's clip and question. A
+    frame scores, for each vector of the query, the most that one of its own gives."""
+
+    width: int = 128
+    """Entries of a vector."""
+    pool: int = 1
+    """A frame keeps one of so many vectors, means of those that are most alike; 1 keeps all."""
+
+
+@dataclass
 class RetrieverConfig:
     name: str = MISSING
     model: str | None = None
@@ -80,7 +91,9 @@ class RetrieverConfig:
     frames: int = 12
     max_length: int = 3072
     widths: list[int] = field(default_factory=lambda: [4096, 2048, 1024, 512, 256, 128, 64])
-    """Matryoshka widths, widest first."""
+    """Matryoshka widths, widest first. Those of a retriever with one vector; `late` has its own."""
+    late: LateConfig | None = None
+    """null gives a query and a frame one vector each."""
     query_instruction: str = "Retrieve images or text relevant to the user's query."
     frame_instruction: str = "Represent the user's input."
 
@@ -92,6 +105,8 @@ class RetrieverConfig:
                 f"retriever.widths={self.widths} must be one or more widths that fall strictly, "
                 "widest first"
             )
+        if self.late is not None:
+            problems += too_small(self.late, "retriever.late.", {"width": 1, "pool": 1})
         return problems
 
 

@@ -154,7 +154,7 @@ class ContrastiveTrainConfig(TrainConfig):
     hard_negatives: int = 1
     """Same-scene wrong-time frames a query."""
     scale: float = 50.0
-    """Inverse temperature of the cosine similarities."""
+    """Inverse temperature of the scores: cosine similarities, which retriever.late sums up."""
     distinct_frames: bool = True
     """Whether a frame that several queries of a batch name is embedded once; moves no gradient."""
     shared_prefixes: bool = True
