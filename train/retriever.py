@@ -99,6 +99,10 @@ def load_retriever(
                 target_modules=cfg.lora.targets,
             )
         )
+        # They come in the precision of a base that is not quantised, in whose steps updates vanish.
+        for weight in backbone.parameters():
+            if weight.requires_grad:
+                weight.data = weight.data.float()
     return model
 
 

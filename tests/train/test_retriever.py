@@ -102,3 +102,18 @@ def test_adapters_are_read_back_over_the_4_bit_weights_they_were_trained_on(
     query = [query_input(micro_store.retrieval("train")[0], frames, cfg)]
     one, two = (m.encode(query, prompt_name="query") for m in (model, again))
     np.testing.assert_allclose(one, two, atol=1e-5)
+
+
+@pytest.mark.parametrize("quantization", ["none", "nf4"])
+def test_adapters_are_trained_in_fp32_over_a_bf16_base(
+    micro_store, frames, retriever_cfg, saved_base, tmp_path, quantization
+) -> None:
+    cfg = replace(
+        retriever_cfg, architecture=None, model=saved_base, quantization=quantization,
+        lora=LoraConfig(),
+    )  # fmt: skip
+    model = retriever.load_retriever(cfg, "bf16", [], tmp_path)
+    assert {p.dtype for p in model.parameters() if p.requires_grad} == {torch.float32}
+    assert next(model[0].parameters()).dtype == torch.bfloat16
+    query = [query_input(micro_store.retrieval("train")[0], frames, cfg)]
+    assert np.isfinite(model.encode(query, prompt_name="query")).all()
