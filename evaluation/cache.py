@@ -64,7 +64,8 @@ class Embeddings:
 
         Args:
             things: by name; one after the other is embedded, in this order.
-            embed: gives (things, entries) fp32.
+            embed: gives (things, entries) fp32; where it gives fewer entries for some than for
+                others, their rows are filled up with zeros.
 
         Raises:
             UserError: an embedding is not finite, or another process is filling the folder.
@@ -91,7 +92,7 @@ class Embeddings:
                         rows.append(embed([things[name] for name in some]))
                         self._check_finite(rows[-1], some)
                         bar.update(len(some))
-                    self._add(names, np.concatenate(rows))
+                    self._add(names, filled_up(rows))
 
     def parts(self, names: Sequence[str]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """All embeddings of `names`, in no order, a file at a time: which of `names` they are, and
@@ -110,16 +111,16 @@ class Embeddings:
     def rows(self, names: Sequence[str]) -> np.ndarray:
         """(names, entries) in their order; a name may stand there twice."""
         once = list(dict.fromkeys(names))
-        found = np.empty((len(once), self.width), np.float32)
+        found = np.zeros((len(once), self.width), np.float32)
         for numbers, rows in self.parts(once):
-            found[numbers] = rows
+            found[numbers, : rows.shape[1]] = rows
         row_of = {name: k for k, name in enumerate(once)}
         return found[[row_of[name] for name in names]]
 
     @property
     def width(self) -> int:
-        """Entries of each embedding."""
-        return np.load(self._parts[0].path, mmap_mode="r").shape[1]
+        """Entries of the longest embedding."""
+        return max(np.load(part.path, mmap_mode="r").shape[1] for part in self._parts)
 
     def _missing(self, names: Mapping[str, Any]) -> list[str]:
         return [name for name in names if name not in self._place]
@@ -171,6 +172,12 @@ class Embeddings:
                 "weights are broken or overflow; measure in train.precision=fp32, or train again "
                 "with a lower train.lr"
             )
+
+
+def filled_up(rows: Sequence[np.ndarray]) -> np.ndarray:
+    """Rows (some, entries) of several lengths below each other, zeros where some are shorter."""
+    longest = max(part.shape[1] for part in rows)
+    return np.concatenate([np.pad(r, ((0, 0), (0, longest - r.shape[1]))) for r in rows])
 
 
 def _whole(note: Path) -> Part | None:

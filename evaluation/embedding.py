@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -27,7 +27,7 @@ from train.compatible import check_base, weights_digest
 from train.trained import run_title
 
 if TYPE_CHECKING:
-    from sentence_transformers import SentenceTransformer
+    from train.retriever import Retriever
 
 EMBEDDINGS = "embeddings"
 """Folder of them in a store."""
@@ -48,7 +48,7 @@ class Embedder:
     precision: str
     weights: str
     """Hash of the base's weights and the adapters'."""
-    load: Callable[[], SentenceTransformer]
+    load: Callable[[], Retriever]
 
     def about(self, store: Store) -> dict[str, Any]:
         """Everything that an embedding depends on, besides what is shown and how it is asked."""
@@ -59,6 +59,7 @@ class Embedder:
             "quantization": preset.quantization,
             "precision": self.precision,
             "image_size": preset.image_size,
+            "late": None if preset.late is None else asdict(preset.late),
             "benchmark": store.identity,
             "made by": {package: version(package) for package in MAKERS},
         }
@@ -89,10 +90,11 @@ def trained_embedder(folder: Path, preset: RetrieverConfig, precision: str) -> E
     """
     check_base(folder, preset.model)
     saved = folder / "retriever"
-    check_pooling(saved)
+    if preset.late is None:
+        check_pooling(saved)
 
     @cache
-    def load() -> SentenceTransformer:
+    def load() -> Retriever:
         from train.retriever import load_trained
         from train.room import keep_big_blocks
 
@@ -120,7 +122,7 @@ def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Em
     """The preset's base."""
 
     @cache
-    def load() -> SentenceTransformer:
+    def load() -> Retriever:
         from train.retriever import load_retriever
         from train.room import keep_big_blocks
 
@@ -128,7 +130,8 @@ def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Em
         return load_retriever(preset, precision, [], run / "untrained")
 
     weights = weights_digest(preset.model)
-    return Embedder(f"{UNTRAINED} {preset.name}", preset, precision, weights, load)
+    name = f"{UNTRAINED} {preset.name}" + (", late" if preset.late is not None else "")
+    return Embedder(name, preset, precision, weights, load)
 
 
 def check_pooling(saved: Path) -> None:
@@ -200,16 +203,23 @@ def _embedded(
     store: Store,
     batch: int,
 ) -> Embeddings:
+    preset = embedder.preset
+
     def embed(some: list[Thing]) -> np.ndarray:
         model = embedder.load()
-        check_widths(embedder.preset, model.get_embedding_dimension())
         shown, prompt = inputs(some), about["instruction"]
+        if preset.late is not None:
+            from evaluation.late import embedded_rows
+
+            return embedded_rows(model, shown, prompt, kind)
+        check_widths(preset, model.get_embedding_dimension())
         embedded = model.encode(shown, prompt=prompt, batch_size=batch, show_progress_bar=False)
         return np.asarray(embedded, dtype=np.float32)
 
     kept = Embeddings(store.folder / EMBEDDINGS, kind, embedder.about(store) | about)
     kept.complete(things, embed, batch)
-    check_widths(embedder.preset, kept.width)
+    if preset.late is None:
+        check_widths(preset, kept.width)
     return kept
 
 

@@ -203,7 +203,8 @@ def ranks_of_found(
         hit = np.isfinite(own[:, 0])
         counts.append((np.where(hit, greater, 0), np.where(hit, tied, 0), hit))
     greater, tied, hit = (np.stack(c) for c in zip(*counts, strict=True))
-    return Ranks(tuple(widths), greater, tied, hit, frames)
+    sizes, seconds = zip(*((there.bytes, there.seconds) for there in found), strict=True)
+    return Ranks(tuple(widths), greater, tied, hit, frames, sizes, seconds)
 
 
 def recall_against_exact(

@@ -26,7 +26,8 @@ def retrieval_rows(
             each = query_measures(*counts, ranks.frames, RECALLS)
             found = [_measured(measure, values, scenes) for measure, values in each.items()]
             sizes = (len(of), ranks.frames)
-            rows.append(RetrievalRow(benchmark, name, width, builder, *found, *sizes))
+            cost = (ranks.bytes and ranks.bytes[k], ranks.seconds and ranks.seconds[k])
+            rows.append(RetrievalRow(benchmark, name, width, builder, *found, *sizes, *cost))
     return rows
 
 

@@ -8,6 +8,7 @@ library adds, and that changes with the shape of a block. Here no sum is rounded
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -18,6 +19,7 @@ from evaluation.metrics import compare
 
 GRID = 2.0**26
 """Steps of a unit vector's entries."""
+FP32 = np.dtype(np.float32).itemsize
 QUERIES, FRAMES = 256, 1024
 """Of a block: its scores stay in a core's cache while they are counted."""
 
@@ -32,6 +34,8 @@ class Ranks:
             score exactly as it does.
         found: (widths, queries) False where the target was not found; an exact search finds it.
         frames: size of the database.
+        bytes: at each width, of what stands for the database: its vectors, or an index of them.
+        seconds: at each width, to rank for all queries; an exact search ranks at all at once.
     """
 
     widths: tuple[int, ...]
@@ -39,6 +43,8 @@ class Ranks:
     tied: np.ndarray
     found: np.ndarray
     frames: int
+    bytes: tuple[int, ...] | None = None
+    seconds: tuple[float, ...] | None = None
 
 
 class Cut:
@@ -124,6 +130,7 @@ def exact_ranks(
         database: (some frames, entries) each, in whatever order and numbers; one at a time is held.
         widths: widest first.
     """
+    began = time.perf_counter()
     queries = Cut(asked, widths)
     gold = list(pair_scores(queries, Cut(targets, widths)))
     counts = np.zeros((2, len(widths), len(asked)), np.int64)
@@ -136,7 +143,10 @@ def exact_ranks(
                 counts[:, k, some] += compare(scores, gold[k][some])
     greater, equal = counts[:, ::-1]
     # The target itself is among those that score as it does.
-    return Ranks(tuple(widths), greater, equal - 1, np.ones(greater.shape, bool), frames)
+    found = np.ones(greater.shape, bool)
+    sizes = tuple(frames * width * FP32 for width in widths)
+    seconds = (time.perf_counter() - began,) * len(widths)
+    return Ranks(tuple(widths), greater, equal - 1, found, frames, sizes, seconds)
 
 
 def least_of_top(

@@ -35,6 +35,7 @@ def main(cfg: ReportCommand, run: Run) -> None:
     from evaluation.tables import (
         RetrievalRow,
         SelectionRow,
+        cost_table,
         retrieval_table,
         selection_table,
     )
@@ -55,7 +56,7 @@ def main(cfg: ReportCommand, run: Run) -> None:
     for benchmark in dict.fromkeys(r.benchmark for r in ranks):
         # The same untrained row stands in the reports of several trained ones.
         rows = list(dict.fromkeys(r for r in ranks if r.benchmark == benchmark))
-        parts.append(f"benchmark {benchmark}\n{retrieval_table(rows)}")
+        parts.append(f"benchmark {benchmark}\n{retrieval_table(rows)}\n\n{cost_table(rows)}")
         pictures.append(run.folder / f"retrieval-{benchmark}.png")
         retrieval_figure(rows, pictures[-1])
     picture = run.folder / "report.png"

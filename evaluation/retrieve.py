@@ -7,6 +7,7 @@ import logging
 from pathlib import Path
 
 from conf.entry import Run, command
+from conf.errors import UserError
 from conf.runs import write_text
 from conf.schema import ContrastiveCommand, RetrieveCommand
 
@@ -23,6 +24,11 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     if cfg.index == "faiss":
         from evaluation.index import import_faiss
 
+        if preset.late is not None:
+            raise UserError(
+                "index=faiss holds one vector a frame, and retriever.late has many: "
+                "leave index=exact"
+            )
         import_faiss()
 
     from data.build import ensure_benchmark
@@ -45,8 +51,12 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
         shown = embedding.embed_frames(embedder, database, store, frames, cfg.batch)
         name = embedder.name
         log.info("ranking %s frames with %s", f"{len(names):,}", name)
-        if cfg.index == "exact":
-            parts = (part for _, part in shown.parts(names))
+        parts = (part for _, part in shown.parts(names))
+        if preset.late is not None:
+            from evaluation.late import late_ranks
+
+            ranks = late_ranks(asked, shown.rows(targets), parts, preset.late.width)
+        elif cfg.index == "exact":
             ranks = ranking.exact_ranks(asked, shown.rows(targets), parts, preset.widths)
         else:
             name = f"{name} ({cfg.index})"
@@ -57,7 +67,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
         rows += measures.retrieval_rows(store.name, name, ranks, queries, cfg.seed)
         curves += measures.recall_curves(name, ranks, queries)
 
-    table = tables.retrieval_table(rows)
+    table = f"{tables.retrieval_table(rows)}\n\n{tables.cost_table(rows)}"
     log.info("%s", table)
     told = [tables.index_table(indexes)] if indexes else []
     page = "\n\n".join([table, *told, *tables.builder_tables(rows)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from data.records import FAMILIES
@@ -57,7 +57,9 @@ class SelectionRow:
 @dataclass(frozen=True)
 class RetrievalRow:
     """One retriever at one width (None for a pipeline without widths) on the queries of one builder
-    (None for all of them), recalls in shares. Intervals are drawn over scenes."""
+    (None for all of them), recalls in shares. Intervals are drawn over scenes. `bytes` and
+    `seconds` are those of `evaluation.ranking.Ranks`; rows that differ in the time alone are
+    equal."""
 
     benchmark: str
     name: str
@@ -71,6 +73,8 @@ class RetrievalRow:
     tie_rate: Interval
     queries: int
     frames: int
+    bytes: int | None = None
+    seconds: float | None = field(default=None, compare=False)
 
     @property
     def untrained(self) -> bool:
@@ -152,6 +156,27 @@ def retrieval_table(rows: Sequence[RetrievalRow]) -> str:
         {"": own, "paper (Qwen3-VL 8B, full benchmark)": reference},
     )
     return f"{table}\nIntervals are bootstrapped over scenes; a target that is not found is last."
+
+
+def cost_table(rows: Sequence[RetrievalRow]) -> str:
+    """What the rows over all queries cost beside what they give, those that give most first."""
+    every = [r for r in rows if r.builder is None]
+    cells = [
+        [
+            _short(r.name, NAME_WIDTH),
+            "-" if r.width is None else str(r.width),
+            _percent(r.recall_10.value),
+            f"{r.mrr.value:.3f}",
+            "-" if r.bytes is None else f"{r.bytes / 2**20:,.2f}",
+            "-" if r.seconds is None else f"{r.seconds:,.2f}",
+        ]
+        for r in sorted(every, key=lambda r: -r.mrr.value)
+    ]
+    table = _table(["What it gives and costs", "Width", "R@10", "MRR", "MiB", "s"], {"": cells})
+    return (
+        f"{table}\nMiB: of what stands for the database. s: to rank for all queries; an exact "
+        "search ranks at\nall widths at once."
+    )
 
 
 def builder_tables(rows: Sequence[RetrievalRow]) -> list[str]:

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from evaluation.tables import (
     RetrievalRow,
     SelectionRow,
     builder_tables,
+    cost_table,
     index_table,
     retrieval_table,
     selection_table,
@@ -67,7 +69,8 @@ def ranks(queries) -> Ranks:
     shape = (3, len(queries))
     greater = np.floor(10 ** rng.uniform(0, 3.5, shape)).astype(int) - 1
     tied = rng.integers(3, size=shape) * (rng.random(shape) < 0.2)
-    return Ranks((4096, 256, 64), greater, tied, rng.random(shape) > 0.05, 10_000)
+    costs = ((4096 * 40_000, 256 * 40_000, 64 * 40_000), (12.3456, 1234.5, 0.01234))
+    return Ranks((4096, 256, 64), greater, tied, rng.random(shape) > 0.05, 10_000, *costs)
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +132,24 @@ def test_an_index_stands_beside_its_size_and_time():
     assert table.splitlines()[2].split() == [
         "one", "(faiss)", "64", "98.1", "100.0", "50.0", "3.0", "0.50",
     ]  # fmt: skip
+
+
+def test_what_a_row_costs_stands_beside_what_it_gives(retrieval_rows, ranks):
+    rows = {r.width: r for r in retrieval_rows if r.builder is None and r.name == "contrastive"}
+    lines = [line for line in cost_table(retrieval_rows).splitlines() if "contrastive" in line]
+    assert max(map(len, cost_table(retrieval_rows).splitlines())) <= 100
+    assert [float(line.split()[3]) for line in lines] == sorted(
+        (round(r.mrr.value, 3) for r in rows.values()), reverse=True
+    )
+    told = {int(line.split()[1]): line.split()[4:] for line in lines}
+    assert told == {4096: ["156.25", "12.35"], 256: ["9.77", "1,234.50"], 64: ["2.44", "0.01"]}
+    assert {r.width: (r.bytes, r.seconds) for r in rows.values()} == {
+        width: (ranks.bytes[k], ranks.seconds[k]) for k, width in enumerate(ranks.widths)
+    }
+    # In a report of several runs a retriever stands once.
+    again = replace(rows[64], seconds=5.0)
+    assert again == rows[64]
+    assert hash(again) == hash(rows[64])
 
 
 def test_selection_table(selection_rows):
