@@ -23,7 +23,7 @@ from torch.utils.data import BatchSampler
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import ContrastiveCommand, SftCommand
+from conf.schema import ContrastiveCommand, LateConfig, SftCommand
 from train import contrastive, loop, ranks, samples, sft
 from train.collate import IGNORED, Collator
 from train.conversation import selection_sample
@@ -82,7 +82,9 @@ def planned(settings: SftCommand, folder: Path, **changes: Any) -> dict[str, Any
 def ranking(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]:
     """What launched.py is told of a retriever's run."""
     retriever = settings.retriever
+    late = retriever.late
     overrides = [
+        *(["+exp=late_interaction", f"retriever.late.width={late.width}"] if late else []),
         "retriever=tiny", "benchmark=micro", f"store={settings.store}", f"run={folder.name}",
         f"checkpoints={folder.parents[1]}", "workers=1",
         *(f"retriever.architecture.{key}={value}"
@@ -146,16 +148,19 @@ def test_two_ranks_are_one(settings, contrastive_settings, few, tmp_path) -> Non
     # Near frames are told by names of both ranks.
     train = replace(contrastive_settings.train, mask_near=20.0, batches="scenes")
     near_masked = replace(contrastive_settings, train=train)
-    whole = tmp_path / "contrastive" / "one"
-    whole.mkdir(parents=True)
-    contrastive.main.__wrapped__(near_masked, Run("one", whole))
+    many = replace(near_masked.retriever, late=LateConfig(width=24))
+    late = replace(near_masked, retriever=many)
+    wholes = {"one": near_masked, "late": late}
+    for name, alone_settings in wholes.items():
+        (whole := tmp_path / "contrastive" / name).mkdir(parents=True)
+        contrastive.main.__wrapped__(alone_settings, Run(name, whole))
     told = [
         planned(settings, runs / "two"),
         planned(settings, runs / "more", after=one / "checkpoint-2"),
         planned(settings, runs / "parts", fsdp=True),
         planned(settings, runs / "on", fsdp=True, after=runs / "parts" / "checkpoint-2"),
         planned(settings, runs / "done", fsdp=True, after=runs / "parts" / "checkpoint-4"),
-        ranking(near_masked, tmp_path / "contrastive" / "two"),
+        *(ranking(cfg, tmp_path / "contrastive" / f"{name}-two") for name, cfg in wholes.items()),
         planned(settings, runs / "lost", fails_on=1),
     ]
     file = tmp_path / "runs.json"
@@ -166,8 +171,11 @@ def test_two_ranks_are_one(settings, contrastive_settings, few, tmp_path) -> Non
     assert ended.returncode == 1
     for name in ("two", "parts"):
         same(one, runs / name)
-    same_journals(whole, whole.with_name("two"))
-    same_weights(whole, whole.with_name("two"), "retriever/model.safetensors")
+    for name in wholes:
+        whole = tmp_path / "contrastive" / name
+        same_journals(whole, whole.with_name(f"{name}-two"))
+        same_weights(whole, whole.with_name(f"{name}-two"), "retriever/model.safetensors")
+    same_weights(whole, whole.with_name(f"{name}-two"), "retriever/1_Dense/model.safetensors")
     for name in ("more", "on"):
         same(one, runs / name, step=2)
     same_weights(one, runs / "done")

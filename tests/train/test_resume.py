@@ -13,9 +13,7 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import (
-    SftCommand,
-)
+from conf.schema import LateConfig, SftCommand
 from train import contrastive, samples, sft
 from train.checkpoints import newest_checkpoint
 from train.compatible import check_base, note_base
@@ -170,14 +168,17 @@ def test_other_folders_are_no_checkpoints(tmp_path, caplog) -> None:
 
 
 @pytest.mark.slow
-def test_a_retriever_goes_on_as_if_undisturbed(contrastive_settings, tmp_path) -> None:
+@pytest.mark.parametrize("late", [None, LateConfig(width=24)], ids=["one vector", "many"])
+def test_a_retriever_goes_on_as_if_undisturbed(contrastive_settings, tmp_path, late) -> None:
     train = replace(contrastive_settings.train, best="mrr")
-    settings = replace(contrastive_settings, train=train)
+    cfg = replace(contrastive_settings.retriever, late=late)
+    settings = replace(contrastive_settings, retriever=cfg, train=train)
     whole, killed = train_twice(contrastive.main, settings, tmp_path)
     measured = {r["step"]: r["eval_mrr"] for r in read_journal(whole) if "eval_mrr" in r}
     best = max((2, 4), key=measured.get)
     kept = load_file(whole / f"checkpoint-{best}" / "model.safetensors")
     weights = load_file(whole / "retriever" / "model.safetensors")
     assert all(torch.equal(kept[name], weight) for name, weight in weights.items())
-    same_weights(*(f / "retriever" / "model.safetensors" for f in (whole, killed)))
+    for name in ("model.safetensors", *(["1_Dense/model.safetensors"] if late else [])):
+        same_weights(*(f / "retriever" / name for f in (whole, killed)))
     same_journals(whole, killed)
