@@ -70,7 +70,8 @@ class StudentConfig:
 @dataclass
 class LateConfig:
     """A retriever of many vectors: one a token of the frame, or of the query's clip and question. A
-    frame scores, for each vector of the query, the most that one of its own gives."""
+    frame scores, for each vector of the query, the most that one of its own gives. The sum of these
+    goes with a train.scale of about 1."""
 
     width: int = 128
     """Entries of a vector."""

@@ -149,7 +149,7 @@ def test_two_ranks_are_one(settings, contrastive_settings, few, tmp_path) -> Non
     train = replace(contrastive_settings.train, mask_near=20.0, batches="scenes")
     near_masked = replace(contrastive_settings, train=train)
     many = replace(near_masked.retriever, late=LateConfig(width=24))
-    late = replace(near_masked, retriever=many)
+    late = replace(near_masked, retriever=many, train=replace(train, scale=1.0))
     wholes = {"one": near_masked, "late": late}
     for name, alone_settings in wholes.items():
         (whole := tmp_path / "contrastive" / name).mkdir(parents=True)
