@@ -17,7 +17,8 @@ from sentence_transformers.util.similarity import maxsim
 from torch.nn.functional import cross_entropy
 from transformers import dynamic_module_utils
 
-from conf.schema import LateConfig, LoraConfig
+from conf.compose import compose, register
+from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
 from train.audit import audit_retriever
 from train.backbone import keep_differentiable
 from train.batches import batch_of
@@ -299,3 +300,15 @@ def test_weights_of_widths_are_refused(contrastive_settings, late_cfg) -> None:
     train = replace(contrastive_settings.train, width_weights=[1.0, 1.0])
     settings = replace(contrastive_settings, retriever=late_cfg, train=train)
     assert any("its vectors have one width" in problem for problem in settings.check())
+
+
+@pytest.mark.parametrize("retriever", ["tiny", "qwen3_vl_emb_8b"])
+def test_any_retriever_becomes_one_of_many_vectors(retriever) -> None:
+    register("train.contrastive", ContrastiveCommand)
+    one, many = (
+        compose("train.contrastive", ContrastiveCommand, [f"retriever={retriever}", *overlay])
+        for overlay in ([], ["+exp=late_interaction"])
+    )
+    assert one.retriever.late is None
+    assert many.retriever == replace(one.retriever, late=LateConfig())
+    assert many.train == replace(one.train, scale=1.0)
