@@ -5,6 +5,7 @@
         scenes/<id>.npz      one scene's oracle; <id>-without-<k> is it with object k absent
         selection.parquet retrieval.parquet database.parquet
         frames/<id>.zip      a cache of that scene's rendered frames, not part of the manifest
+        embeddings/          a cache of what retrievers make of frames and queries, not part of it
         rationales.jsonl     every answer of teachers, not part of the manifest
         rationales.parquet   the accepted ones of the last narration, not part of it either
 

@@ -1,88 +1,223 @@
-"""Embed queries and frames with a retriever and rank them, at each of its widths."""
+"""Embed the queries and the frames of a benchmark with a retriever, once.
+
+What loads a model is imported only where something has to be embedded: importing it takes longer
+than ranking.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from sentence_transformers import SentenceTransformer
-from tqdm import tqdm
 
 from conf.errors import UserError
 from conf.schema import RetrieverConfig
 from data.frames import Frames
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
-from evaluation.metrics import rank_metrics
-from evaluation.tables import RECALLS, RetrievalRow
-from train.retriever import frame_input, query_input
+from evaluation.cache import Embeddings
+from evaluation.tables import UNTRAINED
+from train.compatible import check_base, weights_digest
+from train.trained import run_title
+
+if TYPE_CHECKING:
+    from sentence_transformers import SentenceTransformer
+
+EMBEDDINGS = "embeddings"
+"""Folder of them in a store."""
+MAKERS = ("sentence-transformers", "transformers")
+"""Packages that turn a prompt and pixels into a model's input."""
+POOLING = "lasttoken"
+
+Thing = TypeVar("Thing")
 
 
-def rank_all(
-    model: SentenceTransformer,
-    cfg: RetrieverConfig,
-    store: Store,
-    frames: Frames,
-    batch: int,
-    name: str,
-) -> list[RetrievalRow]:
-    """Rank the test database for every test query: a row a width, widest first. Scores are fp32
-    cosines of the embeddings' first `width` entries.
+@dataclass(frozen=True)
+class Embedder:
+    """A retriever that is measured: what tells its embeddings from all others, and how it is
+    loaded."""
+
+    name: str
+    preset: RetrieverConfig
+    precision: str
+    weights: str
+    """Hash of the base's weights and the adapters'."""
+    load: Callable[[], SentenceTransformer]
+
+    def about(self, store: Store) -> dict[str, Any]:
+        """Everything that an embedding depends on, besides what is shown and how it is asked."""
+        preset = self.preset
+        return {
+            "weights": self.weights,
+            "revision": preset.revision,
+            "quantization": preset.quantization,
+            "precision": self.precision,
+            "image_size": preset.image_size,
+            "benchmark": store.identity,
+            "made by": {package: version(package) for package in MAKERS},
+        }
+
+
+def embedders(
+    folder: Path | None, preset: RetrieverConfig, precision: str, store: Store, run: Path
+) -> Iterator[Embedder]:
+    """The retriever of a training run's `folder`, where there is one, and the untrained one that it
+    began from: one at a time, so that only one needs room.
 
     Raises:
-        UserError: there is no test query.
+        UserError: what `trained_embedder` raises.
     """
-    queries, database = store.standard_test(), store.database("test")
-    if not queries:
-        raise UserError(f"{store.folder} has no queries of the standard test to measure on")
-    asked = embed_queries(model, queries, frames, cfg, batch)
-    shown = embed_frames(model, database, frames, cfg, batch)
-    column = {frame: k for k, frame in enumerate(database)}
-    gold = np.array([column[q.target] for q in queries])
-    rows = []
-    for width in cfg.widths:
-        scores = normalise(asked[:, :width]) @ normalise(shown[:, :width]).T
-        metrics = rank_metrics(scores, gold, RECALLS)
-        rows.append(RetrievalRow.of(store.name, name, width, metrics, len(queries), len(database)))
-    return rows
+    if folder is not None:
+        yield trained_embedder(folder, preset, precision)
+    if preset.architecture is not None:
+        base = built_base(preset, precision, store, folder, run)
+        preset = replace(preset, architecture=None, model=str(base))
+    yield untrained_embedder(preset, precision, run)
+
+
+def trained_embedder(folder: Path, preset: RetrieverConfig, precision: str) -> Embedder:
+    """The retriever of a run of train.contrastive.
+
+    Raises:
+        UserError: it is over another base than `preset` names, or saved by another pooling.
+    """
+    check_base(folder, preset.model)
+    saved = folder / "retriever"
+    check_pooling(saved)
+
+    @cache
+    def load() -> SentenceTransformer:
+        from train.retriever import load_trained
+        from train.room import keep_big_blocks
+
+        keep_big_blocks()
+        return load_trained(preset, precision, saved)
+
+    weights = weights_digest(preset.model, saved)
+    return Embedder(run_title(folder), preset, precision, weights, load)
+
+
+def built_base(
+    preset: RetrieverConfig, precision: str, store: Store, folder: Path | None, run: Path
+) -> Path:
+    """Where a base that is built from a seed is: in the training run that began from it, or else
+    built here."""
+    if folder is not None and (folder / "untrained").is_dir():
+        return folder / "untrained"
+    from train.retriever import corpus, load_retriever
+
+    load_retriever(preset, precision, corpus(store.retrieval("train"), preset), run / "untrained")
+    return run / "untrained"
+
+
+def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Embedder:
+    """The preset's base."""
+
+    @cache
+    def load() -> SentenceTransformer:
+        from train.retriever import load_retriever
+        from train.room import keep_big_blocks
+
+        keep_big_blocks()
+        return load_retriever(preset, precision, [], run / "untrained")
+
+    weights = weights_digest(preset.model)
+    return Embedder(f"{UNTRAINED} {preset.name}", preset, precision, weights, load)
+
+
+def check_pooling(saved: Path) -> None:
+    """Raises UserError where a saved retriever does not pool the last token."""
+    try:
+        modules = json.loads((saved / "modules.json").read_text())
+        parts = [saved / m["path"] for m in modules if m["type"].endswith(".Pooling")]
+        modes = [json.loads((part / "config.json").read_text())["pooling_mode"] for part in parts]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{saved} is damaged: what it says of its modules cannot be read ({error}); delete the "
+            "run's folder and train again"
+        ) from error
+    if modes != [POOLING]:
+        told = f"with {' and '.join(map(str, modes))} pooling" if modes else "without pooling"
+        raise UserError(
+            f"{saved} was saved {told}, and a retriever here is read at its last token "
+            f"({POOLING}): give a run of train.contrastive, or train again"
+        )
+
+
+def frame_name(frame: FrameRef) -> str:
+    return f"{frame.scene_id}/{frame.frame}"
 
 
 def embed_queries(
-    model: SentenceTransformer,
-    queries: Sequence[RetrievalQuery],
-    frames: Frames,
-    cfg: RetrieverConfig,
-    batch: int,
-) -> np.ndarray:
-    """(queries, width) fp32 embeddings; pixels are read a batch at a time."""
-    parts = []
-    for start in tqdm(range(0, len(queries), batch), desc="embedding queries", unit="batch"):
-        inputs = [query_input(q, frames, cfg) for q in queries[start : start + batch]]
-        parts.append(_encode(model, inputs, cfg.query_instruction, batch))
-    return np.concatenate(parts)
+    embedder: Embedder, queries: Sequence[RetrievalQuery], store: Store, frames: Frames, batch: int
+) -> Embeddings:
+    """The embeddings of queries, by their ids; pixels are read a batch at a time.
+
+    Raises:
+        UserError: what `Embeddings.complete` and `check_widths` raise.
+    """
+    preset = embedder.preset
+
+    def inputs(some: list[RetrievalQuery]) -> list:
+        from train.retriever import query_input
+
+        return [query_input(q, frames, preset) for q in some]
+
+    about = {"instruction": preset.query_instruction, "frames": preset.frames}
+    # Scene by scene, so that a scene's frames are decoded once.
+    things = {q.query_id: q for q in sorted(queries, key=lambda q: (q.scene_id, q.query_id))}
+    return _embedded(embedder, "query", about, things, inputs, store, batch)
 
 
 def embed_frames(
-    model: SentenceTransformer,
-    database: Sequence[FrameRef],
-    frames: Frames,
-    cfg: RetrieverConfig,
+    embedder: Embedder, database: Sequence[FrameRef], store: Store, frames: Frames, batch: int
+) -> Embeddings:
+    """The embeddings of frames, by `frame_name`. Errors are those of `embed_queries`."""
+
+    def inputs(some: list[FrameRef]) -> list:
+        from train.retriever import frame_input
+
+        return [frame_input(f, frames) for f in some]
+
+    about = {"instruction": embedder.preset.frame_instruction}
+    ordered = sorted(database, key=lambda f: (f.scene_id, f.frame))
+    things = {frame_name(f): f for f in ordered}
+    return _embedded(embedder, "frame", about, things, inputs, store, batch)
+
+
+def _embedded(
+    embedder: Embedder,
+    kind: str,
+    about: dict[str, Any],
+    things: Mapping[str, Thing],
+    inputs: Callable[[list[Thing]], list],
+    store: Store,
     batch: int,
-) -> np.ndarray:
-    """(frames, width) fp32 embeddings."""
-    parts = []
-    for start in tqdm(range(0, len(database), batch), desc="embedding frames", unit="batch"):
-        inputs = [frame_input(f, frames) for f in database[start : start + batch]]
-        parts.append(_encode(model, inputs, cfg.frame_instruction, batch))
-    return np.concatenate(parts)
+) -> Embeddings:
+    def embed(some: list[Thing]) -> np.ndarray:
+        model = embedder.load()
+        check_widths(embedder.preset, model.get_embedding_dimension())
+        shown, prompt = inputs(some), about["instruction"]
+        embedded = model.encode(shown, prompt=prompt, batch_size=batch, show_progress_bar=False)
+        return np.asarray(embedded, dtype=np.float32)
+
+    kept = Embeddings(store.folder / EMBEDDINGS, kind, embedder.about(store) | about)
+    kept.complete(things, embed, batch)
+    check_widths(embedder.preset, kept.width)
+    return kept
 
 
-def _encode(model: SentenceTransformer, inputs: list, prompt: str, batch: int) -> np.ndarray:
-    embedded = model.encode(inputs, prompt=prompt, batch_size=batch, show_progress_bar=False)
-    return np.asarray(embedded, dtype=np.float32)
-
-
-def normalise(embeddings: np.ndarray) -> np.ndarray:
-    """Rows of unit length; a row of zeros stays one."""
-    lengths = np.linalg.norm(embeddings, axis=1, keepdims=True)
-    return embeddings / np.maximum(lengths, 1e-12)
+def check_widths(preset: RetrieverConfig, entries: int) -> None:
+    """Raises UserError where the preset has a width that embeddings of so many entries lack."""
+    if preset.widths[0] > entries:
+        fitting = ",".join(str(w) for w in preset.widths if w <= entries) or entries
+        raise UserError(
+            f"retriever.widths asks for {preset.widths[0]}, and the embeddings of {preset.name} "
+            f"have {entries} entries: give retriever.widths=[{fitting}]"
+        )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from data.records import FAMILIES
 from evaluation import paper
@@ -66,24 +66,31 @@ def selection_figure(rows: Sequence[SelectionRow], path: Path | str) -> None:
 
 
 def retrieval_figure(rows: Sequence[RetrievalRow], path: Path | str) -> None:
-    """Recall@1, @10 and @50 (%) over embedding width, one panel each; untrained rows are dashed.
+    """Recall@1, @10 and @50 (%) of all queries over embedding width, one panel each, in bands of
+    their 95% intervals; untrained rows are dashed.
 
     Rows without a width are left out.
     """
-    from matplotlib.ticker import NullLocator
-
-    rows = sorted((r for r in rows if r.width), key=lambda r: r.width)
+    every = (r for r in rows if r.width and r.builder is None)
+    rows = sorted(every, key=lambda r: r.width)
     names = sorted({r.name for r in rows}, key=lambda name: (name.startswith(UNTRAINED), name))
     widths = sorted({r.width for r in rows})
     figure = empty_figure(9, 3.8)
     panels = figure.subplots(1, len(RECALLS), sharey=True)
     for axes, k in zip(panels, RECALLS, strict=True):
         for i, name in enumerate(names):
-            points = [(r.width, 100 * getattr(r, f"recall_{k}")) for r in rows if r.name == name]
-            untrained = name.startswith(UNTRAINED)
+            points = [(r.width, r.measures[f"recall@{k}"]) for r in rows if r.name == name]
+            untrained, color = name.startswith(UNTRAINED), _color(name, i)
+            across = [width for width, _ in points]
+            spans = [
+                [100 * found.low for _, found in points],
+                [100 * found.high for _, found in points],
+            ]
+            axes.fill_between(across, *spans, color=color, alpha=0.15, linewidth=0)
             axes.plot(
-                *zip(*points, strict=True),
-                color=_color(name, i),
+                across,
+                [100 * found.value for _, found in points],
+                color=color,
                 linestyle="--" if untrained else "-",
                 marker="o",
                 markersize=5,
@@ -92,17 +99,76 @@ def retrieval_figure(rows: Sequence[RetrievalRow], path: Path | str) -> None:
                 label=name,
                 clip_on=False,
             )
-        axes.set_xscale("log", base=2)
-        axes.set_xticks(widths, [str(w) for w in widths], rotation=45 if len(widths) > 4 else 0)
-        axes.xaxis.set_minor_locator(NullLocator())
+        _over_widths(axes, widths)
         axes.set_title(f"Recall@{k}", fontsize=11)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="y", color="#eeeeee")
     panels[0].set_ylim(0, None)
     panels[0].set_ylabel("Queries (%)")
     figure.supxlabel("Embedding width", fontsize=10)
     _legend(figure, panels[0])
     figure.savefig(path)
+
+
+def builders_figure(
+    rows: Sequence[RetrievalRow], curves: Sequence[dict[str, Any]], path: Path | str
+) -> None:
+    """By builder, of the first retriever in `rows`: recall (%) over k at its widest width, and
+    Recall@10 over width; all queries in black, with the band of their 95% interval.
+
+    Args:
+        curves: as `evaluation.measures.recall_curves` gives them.
+    """
+    from matplotlib.ticker import StrMethodFormatter
+
+    name, widest = rows[0].name, rows[0].width
+    figure = empty_figure(9, 4.2)
+    left, right = figure.subplots(1, 2, sharey=True)
+    for curve in reversed([c for c in curves if c["name"] == name]):
+        recalls = [100 * recall for recall in curve["recalls"]]
+        left.plot(curve["ks"], recalls, **_builder_style(curve["builder"]))
+    own = sorted((r for r in rows if r.name == name and r.width), key=lambda r: r.width)
+    for builder in reversed(list(dict.fromkeys(r.builder for r in own))):
+        points = [r for r in own if r.builder == builder]
+        across = [r.width for r in points]
+        recalls = [100 * r.recall_10.value for r in points]
+        right.plot(across, recalls, marker="o", markersize=4, **_builder_style(builder))
+        if builder is None:
+            spans = [[100 * getattr(r.recall_10, end) for r in points] for end in ("low", "high")]
+            right.fill_between(across, *spans, color=INK, alpha=0.12, linewidth=0)
+    left.set_xscale("log")
+    left.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    left.set_xlabel("k")
+    left.set_title(f"Recall@k at width {widest}", fontsize=11)
+    left.spines[["top", "right"]].set_visible(False)
+    left.grid(axis="y", color="#eeeeee")
+    _over_widths(right, sorted({r.width for r in own}))
+    right.set_xlabel("Embedding width")
+    right.set_title("Recall@10", fontsize=11)
+    left.set_ylim(0, None)
+    left.set_ylabel("Queries (%)")
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(
+        handles[::-1], labels[::-1], loc="outside right center", fontsize=9, frameon=False,
+        title=textwrap.fill(name, 18), title_fontsize=9,
+    )  # fmt: skip
+    figure.savefig(path)
+
+
+def _builder_style(builder: int | None) -> dict[str, Any]:
+    if builder is None:
+        return {"color": INK, "linewidth": 2.6, "label": "all queries"}
+    color = COLORS[(builder - 1) % len(COLORS)]
+    return {"color": color, "linewidth": 1.5, "label": f"builder {builder}"}
+
+
+def _over_widths(axes: Axes, widths: Sequence[int]) -> None:
+    """A panel whose x axis is the embedding's width."""
+    from matplotlib.ticker import NullLocator
+
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(widths, [str(w) for w in widths], rotation=45 if len(widths) > 4 else 0)
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y", color="#eeeeee")
 
 
 def item_figure(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar
 
 from conf.entry import Run, command
 from conf.errors import UserError
@@ -13,7 +13,12 @@ from conf.runs import write_text
 from conf.schema import ReportCommand
 from conf.sweep import AT_START
 
+if TYPE_CHECKING:
+    from evaluation.tables import RetrievalRow, SelectionRow
+
 log = logging.getLogger(__name__)
+
+Row = TypeVar("Row", "SelectionRow", "RetrievalRow")
 
 
 @command("evaluation.report", ReportCommand)
@@ -40,13 +45,13 @@ def main(cfg: ReportCommand, run: Run) -> None:
     if selected:
         pictures.insert(0, selected[-1] / "item.png")
     # Measured on another benchmark is measured on other items: never in one table.
-    choices = [SelectionRow.from_dict(r) for f in selected for r in _rows(f)]
+    choices = [r for f in selected for r in _rows(f, SelectionRow)]
     for benchmark in dict.fromkeys(r.benchmark for r in choices):
         rows = [r for r in choices if r.benchmark == benchmark]
         parts.append(f"benchmark {benchmark}\n{selection_table(rows)}")
         pictures.insert(1, run.folder / f"selection-{benchmark.replace(', ', '-')}.png")
         selection_figure(rows, pictures[1])
-    ranks = [RetrievalRow(**r) for f in retrieved for r in _rows(f)]
+    ranks = [r for f in retrieved for r in _rows(f, RetrievalRow) if r.builder is None]
     for benchmark in dict.fromkeys(r.benchmark for r in ranks):
         # The same untrained row stands in the reports of several trained ones.
         rows = list(dict.fromkeys(r for r in ranks if r.benchmark == benchmark))
@@ -67,12 +72,13 @@ def _finished(root: Path, command_name: str) -> list[Path]:
     return [p.parent for p in sorted(done, key=lambda p: p.stat().st_mtime)]
 
 
-def _rows(folder: Path) -> list[dict[str, Any]]:
+def _rows(folder: Path, row: type[Row]) -> list[Row]:
     try:
-        return json.loads((folder / "report.json").read_text())["rows"]
+        return [row.from_dict(r) for r in json.loads((folder / "report.json").read_text())["rows"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
-            f"{folder / 'report.json'} is missing or damaged: delete {folder} and measure again"
+            f"{folder / 'report.json'} is missing, damaged or of another version: delete {folder} "
+            "and measure again"
         ) from error
 
 

@@ -15,49 +15,58 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.retrieve", RetrieveCommand)
 def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
-    from train.trained import run_title, settings_of
+    from train.trained import settings_of
 
     folder = Path(cfg.model) if cfg.model is not None else None
     trained = settings_of(folder, ContrastiveCommand, "retriever") if folder else cfg
     preset, precision = trained.retriever, trained.train.precision
+    if cfg.index == "faiss":
+        from evaluation.index import import_faiss
+
+        import_faiss()
 
     from data.build import ensure_benchmark
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.frames import Frames
-    from evaluation.embedding import rank_all
-    from evaluation.figures import retrieval_figure
-    from evaluation.tables import RECALLS, UNTRAINED, RetrievalRow, retrieval_table
-    from train import compatible, retriever, room
+    from evaluation import embedding, figures, index, measures, ranking, tables
+    from evaluation.checks import check_retrieval
 
-    room.keep_big_blocks()
+    queries, database = store.standard_test(), store.database("test")
+    check_retrieval(store, queries, database)
     frames = Frames(store, preset.image_size)
-    rows: list[RetrievalRow] = []
-    if folder is not None:
-        log.info("ranking with the retriever of %s", folder)
-        compatible.check_base(folder, preset.model)
-        model = retriever.load_trained(preset, precision, folder / "retriever")
-        rows += rank_all(model, preset, store, frames, cfg.batch, run_title(folder))
-    log.info("ranking with the untrained %s", preset.name)
-    texts = retriever.corpus(store.retrieval("train"), preset)
-    untrained = retriever.load_retriever(preset, precision, texts, run.folder / "untrained")
-    rows += rank_all(untrained, preset, store, frames, cfg.batch, f"{UNTRAINED} {preset.name}")
+    ids = [q.query_id for q in queries]
+    names = [embedding.frame_name(f) for f in database]
+    targets = [embedding.frame_name(q.target) for q in queries]
+    rows, curves, indexes = [], [], []
+    for embedder in embedding.embedders(folder, preset, precision, store, run.folder):
+        asked = embedding.embed_queries(embedder, queries, store, frames, cfg.batch).rows(ids)
+        shown = embedding.embed_frames(embedder, database, store, frames, cfg.batch)
+        name = embedder.name
+        log.info("ranking %s frames with %s", f"{len(names):,}", name)
+        if cfg.index == "exact":
+            parts = (part for _, part in shown.parts(names))
+            ranks = ranking.exact_ranks(asked, shown.rows(targets), parts, preset.widths)
+        else:
+            name = f"{name} ({cfg.index})"
+            ranks, told = index.approximate_ranks(
+                asked, targets, shown, names, preset.widths, cfg.probes, cfg.seed
+            )
+            indexes += [{"name": name, **of_width} for of_width in told]
+        rows += measures.retrieval_rows(store.name, name, ranks, queries, cfg.seed)
+        curves += measures.recall_curves(name, ranks, queries)
 
-    table = retrieval_table(rows)
+    table = tables.retrieval_table(rows)
     log.info("%s", table)
-    write_text(run.folder / "report.txt", table + "\n")
-    write_text(
-        run.folder / "report.json", json.dumps({"rows": [r.to_dict() for r in rows]}, indent=1)
-    )
-    retrieval_figure(rows, run.folder / "retrieval.png")
-    widest = rows[0]
-    recalls = (widest.recall_1, widest.recall_10, widest.recall_50)
-    return {
-        **{f"recall@{k}": value for k, value in zip(RECALLS, recalls, strict=True)},
-        "mrr": widest.mrr,
-        "median_rank": widest.median_rank,
-    }
+    told = [tables.index_table(indexes)] if indexes else []
+    page = "\n\n".join([table, *told, *tables.builder_tables(rows)])
+    write_text(run.folder / "report.txt", page + "\n")
+    report = {"rows": [r.to_dict() for r in rows], "curves": curves, "indexes": indexes}
+    write_text(run.folder / "report.json", json.dumps(report, indent=1))
+    figures.retrieval_figure(rows, run.folder / "retrieval.png")
+    figures.builders_figure(rows, curves, run.folder / "builders.png")
+    return {name: found.value for name, found in rows[0].measures.items() if name != "tie_rate"}
 
 
 if __name__ == "__main__":

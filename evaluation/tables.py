@@ -12,6 +12,8 @@ from evaluation.metrics import Accuracy, Interval
 
 RECALLS = (1, 10, 50)
 """Cut-offs that the retrieval rows report."""
+MEASURES = ("mrr", "median_rank", "tie_rate")
+"""What they report besides."""
 UNTRAINED = "untrained"
 """What the names of rows begin with that a trained retriever is held against."""
 
@@ -54,41 +56,39 @@ class SelectionRow:
 
 @dataclass(frozen=True)
 class RetrievalRow:
-    """One retriever at one width (None for a pipeline without widths), recalls in shares."""
+    """One retriever at one width (None for a pipeline without widths) on the queries of one builder
+    (None for all of them), recalls in shares. Intervals are drawn over scenes."""
 
     benchmark: str
     name: str
     width: int | None
-    recall_1: float
-    recall_10: float
-    recall_50: float
-    mrr: float
-    median_rank: float
-    tie_rate: float
+    builder: int | None
+    recall_1: Interval
+    recall_10: Interval
+    recall_50: Interval
+    mrr: Interval
+    median_rank: Interval
+    tie_rate: Interval
     queries: int
     frames: int
-
-    @classmethod
-    def of(
-        cls,
-        benchmark: str,
-        name: str,
-        width: int | None,
-        metrics: dict[str, float],
-        queries: int,
-        frames: int,
-    ) -> RetrievalRow:
-        """From what `rank_metrics` gives with `ks=RECALLS`."""
-        recalls = [metrics[f"recall@{k}"] for k in RECALLS]
-        rest = [metrics[key] for key in ("mrr", "median_rank", "tie_rate")]
-        return cls(benchmark, name, width, *recalls, *rest, queries, frames)
 
     @property
     def untrained(self) -> bool:
         return self.name.startswith(UNTRAINED)
 
+    @property
+    def measures(self) -> dict[str, Interval]:
+        """By the names that `evaluation.metrics` gives them."""
+        recalls = {f"recall@{k}": getattr(self, f"recall_{k}") for k in RECALLS}
+        return {**recalls, **{name: getattr(self, name) for name in MEASURES}}
+
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
+
+    @classmethod
+    def from_dict(cls, row: dict[str, Any]) -> RetrievalRow:
+        names = [f"recall_{k}" for k in RECALLS] + list(MEASURES)
+        return cls(**{**row, **{name: Interval(**row[name]) for name in names}})
 
 
 def selection_table(rows: Sequence[SelectionRow]) -> str:
@@ -124,21 +124,16 @@ def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> str:
 
 
 def retrieval_table(rows: Sequence[RetrievalRow]) -> str:
-    """The rows by width, widest first, each width's untrained row on top; then the paper's."""
-    ordered = sorted(rows, key=lambda r: (-(r.width or 0), not r.untrained))
-    own = [
-        [
-            _short(r.name, NAME_WIDTH),
-            "-" if r.width is None else str(r.width),
-            *map(_percent, (r.recall_1, r.recall_10, r.recall_50)),
-            f"{r.mrr:.3f}",
-            f"{r.median_rank:g}",
-            _percent(r.tie_rate),
-            f"{r.queries:,}",
-            f"{r.frames:,}",
-        ]
-        for r in ordered
-    ]
+    """The rows over all queries by width, widest first, each width's untrained row on top; then the
+    paper's."""
+    every = [r for r in rows if r.builder is None]
+    ordered = sorted(every, key=lambda r: (-(r.width or 0), not r.untrained))
+    own = []
+    for r in ordered:
+        width = "-" if r.width is None else str(r.width)
+        sizes = [f"{r.queries:,}", f"{r.frames:,}"]
+        own.append([_short(r.name, NAME_WIDTH), width, *_values(r), *sizes])
+        own.append(["  95% interval", "", *_ranges(r), "", ""])
     reference = [
         [
             r.name,
@@ -152,11 +147,62 @@ def retrieval_table(rows: Sequence[RetrievalRow]) -> str:
         ]
         for r in paper.RETRIEVAL_DISTILLED
     ]
-    recalls = [f"R@{k}" for k in RECALLS]
-    return _table(
-        ["Retrieval", "Width", *recalls, "MRR", "Median", "Tied", "Queries", "Frames"],
+    table = _table(
+        ["Retrieval", "Width", *_heads(), "Queries", "Frames"],
         {"": own, "paper (Qwen3-VL 8B, full benchmark)": reference},
     )
+    return f"{table}\nIntervals are bootstrapped over scenes; a target that is not found is last."
+
+
+def builder_tables(rows: Sequence[RetrievalRow]) -> list[str]:
+    """A table for each retriever: by builder, at every width, with the intervals."""
+    tables = []
+    for name in dict.fromkeys(r.name for r in rows):
+        cells = []
+        for r in [r for r in rows if r.name == name]:
+            of = "all queries" if r.builder is None else f"builder {r.builder}"
+            pairs = zip(_values(r), _ranges(r), strict=True)
+            found = [f"{value} [{span}]" for value, span in pairs]
+            cells.append([of, str(r.width), *found, str(r.queries)])
+        head = [f"{_short(name, NAME_WIDTH)} by builder", "Width", *_heads(), "Queries"]
+        tables.append(_table(head, {"": cells}))
+    return tables
+
+
+def index_table(indexes: Sequence[dict[str, Any]]) -> str:
+    """What is told of approximate indexes, as `evaluation.index` gives it, each with its `name`."""
+    cells = [
+        [
+            _short(told["name"], NAME_WIDTH),
+            str(told["width"]),
+            *(_percent(told[f"recall@{k}"]) for k in RECALLS),
+            f"{told['bytes'] / 2**20:,.1f}",
+            f"{told['seconds']:.2f}",
+        ]
+        for told in indexes
+    ]
+    recalls = [f"R@{k}" for k in RECALLS]
+    table = _table(["Index, held against exact", "Width", *recalls, "MiB", "s"], {"": cells})
+    return f"{table}\nR@k: of the exact first k, what share the index has among its own first k."
+
+
+def _heads() -> list[str]:
+    return [*(f"R@{k}" for k in RECALLS), "MRR", "Median", "Tied"]
+
+
+def _values(row: RetrievalRow) -> list[str]:
+    found = row.measures
+    recalls = [_percent(found[f"recall@{k}"].value) for k in RECALLS]
+    median, ties = f"{row.median_rank.value:g}", _percent(row.tie_rate.value)
+    return [*recalls, f"{row.mrr.value:.3f}", median, ties]
+
+
+def _ranges(row: RetrievalRow) -> list[str]:
+    found = row.measures
+    recalls = [_range(found[f"recall@{k}"]) for k in RECALLS]
+    mrr = f"{row.mrr.low:.2f}-{row.mrr.high:.2f}"
+    median = f"{row.median_rank.low:.0f}-{row.median_rank.high:.0f}"
+    return [*recalls, mrr, median, _range(row.tie_rate)]
 
 
 def _percent(share: float | None) -> str:

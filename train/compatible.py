@@ -6,15 +6,17 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from safetensors import safe_open
-from torch import nn
-from transformers import PreTrainedConfig, PreTrainedTokenizerBase, ProcessorMixin
 
 from conf.errors import UserError
 from conf.runs import write_json
 from conf.schema import StudentConfig
+
+if TYPE_CHECKING:
+    from torch import nn
+    from transformers import PreTrainedConfig, PreTrainedTokenizerBase, ProcessorMixin
 
 BASE = "base.json"
 PEFT = "base_model.model."

@@ -17,6 +17,7 @@ from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
 EXPORTS = ("bf16", "fp32", "adapter")
 FRAMES_AHEAD = ("named", "all", "none")
 ENGINES = ("loky", "ray")
+INDEXES = ("exact", "faiss")
 DTYPES = ("auto", "bfloat16", "float16", "float32")
 
 
@@ -255,9 +256,21 @@ class RetrieveCommand(CommandConfig):
     retriever's base."""
     batch: int = 64
     """Queries or frames that pass the model at once."""
+    index: str = "exact"
+    """exact holds every frame of the database against every query; faiss asks an approximate index
+    (extra `index`), for databases of millions, and says what that loses."""
+    probes: int = 16
+    """Lists that a query looks through in an approximate index, which has about as many as the
+    square root of the frames."""
+    seed: int = 0
+    """Of the scenes that are drawn for the intervals, and of the queries by which an approximate
+    index is held against exact ranks."""
 
     def check(self) -> list[str]:
-        return super().check() + too_small(self, "", {"batch": 1})
+        problems = super().check() + too_small(self, "", {"batch": 1, "probes": 1})
+        if self.index not in INDEXES:
+            problems.append(f"index={self.index}: the options are exact and faiss")
+        return problems
 
 
 @dataclass

@@ -120,16 +120,21 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
     metrics = retrieve.main.__wrapped__(ranked, run)
     finish(run, metrics)
     rows = json.loads((run.folder / "report.json").read_text())["rows"]
-    assert [r["width"] for r in rows] == [64, 32, 64, 32]
+    groups = 1 + len({q.builder for q in micro_store.standard_test()})
+    assert [r["width"] for r in rows] == [64, 32] * 2 * groups
     # This "trained" one was saved untrained: both must rank alike.
-    for trained, untrained in zip(rows[:2], rows[2:], strict=True):
-        assert trained["mrr"] == pytest.approx(untrained["mrr"], rel=0.05)
+    for trained, untrained in zip(rows[: 2 * groups], rows[2 * groups :], strict=True):
+        assert trained["mrr"]["value"] == pytest.approx(untrained["mrr"]["value"], rel=0.05)
+        assert trained["builder"] == untrained["builder"]
         assert trained["frames"] == len(micro_store.database())
+    assert metrics["recall@10"] == rows[0]["recall_10"]["value"]
+    assert set(metrics) == {"recall@1", "recall@10", "recall@50", "mrr", "median_rank"}
 
     page = run_in(runs, "report")
     report.main.__wrapped__(ReportCommand(checkpoints=str(runs)), page)
     text = (page.folder / "report.txt").read_text()
     assert "sft/run answer loss" in text
+    assert "untrained small" in text
     assert (page.folder / "report.png").stat().st_size > 10_000
 
 
@@ -172,6 +177,14 @@ def test_a_torn_model_is_named(runs, tmp_path) -> None:
 
 def test_nothing_to_report_says_what_to_run_first(tmp_path) -> None:
     with pytest.raises(UserError, match=r"evaluation\.select"):
+        report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path)), Run("x", tmp_path))
+
+
+def test_a_report_of_another_version_is_named(tmp_path) -> None:
+    run = run_in(tmp_path, "retrieve")
+    finish(run, {})
+    (run.folder / "report.json").write_text('{"rows": [{"name": "old", "mrr": 0.5}]}')
+    with pytest.raises(UserError, match="damaged or of another version: delete"):
         report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path)), Run("x", tmp_path))
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from evaluation.metrics import (
+    SceneBootstrap,
     accuracy_by,
     accuracy_table,
     bootstrap_by_scene,
@@ -204,3 +205,20 @@ def test_bootstrap_repeats_and_keeps_rows_together():
 def test_bootstrap_of_nothing_is_refused():
     with pytest.raises(ValueError, match="values for"):
         bootstrap_by_scene([], [], np.mean, seed=0)
+
+
+@pytest.mark.parametrize("items", [1, 2, 40, 401])
+def test_many_measures_at_once_draw_what_one_does(items):
+    rng = np.random.default_rng(items)
+    scenes = [f"scene {k}" for k in rng.integers(max(1, items // 5), size=items)]
+    values = np.round(rng.random(items), 2)
+    once = SceneBootstrap(scenes, seed=7, resamples=300)
+    for found, statistic in ((once.mean(values), np.mean), (once.median(values), np.median)):
+        drawn = bootstrap_by_scene(values, scenes, statistic, seed=7, resamples=300)
+        assert found == pytest.approx(drawn, abs=1e-12)
+        assert found[0] <= statistic(values) <= found[1]
+
+
+def test_many_measures_of_nothing_are_refused():
+    with pytest.raises(ValueError, match="no items"):
+        SceneBootstrap([], seed=0)

@@ -4,18 +4,30 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from data.records import FrameRef, RetrievalQuery
 from evaluation import paper
 from evaluation.figures import (
+    builders_figure,
     item_figure,
     retrieval_figure,
     selection_figure,
 )
-from evaluation.metrics import accuracy_table, rank_metrics
+from evaluation.measures import recall_curves
+from evaluation.measures import retrieval_rows as retrieval_rows_of
+from evaluation.metrics import (
+    accuracy_table,
+    bootstrap_by_scene,
+    metrics_from_counts,
+    query_measures,
+)
+from evaluation.ranking import Ranks
 from evaluation.tables import (
     RECALLS,
     UNTRAINED,
     RetrievalRow,
     SelectionRow,
+    builder_tables,
+    index_table,
     retrieval_table,
     selection_table,
 )
@@ -34,15 +46,89 @@ def selection_rows() -> list[SelectionRow]:
     ]
 
 
+SCENES = 15
+
+
 @pytest.fixture(scope="module")
-def retrieval_rows() -> list[RetrievalRow]:
-    scores, gold = np.random.default_rng(0).random((20, 10_000)), np.arange(20)
-    metrics = rank_metrics(scores, gold, RECALLS)
+def queries() -> list[RetrievalQuery]:
+    """Four a scene, of builders 1 to 6 in turn."""
     return [
-        RetrievalRow.of("tiny", name, width, metrics, 20, 10_000)
-        for name in ("contrastive", UNTRAINED)
-        for width in (64, 4096, 256)
+        RetrievalQuery(
+            f"q{k}", "test", "future", k % 6 + 1, "time", "Which?", f"scene-{k % SCENES}", 0, 50,
+            FrameRef("scene", k), (),
+        )
+        for k in range(4 * SCENES)
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def ranks(queries) -> Ranks:
+    rng = np.random.default_rng(0)
+    shape = (3, len(queries))
+    greater = np.floor(10 ** rng.uniform(0, 3.5, shape)).astype(int) - 1
+    tied = rng.integers(3, size=shape) * (rng.random(shape) < 0.2)
+    return Ranks((4096, 256, 64), greater, tied, rng.random(shape) > 0.05, 10_000)
+
+
+@pytest.fixture(scope="module")
+def retrieval_rows(ranks, queries) -> list[RetrievalRow]:
+    names = ("contrastive", UNTRAINED)
+    return [row for n in names for row in retrieval_rows_of("tiny", n, ranks, queries, seed=0)]
+
+
+def test_rows_are_the_metrics_of_their_queries_with_an_interval_around(ranks, queries):
+    rows = retrieval_rows_of("tiny", "one", ranks, queries, seed=3)
+    assert [(r.builder, r.width) for r in rows] == [
+        (builder, width) for builder in (None, 1, 2, 3, 4, 5, 6) for width in ranks.widths
     ]
+    for row in rows:
+        of = [k for k, q in enumerate(queries) if row.builder in (None, q.builder)]
+        k = ranks.widths.index(row.width)
+        counts = (ranks.greater[k, of], ranks.tied[k, of], ranks.found[k, of])
+        metrics = metrics_from_counts(*counts, 10_000, RECALLS)
+        assert {name: found.value for name, found in row.measures.items()} == metrics
+        assert (row.queries, row.frames) == (len(of), 10_000)
+        for found in row.measures.values():
+            assert found.low <= found.value <= found.high
+            assert found.n == len(of)
+    # As `bootstrap_by_scene` draws them.
+    each = query_measures(ranks.greater[1], ranks.tied[1], ranks.found[1], 10_000, RECALLS)
+    scenes = [q.scene_id for q in queries]
+    for name, statistic in (("mrr", np.mean), ("median_rank", np.median), ("recall@10", np.mean)):
+        found = rows[1].measures[name]
+        drawn = bootstrap_by_scene(each[name], scenes, statistic, seed=3)
+        assert (found.low, found.high) == pytest.approx(drawn)
+    assert rows == retrieval_rows_of("tiny", "one", ranks, queries, seed=3)
+    assert rows != retrieval_rows_of("tiny", "one", ranks, queries, seed=4)
+
+
+def test_curves_rise_to_all_that_was_found(ranks, queries):
+    curves = recall_curves("one", ranks, queries)
+    assert [c["builder"] for c in curves] == [None, 1, 2, 3, 4, 5, 6]
+    for curve in curves:
+        assert (curve["ks"][0], curve["ks"][-1]) == (1, 10_000)
+        assert curve["recalls"] == sorted(curve["recalls"])
+    assert curves[0]["recalls"][-1] == pytest.approx(ranks.found[0].mean())
+    rows = retrieval_rows_of("tiny", "one", ranks, queries, seed=0)
+    assert curves[0]["recalls"][0] == pytest.approx(rows[0].recall_1.value)
+
+
+def test_builder_tables_show_every_width_of_every_builder(retrieval_rows):
+    trained, untrained = builder_tables(retrieval_rows)
+    assert "contrastive by builder" in trained
+    assert f"{UNTRAINED} by builder" in untrained
+    for builder in range(1, 7):
+        lines = [line for line in trained.splitlines() if line.startswith(f"builder {builder} ")]
+        assert [line.split()[2] for line in lines] == ["4096", "256", "64"]
+        assert all(line.count("[") == 6 for line in lines)
+
+
+def test_an_index_stands_beside_its_size_and_time():
+    told = {"name": "one (faiss)", "width": 64, "bytes": 3 << 20, "seconds": 0.5}
+    table = index_table([told | {"recall@1": 0.981, "recall@10": 1.0, "recall@50": 0.5}])
+    assert table.splitlines()[2].split() == [
+        "one", "(faiss)", "64", "98.1", "100.0", "50.0", "3.0", "0.50",
+    ]  # fmt: skip
 
 
 def test_selection_table(selection_rows):
@@ -66,13 +152,15 @@ def test_columns_are_aligned(selection_rows, retrieval_rows):
     )
     retrieval = retrieval_table(retrieval_rows).splitlines()
     edge = retrieval[0].index("MRR") + len("MRR")
-    assert all(line[edge - 5 : edge - 3] == "0." for line in retrieval if line[0] not in "-pR")
+    own = [line for line in retrieval if line[0] not in "-pRI "]
+    assert len(own) == 10
+    assert all(line[edge - 5 : edge - 3] == "0." for line in own)
 
 
 def test_retrieval_table_sets_the_untrained_row_beside_each_width(retrieval_rows):
     lines = retrieval_table(retrieval_rows).splitlines()
     assert max(map(len, lines)) <= 100
-    assert [line.split()[:2] for line in lines[2:8]] == [
+    assert [line.split()[:2] for line in lines[2:14:2]] == [
         [name, str(width)] for width in (4096, 256, 64) for name in (UNTRAINED, "contrastive")
     ]
 
@@ -80,14 +168,17 @@ def test_retrieval_table_sets_the_untrained_row_beside_each_width(retrieval_rows
 def test_rows_are_json(selection_rows, retrieval_rows):
     for row in (*selection_rows, *retrieval_rows):
         assert json.loads(json.dumps(row.to_dict())) == row.to_dict()
+        assert type(row).from_dict(row.to_dict()) == row
     assert selection_rows[0].to_dict()["families"]["time"]["n"] == 30
 
 
-def test_figures_are_written(selection_rows, retrieval_rows, tmp_path):
+def test_figures_are_written(selection_rows, retrieval_rows, ranks, queries, tmp_path):
     images = [Image.new("RGB", (48, 32), (i * 20, 90, 90)) for i in range(12)]
     question = "Which image best matches the next scene state?"
     selection_figure(selection_rows, tmp_path / "selection.png")
     retrieval_figure(retrieval_rows, tmp_path / "retrieval.png")
+    curves = recall_curves("contrastive", ranks, queries)
+    builders_figure(retrieval_rows, curves, tmp_path / "builders.png")
     for chosen in ("B", "C", None):
         path = tmp_path / f"item_{chosen}.png"
         item_figure(images, images[:4], "ABCD", "B", chosen, question, path)
@@ -100,7 +191,7 @@ def test_figures_are_written(selection_rows, retrieval_rows, tmp_path):
     for path in tmp_path.iterdir():
         with Image.open(path) as image:
             assert image.width > 800
-    assert len(list(tmp_path.iterdir())) == 7
+    assert len(list(tmp_path.iterdir())) == 8
 
 
 def test_the_frame_says_what_was_right(tmp_path):

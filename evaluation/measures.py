@@ -1,0 +1,56 @@
+"""From ranks to rows: every measure of a retriever, by builder and width, with its interval."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from data.records import RetrievalQuery
+from evaluation.metrics import Interval, SceneBootstrap, expected_hits, query_measures, summary
+from evaluation.ranking import Ranks
+from evaluation.tables import RECALLS, RetrievalRow
+
+
+def retrieval_rows(
+    benchmark: str, name: str, ranks: Ranks, queries: Sequence[RetrievalQuery], seed: int
+) -> list[RetrievalRow]:
+    """A row a width, widest first, over all queries, and then as many of each builder's. The scenes
+    of the intervals are drawn by `seed`."""
+    rows = []
+    for builder, of in by_builder(queries).items():
+        scenes = SceneBootstrap([queries[k].scene_id for k in of], seed)
+        for k, width in enumerate(ranks.widths):
+            counts = (ranks.greater[k, of], ranks.tied[k, of], ranks.found[k, of])
+            each = query_measures(*counts, ranks.frames, RECALLS)
+            found = [_measured(measure, values, scenes) for measure, values in each.items()]
+            sizes = (len(of), ranks.frames)
+            rows.append(RetrievalRow(benchmark, name, width, builder, *found, *sizes))
+    return rows
+
+
+def _measured(measure: str, values: np.ndarray, scenes: SceneBootstrap) -> Interval:
+    middle = scenes.median(values) if measure == "median_rank" else scenes.mean(values)
+    return Interval(float(summary(measure)(values)), *map(float, middle), len(values))
+
+
+def by_builder(queries: Sequence[RetrievalQuery]) -> dict[int | None, np.ndarray]:
+    """The numbers of all queries, under None, and of each builder's."""
+    of = np.array([q.builder or 0 for q in queries])
+    every = {None: np.arange(len(queries))}
+    return every | {int(b): np.flatnonzero(of == b) for b in np.unique(of) if b}
+
+
+def recall_curves(
+    name: str, ranks: Ranks, queries: Sequence[RetrievalQuery]
+) -> list[dict[str, Any]]:
+    """Recall over k at the widest width, of all queries and of each builder's: `name`, `builder`,
+    `ks` up to the whole database, and `recalls`."""
+    ks = sorted({round(k) for k in np.geomspace(1, ranks.frames, 60)})
+    curves = []
+    for builder, of in by_builder(queries).items():
+        counts = (ranks.greater[0, of], ranks.tied[0, of], ranks.found[0, of])
+        recalls = [float(expected_hits(*counts, k).mean()) for k in ks]
+        curves.append({"name": name, "builder": builder, "ks": ks, "recalls": recalls})
+    return curves

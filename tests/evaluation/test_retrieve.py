@@ -1,0 +1,197 @@
+"""`evaluation.retrieve` on a small retriever: its numbers, what it keeps, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from safetensors.torch import load_file, save_file
+from sentence_transformers import SentenceTransformer
+
+from conf.entry import Run
+from conf.errors import UserError
+from conf.schema import (
+    ArchitectureConfig,
+    ContrastiveCommand,
+    LoraConfig,
+    RetrieveCommand,
+    RetrieverConfig,
+)
+from data.frames import Frames
+from data.store import open_store
+from evaluation import retrieve
+from evaluation.embedding import EMBEDDINGS, embed_frames, embed_queries, embedders, frame_name
+from evaluation.metrics import rank_metrics
+from train import retriever
+
+CFG = RetrieverConfig(
+    name="small", widths=[64, 32], quantization="none", lora=LoraConfig(rank=0), image_size=96,
+    architecture=ArchitectureConfig(
+        hidden=64, layers=1, heads=2, kv_heads=2, feed_forward=64,
+        vision_hidden=64, vision_layers=1, vision_heads=2, vision_feed_forward=64,
+    ),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory, micro, micro_store) -> Path:
+    """A finished run of the trainer, as it leaves it."""
+    folder = tmp_path_factory.mktemp("contrastive") / "run"
+    texts = retriever.corpus(micro_store.retrieval("train"), CFG)
+    built = retriever.load_retriever(CFG, "fp32", texts, folder / "untrained")
+    for weight in built.parameters():
+        weight.data += 0.01
+    built.save_pretrained(str(folder / "retriever"), create_model_card=False)
+    settings = ContrastiveCommand(benchmark=micro, retriever=CFG)
+    OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
+    (folder / "metrics.json").write_text("{}")
+    return folder
+
+
+@pytest.fixture
+def world(tmp_path, saved, micro, micro_store) -> Callable[..., dict]:
+    """Measures a copy of the run on a copy of the store; the report."""
+    shutil.copytree(saved, tmp_path / "run")
+    shutil.copytree(micro_store.folder, tmp_path / "store" / "micro")
+    shutil.rmtree(tmp_path / "store" / "micro" / EMBEDDINGS, ignore_errors=True)
+    unused = RetrieverConfig(name="unused", model="unused")
+
+    def measure(name: str = "one", **settings) -> dict:
+        run = Run(name, tmp_path / name)
+        run.folder.mkdir(exist_ok=True)
+        cfg = RetrieveCommand(
+            benchmark=micro, retriever=unused, store=str(tmp_path / "store"), batch=16,
+            model=str(tmp_path / "run"),
+        )  # fmt: skip
+        retrieve.main.__wrapped__(replace(cfg, **settings), run)
+        return json.loads((run.folder / "report.json").read_text())
+
+    return measure
+
+
+def edit_config(folder: Path, **changes: object) -> None:
+    cfg = OmegaConf.load(folder / "config.yaml")
+    for key, value in changes.items():
+        OmegaConf.update(cfg, key.replace("__", "."), value)
+    OmegaConf.save(cfg, folder / "config.yaml")
+
+
+@pytest.mark.slow
+def test_it_is_measured_once_and_read_back(world, tmp_path, micro_store) -> None:
+    first = world()
+    queries, database = micro_store.standard_test(), micro_store.database()
+    frames, names = Frames(micro_store, 96), [frame_name(f) for f in database]
+    (trained, _) = embedders(tmp_path / "run", CFG, "bf16", micro_store, tmp_path)
+    store = open_store(tmp_path / "store" / "micro")
+    asked = embed_queries(trained, queries, store, frames, 16).rows([q.query_id for q in queries])
+    shown = embed_frames(trained, database, store, frames, 16).rows(names)
+    # What was kept is what the saved model gives anyone, and the report is the plain definition's
+    # but for frames that fp32 hardly tells apart: an untrained model takes all for the same.
+    model = SentenceTransformer(str(tmp_path / "run" / "retriever"), device="cpu")
+    plain = [retriever.query_input(q, frames, CFG) for q in queries]
+    np.testing.assert_allclose(model.encode(plain, prompt_name="query"), asked, atol=1e-5)
+    plain = [retriever.frame_input(f, frames) for f in database]
+    np.testing.assert_allclose(model.encode(plain, prompt_name="document"), shown, atol=1e-5)
+    gold = np.array([database.index(q.target) for q in queries])
+    for row in first["rows"][:2]:
+        a, b = (e[:, : row["width"]].astype(float) for e in (asked, shown))
+        scores = a @ b.T / np.linalg.norm(a, axis=1)[:, None] / np.linalg.norm(b, axis=1)
+        assert row["mrr"]["value"] == pytest.approx(
+            rank_metrics(scores, gold, [1])["mrr"], rel=0.01
+        )
+    for picture in ("retrieval.png", "builders.png"):
+        assert (tmp_path / "one" / picture).stat().st_size > 10_000
+    text = (tmp_path / "one" / "report.txt").read_text()
+    for builder in {q.builder for q in queries}:
+        assert f"builder {builder} " in text
+
+    # A second evaluation loads no model: there is none any more that could be loaded.
+    (tmp_path / "run" / "retriever" / "config.json").unlink()
+    (tmp_path / "run" / "untrained" / "config.json").unlink()
+    assert world("two") == first
+
+    # Other weights, precision or size of frames is another model's.
+    edit_config(tmp_path / "run", train__precision="fp32")
+    with pytest.raises(UserError, match="is damaged and cannot be read"):
+        world("three")
+
+
+@pytest.mark.slow
+def test_a_torn_cache_is_made_again_with_the_same_numbers(world, tmp_path, caplog) -> None:
+    first = world()
+    kept = tmp_path / "store" / "micro" / EMBEDDINGS
+    part = min(kept.glob("query-*/00000.npy"))
+    part.write_bytes(part.read_bytes()[:-9])
+    assert world("two") == first
+    assert "00000.npy is damaged" in caplog.text
+
+
+def test_an_index_gives_its_recall_against_exact(world, tmp_path) -> None:
+    found = world(index="faiss", probes=1000)
+    assert [i["width"] for i in found["indexes"]] == [64, 32, 64, 32]
+    assert all(i["recall@50"] > 0.9 for i in found["indexes"])
+    assert found["rows"][0]["name"] == "run (faiss)"
+    assert "held against exact" in (tmp_path / "one" / "report.txt").read_text()
+
+
+def test_a_width_that_the_model_lacks_is_refused(world, tmp_path) -> None:
+    edit_config(tmp_path / "run", retriever__widths=[4096, 64, 32])
+    with pytest.raises(
+        UserError, match=r"asks for 4096, .* 64 entries.*retriever\.widths=\[64,32\]"
+    ):
+        world()
+
+
+def test_another_pooling_is_refused(world, tmp_path) -> None:
+    config = tmp_path / "run" / "retriever" / "1_Pooling" / "config.json"
+    config.write_text(json.dumps({**json.loads(config.read_text()), "pooling_mode": "mean"}))
+    with pytest.raises(UserError, match="was saved with mean pooling"):
+        world()
+    modules = tmp_path / "run" / "retriever" / "modules.json"
+    modules.write_text(json.dumps(json.loads(modules.read_text())[:1]))
+    with pytest.raises(UserError, match="was saved without pooling"):
+        world()
+    modules.write_text("[")
+    with pytest.raises(UserError, match="retriever is damaged"):
+        world()
+
+
+def test_broken_weights_are_told_by_a_query_that_shows_them(world, tmp_path, micro_store) -> None:
+    path = tmp_path / "run" / "retriever" / "model.safetensors"
+    weights = load_file(path)
+    name = next(k for k in weights if k.endswith("language_model.norm.weight"))
+    weights[name][3] = float("nan")
+    save_file(weights, path, metadata={"format": "pt"})
+    others = len(micro_store.standard_test()) - 1
+    with pytest.raises(UserError, match=rf"of query \S+, and of {others} more is not finite"):
+        world()
+
+
+def test_a_kept_embedding_depends_on_what_is_shown(micro_store, saved, tmp_path) -> None:
+    store = open_store(micro_store.folder)
+    (embedder, untrained) = embedders(saved, CFG, "fp32", store, tmp_path)
+    changes = [
+        {},
+        {"image_size": 64},
+        {"frame_instruction": "Describe."},
+    ]
+    database = store.database()[:2]
+    folders = set()
+    for preset in [replace(CFG, **change) for change in changes]:
+        again = replace(embedder, preset=preset)
+        kept = embed_frames(again, database, store, Frames(store, preset.image_size), 2)
+        assert kept.rows([frame_name(f) for f in database]).shape == (2, 64)
+        folders.add(kept.folder)
+    folders.add(embed_frames(untrained, database, store, Frames(store, 96), 2).folder)
+    bf16 = replace(embedder, precision="bf16")
+    folders.add(embed_frames(bf16, database, store, Frames(store, 96), 2).folder)
+    assert len(folders) == 5
+    # Neither the number of a query's frames nor its instruction changes a frame's embedding.
+    asked = replace(embedder, preset=replace(CFG, frames=6, query_instruction="Find."))
+    assert embed_frames(asked, database, store, Frames(store, 96), 2).folder in folders
