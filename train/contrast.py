@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from transformers import set_seed
 from conf.entry import Run
 from conf.errors import UserError
 from conf.runs import rank
-from conf.schema import ContrastiveCommand
+from conf.schema import ContrastiveCommand, ContrastiveTrainConfig
 from data.frames import Frames
 from data.records import RetrievalQuery
 from data.store import Store
@@ -30,6 +31,7 @@ from train import checkpoints, compatible, loop, ranks, retriever, room
 from train.audit import audit_retriever
 from train.batches import Batch, Composed, batch_of
 from train.inputs import Inputs
+from train.mining import HardNegatives
 from train.negatives import Weighing
 from train.ranking import HeldOutRanking
 from train.ranking_loss import RankingLoss
@@ -62,13 +64,17 @@ def train_retriever(
     log.info(audit_retriever(model, cfg.retriever, longest, frames))
 
     checkpoint = checkpoints.newest_checkpoint(run.folder)
+    inputs = Inputs(model, frames, cfg.retriever, cfg.train.precision)
+    negatives = HardNegatives(training, cfg.train, model, inputs, store, run.folder)
     trainer = RetrieverTrainer(
         model=model,
         args=arguments(cfg, run, checkpoint, share),
         train_dataset=Dataset.from_list([{"query": k} for k in range(len(training))]),
         evaluator=HeldOutRanking(validation, frames, cfg.retriever, cfg.train.mini_batch),
-        loss=loss_of(cfg, model, frames, store),
-        data_collator=ByName(cfg, training, model),
+        loss=loss_of(cfg, model, inputs, store),
+        data_collator=ByName(preprocess_fn=model.preprocess),
+        callbacks=[negatives],
+        batch_of=partial(named, cfg.train, training, negatives),
         sampler=Composed(
             training,
             cfg.train.hard_negatives,
@@ -113,13 +119,15 @@ def split(
 
 
 def loss_of(
-    cfg: ContrastiveCommand, model: SentenceTransformer, frames: Frames, store: Store
+    cfg: ContrastiveCommand, model: SentenceTransformer, inputs: Inputs, store: Store
 ) -> MatryoshkaLoss:
     train = cfg.train
+    # What is mined for one query may be another's target.
+    identical = train.mask_identical or train.mine_every > 0
     ranking = RankingLoss(
         model,
-        Inputs(model, frames, cfg.retriever, train.precision),
-        Weighing(store, train.mask_identical, train.mask_near, train.hard_weight),
+        inputs,
+        Weighing(store, identical, train.mask_near, train.hard_weight),
         scale=train.scale,
         mini_batch=train.mini_batch,
         mini_batch_tokens=train.mini_batch_tokens,
@@ -141,35 +149,41 @@ def arguments(
     )
 
 
+def named(
+    train: ContrastiveTrainConfig,
+    queries: Sequence[RetrievalQuery],
+    negatives: HardNegatives,
+    places: Sequence[int],
+) -> Batch:
+    """The batch of the queries at these places, with the hard negatives that are theirs now."""
+    asked = [negatives.given(queries[k]) for k in places]
+    return batch_of(asked, train.hard_negatives, train.distinct_frames, train.shared_prefixes)
+
+
 class ByName(SentenceTransformerDataCollator):
-    """Makes a `Batch` of the places of queries, under the one name that the trainer looks for."""
+    """Leaves a batch the places of its queries: one that is made ahead may come after a mining."""
 
-    def __init__(
-        self, cfg: ContrastiveCommand, queries: Sequence[RetrievalQuery], model: SentenceTransformer
-    ) -> None:
-        super().__init__(preprocess_fn=model.preprocess)
-        self._train = cfg.train
-        self._queries = queries
-
-    def __call__(self, rows: list[dict[str, int]]) -> dict[str, Batch]:
-        train = self._train
-        queries = [self._queries[row["query"]] for row in rows]
-        return {
-            "batch": batch_of(
-                queries, train.hard_negatives, train.distinct_frames, train.shared_prefixes
-            )
-        }
+    def __call__(self, rows: list[dict[str, int]]) -> dict[str, list[int]]:
+        return {"places": [row["query"] for row in rows]}
 
 
 class RetrieverTrainer(SentenceTransformerTrainer):
-    """The library's trainer over batches that hold names, composed by a sampler of ours."""
+    """The library's trainer over batches of places, composed by a sampler of ours and named by
+    `batch_of` when they are taken."""
 
-    def __init__(self, *args: Any, sampler: Composed, **settings: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        sampler: Composed,
+        batch_of: Callable[[Sequence[int]], Batch],
+        **settings: Any,
+    ) -> None:
         self._sampler = sampler
+        self._batch_of = batch_of
         super().__init__(*args, **settings)
 
     def get_batch_sampler(self, *_: Any, **__: Any) -> Composed:
         return self._sampler
 
-    def collect_features(self, inputs: dict[str, Batch]) -> tuple[list[Batch], None]:
-        return [inputs["batch"]], None
+    def collect_features(self, inputs: dict[str, list[int]]) -> tuple[list[Batch], None]:
+        return [self._batch_of(inputs["places"])], None

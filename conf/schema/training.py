@@ -153,6 +153,11 @@ class ContrastiveTrainConfig(TrainConfig):
     """Tokens that pass the model at once, in place of train.mini_batch."""
     hard_negatives: int = 1
     """Same-scene wrong-time frames a query."""
+    mine_every: int = 0
+    """Steps after which hard negatives are mined anew: the wrong frames that the retriever then
+    ranks highest. 0 keeps the benchmark's."""
+    mine_margin: float = 24.0
+    """Mined frames of the target's scene are displaced by so many px (at 336 x 336) from it."""
     scale: float = 50.0
     """Inverse temperature of the cosine similarities."""
     distinct_frames: bool = True
@@ -186,6 +191,8 @@ class ContrastiveTrainConfig(TrainConfig):
                 "scene_queries": 1,
                 "mini_batch_tokens": 1,
                 "mask_near": 0,
+                "mine_every": 0,
+                "mine_margin": 0,
             },
         )
         for name in ("scale", "hard_weight"):
@@ -199,6 +206,11 @@ class ContrastiveTrainConfig(TrainConfig):
             problems.append(
                 f"train.batch={self.batch} with train.hard_negatives=0 leaves no negatives: give a "
                 "batch of 2 or more, or hard negatives"
+            )
+        if self.mine_every and not self.hard_negatives:
+            problems.append(
+                f"train.mine_every={self.mine_every} with train.hard_negatives=0 mines nothing: "
+                "give hard negatives, or leave train.mine_every=0"
             )
         if not 1 <= self.mini_batch <= self.batch:
             problems.append(
