@@ -47,3 +47,17 @@ def accumulation(batch: int, micro_batch: int) -> int:
             f"{near}, or start another number of ranks"
         )
     return batch // at_once
+
+
+def share(batch: int) -> int:
+    """A rank's part of a batch over all ranks.
+
+    Raises:
+        UserError: they cannot have equal parts.
+    """
+    if batch % ranks():
+        raise UserError(
+            f"train.batch={batch} cannot be split over {ranks()} ranks: set it to a multiple of "
+            f"{ranks()}, or start another number of ranks"
+        )
+    return batch // ranks()

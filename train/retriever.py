@@ -7,15 +7,12 @@ saved is a plain `SentenceTransformer`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from sentence_transformers import SentenceTransformer
-from sentence_transformers.sentence_transformer.data_collator import (
-    SentenceTransformerDataCollator,
-)
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
 from transformers import AutoConfig
 
@@ -33,6 +30,7 @@ from train.backbone import (
     pin_sizes,
 )
 from train.compatible import check_processor, check_tower
+from train.ranks import from_main
 from train.tiny import build_model, build_processor
 
 PROCESSING = {
@@ -55,10 +53,7 @@ def load_retriever(
     """
     source = cfg.model
     if cfg.architecture is not None:
-        processor = build_processor(corpus, cfg.architecture.vocabulary, cfg.image_size)
-        build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
-        processor.save_pretrained(folder)
-        source = str(folder)
+        source = from_main(partial(built, cfg, corpus, folder))
     check_reachable("retriever", source)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     try:
@@ -97,6 +92,15 @@ def load_retriever(
             )
         )
     return model
+
+
+def built(cfg: RetrieverConfig, corpus: list[str], folder: Path) -> str:
+    """The folder of a base that is built from a seed and written there."""
+    assert cfg.architecture is not None
+    processor = build_processor(corpus, cfg.architecture.vocabulary, cfg.image_size)
+    build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
+    processor.save_pretrained(folder)
+    return str(folder)
 
 
 def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> SentenceTransformer:
@@ -153,38 +157,3 @@ def query_input(query: RetrievalQuery, frames: Frames, cfg: RetrieverConfig) -> 
 def frame_input(frame: FrameRef, frames: Frames) -> Any:
     """A database frame as sentence-transformers takes it: an image."""
     return frames.image(frame.scene_id, frame.frame)
-
-
-class LateFrames(SentenceTransformerDataCollator):
-    """The library's collator over rows that name queries and frames; pixels are read only when a
-    batch is made."""
-
-    def resolve(self, queries: list[RetrievalQuery], frames: Frames, cfg: RetrieverConfig) -> None:
-        """Say what the rows' names stand for."""
-        self._queries = {q.query_id: q for q in queries}
-        self._frames, self._cfg = frames, cfg
-
-    def __call__(self, features: list[dict[str, str]]) -> dict[str, Any]:
-        return super().__call__([self._loaded(f) for f in features])
-
-    def _loaded(self, names: dict[str, str]) -> dict[str, Any]:
-        query = self._queries[names["query"]]
-        shown = [query.target, *query.hard_negatives]
-        columns = [column for column in names if column != "query"]
-        return {
-            "query": query_input(query, self._frames, self._cfg),
-            **{c: frame_input(f, self._frames) for c, f in zip(columns, shown, strict=False)},
-        }
-
-
-def row(query: RetrievalQuery, negatives: int) -> dict[str, str]:
-    """A query, its target and so many of its hard negatives, by name."""
-    shown = [query.target, *query.hard_negatives[:negatives]]
-    columns = ["target", *(f"negative_{k}" for k in range(negatives))]
-    names = [f"{f.scene_id}/{f.frame}" for f in shown]
-    return {"query": query.query_id, **dict(zip(columns, names, strict=True))}
-
-
-def column_prompts(cfg: RetrieverConfig, columns: Iterable[str]) -> dict[str, str]:
-    """The instruction of each of a row's columns."""
-    return dict.fromkeys(columns, cfg.frame_instruction) | {"query": cfg.query_instruction}

@@ -203,6 +203,17 @@ class ContrastiveCommand(CommandConfig):
                 f"train.hard_negatives={self.train.hard_negatives} is more than "
                 f"benchmark.retrieval.hard_negatives={self.benchmark.retrieval.hard_negatives}"
             )
+        weights, widths = self.train.width_weights, self.retriever.widths
+        if weights is not None and (len(weights) != len(widths) or min(weights, default=0) < 0):
+            problems.append(
+                f"train.width_weights={weights} must give each of the {len(widths)} "
+                f"retriever.widths={list(widths)} a weight of 0 or more"
+            )
+        if self.train.reuse_features and not self.retriever.lora.rank:
+            problems.append(
+                "train.reuse_features=true: without adapters the vision tower is trained, and what "
+                "it makes of a frame changes; give retriever.lora.rank above 0, or leave it false"
+            )
         return problems
 
 

@@ -140,22 +140,78 @@ class SftTrainConfig(TrainConfig):
 @dataclass
 class ContrastiveTrainConfig(TrainConfig):
     batch: int = 512
-    """Queries a step; each is contrasted with every target and hard negative of the batch."""
+    """Queries a step, over all ranks; each is contrasted with every target and hard negative of
+    the batch."""
+    batches: str = "random"
+    """How a batch is composed: random; scenes, where some queries of a scene stand together, so
+    that it has many frames of one scene; or spread, with as few of a scene as can be."""
+    scene_queries: int = 4
+    """Queries of a scene that stand together in train.batches=scenes."""
     mini_batch: int = 8
-    """Samples that pass the model at once in the cached loss; moves memory, not the gradient."""
+    """Prefixes or frames that pass the model at once; moves memory, not the gradient."""
+    mini_batch_tokens: int | None = None
+    """Tokens that pass the model at once, in place of train.mini_batch."""
     hard_negatives: int = 1
     """Same-scene wrong-time frames a query."""
+    mine_every: int = 0
+    """Steps after which hard negatives are mined anew: the wrong frames that the retriever then
+    ranks highest. 0 keeps the benchmark's."""
+    mine_margin: float = 24.0
+    """Mined frames of the target's scene are displaced by so many px (at 336 x 336) from it."""
     scale: float = 50.0
     """Inverse temperature of the cosine similarities."""
+    distinct_frames: bool = True
+    """Whether a frame that several queries of a batch name is embedded once; moves no gradient."""
+    shared_prefixes: bool = True
+    """Whether a prefix that several queries of a batch share passes once; moves no gradient."""
+    reuse_features: bool = False
+    """Whether the frozen tower's outputs are kept between the two passes of a step, in memory that
+    grows with the batch (about 30 MB a query of an 8B model); moves no gradient."""
+    mask_identical: bool = False
+    """Whether the frame of a query's target, where it is shown for another query too, is left out
+    of its negatives. This changes the objective."""
+    mask_near: float = 0.0
+    """Frames of the target's scene that are displaced by less than so many px (at 336 x 336) from
+    it are left out of a query's negatives. Above 0 this changes the objective."""
+    hard_weight: float = 1.0
+    """How many other negatives a query's own hard negatives count for. Other than 1 this changes
+    the objective."""
+    width_weights: list[float] | None = None
+    """Weight of the loss at each of retriever.widths; null weighs all alike."""
     validation_queries: int = 128
     """Queries of held-out training scenes that measure the run."""
 
     def check(self) -> list[str]:
         problems = super().check() + too_small(
-            self, "train.", {"hard_negatives": 0, "validation_queries": 1}
+            self,
+            "train.",
+            {
+                "hard_negatives": 0,
+                "validation_queries": 1,
+                "scene_queries": 1,
+                "mini_batch_tokens": 1,
+                "mask_near": 0,
+                "mine_every": 0,
+                "mine_margin": 0,
+            },
         )
-        if self.scale <= 0:
-            problems.append(f"train.scale={self.scale} must be above 0")
+        for name in ("scale", "hard_weight"):
+            if getattr(self, name) <= 0:
+                problems.append(f"train.{name}={getattr(self, name)} must be above 0")
+        if self.batches not in ("random", "scenes", "spread"):
+            problems.append(
+                f"train.batches={self.batches}: the options are random, scenes and spread"
+            )
+        if self.batch < 2 and not self.hard_negatives:
+            problems.append(
+                f"train.batch={self.batch} with train.hard_negatives=0 leaves no negatives: give a "
+                "batch of 2 or more, or hard negatives"
+            )
+        if self.mine_every and not self.hard_negatives:
+            problems.append(
+                f"train.mine_every={self.mine_every} with train.hard_negatives=0 mines nothing: "
+                "give hard negatives, or leave train.mine_every=0"
+            )
         if not 1 <= self.mini_batch <= self.batch:
             problems.append(
                 f"train.mini_batch={self.mini_batch} must lie between 1 and "

@@ -11,6 +11,8 @@ from transformers import PreTrainedModel, ProcessorMixin
 from conf.schema import (
     ArchitectureConfig,
     BenchmarkConfig,
+    ContrastiveCommand,
+    ContrastiveTrainConfig,
     LoraConfig,
     RetrieverConfig,
     SftCommand,
@@ -111,3 +113,21 @@ def few_steps(
         )
 
     return settings
+
+
+@pytest.fixture(scope="session")
+def contrastive_settings(
+    micro: BenchmarkConfig, micro_store: Store, retriever_cfg: RetrieverConfig
+) -> ContrastiveCommand:
+    """Settings of `train.contrastive` for a few steps of a small retriever."""
+    train = ContrastiveTrainConfig(
+        lr=1e-3, max_steps=4, batch=4, mini_batch=2, precision="fp32",
+        gradient_checkpointing=False, evaluations=2, validation_queries=4,
+    )  # fmt: skip
+    return ContrastiveCommand(
+        benchmark=micro,
+        store=str(micro_store.folder.parent),
+        workers=1,
+        retriever=retriever_cfg,
+        train=train,
+    )

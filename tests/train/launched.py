@@ -1,4 +1,4 @@
-"""What the tests of several ranks have `accelerate launch` start: train.sft, once for each of the
+"""What the tests of several ranks have `accelerate launch` start: a trainer, once for each of the
 runs that a file lists, over the benchmark that the file holds."""
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hydra.core.config_store import ConfigStore
 
 from conf.errors import UserError
 from conf.runs import rank
-from train import samples, sft, student
+from train import contrastive, samples, sft, student
 
 
 def let_cpus_share() -> None:
@@ -33,6 +33,8 @@ def let_cpus_share() -> None:
 
     AcceleratorState.__init__ = sharing
 
+
+TRAINERS = {"sft": sft.main, "contrastive": contrastive.main}
 
 make = samples.supervised_items
 
@@ -62,7 +64,7 @@ def main() -> None:
         if rank() == run["fails_on"]:
             student.token_mean = fail
         sys.argv[1:] = run["overrides"]
-        sft.main()
+        TRAINERS[run["trainer"]]()
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,8 +23,8 @@ from torch.utils.data import BatchSampler
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import SftCommand
-from train import loop, ranks, samples, sft
+from conf.schema import ContrastiveCommand, SftCommand
+from train import contrastive, loop, ranks, samples, sft
 from train.collate import IGNORED, Collator
 from train.conversation import selection_sample
 from train.loop import read_journal
@@ -59,6 +59,10 @@ def alone(settings: SftCommand, folder: Path, after: Path | None = None) -> Path
     return folder
 
 
+UNLESS = {"fsdp": False, "after": None, "fails_on": None}
+"""What launched.py does with a run, unless it is told."""
+
+
 def planned(settings: SftCommand, folder: Path, **changes: Any) -> dict[str, Any]:
     """What launched.py is told of a run."""
     student, train = settings.student, settings.train
@@ -72,8 +76,22 @@ def planned(settings: SftCommand, folder: Path, **changes: Any) -> dict[str, Any
         *(f"train.{key}={value}" for key, value in asdict(train).items()
           if key not in ("report_to", "best")),
     ]  # fmt: skip
-    unless = {"fsdp": False, "after": None, "fails_on": None}
-    return {**unless, "overrides": overrides, "folder": folder, **changes}
+    return {"trainer": "sft", **UNLESS, "overrides": overrides, "folder": folder, **changes}
+
+
+def ranking(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]:
+    """What launched.py is told of a retriever's run."""
+    retriever = settings.retriever
+    overrides = [
+        "retriever=tiny", "benchmark=micro", f"store={settings.store}", f"run={folder.name}",
+        f"checkpoints={folder.parents[1]}", "workers=1",
+        *(f"retriever.architecture.{key}={value}"
+          for key, value in asdict(retriever.architecture).items()),
+        f"retriever.image_size={retriever.image_size}", f"retriever.widths={retriever.widths}",
+        *(f"train.{key}={'null' if value is None else value}"
+          for key, value in asdict(settings.train).items() if key not in ("report_to", "best")),
+    ]  # fmt: skip
+    return {"trainer": "contrastive", **UNLESS, "overrides": overrides, "folder": folder}
 
 
 def launch(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -88,19 +106,23 @@ def launch(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 def same(one: Path, two: Path, step: int = -1) -> None:
-    """The journals after a step, but for shares of an epoch, which are counted in a rank's
-    micro-batches; and the weights."""
+    """The journals after a step, and the weights."""
+    same_journals(one, two, step)
+    same_weights(one, two)
+
+
+def same_journals(one: Path, two: Path, step: int = -1) -> None:
+    """But for shares of an epoch, which are counted in a rank's micro-batches."""
     journals = [
         [{k: v for k, v in r.items() if k != "epoch"} for r in read_journal(f) if r["step"] > step]
         for f in (one, two)
     ]
     for first, second in zip(*journals, strict=True):
         assert first == pytest.approx(second, rel=1e-5)
-    same_weights(one, two)
 
 
-def same_weights(one: Path, two: Path) -> None:
-    weights = [load_file(f / "student" / "adapter_model.safetensors") for f in (one, two)]
+def same_weights(one: Path, two: Path, name: str = "student/adapter_model.safetensors") -> None:
+    weights = [load_file(f / name) for f in (one, two)]
     assert weights[0].keys() == weights[1].keys()
     for name, weight in weights[0].items():
         torch.testing.assert_close(weight, weights[1][name], atol=1e-6, rtol=1e-5)
@@ -114,18 +136,26 @@ def said(ended: subprocess.CompletedProcess[str]) -> list[str]:
 
 
 @pytest.mark.slow
-def test_two_ranks_are_one_with_twice_the_accumulation(settings, few, tmp_path) -> None:
-    """With every rank holding the adapters, or by FSDP a part of them. So is a run that was killed,
-    and one that one rank began and two go on with, or the reverse. What goes wrong on one rank ends
-    both with one sentence."""
+def test_two_ranks_are_one(settings, contrastive_settings, few, tmp_path) -> None:
+    """A student's are one with twice the accumulation, a retriever's one with the whole batch; so
+    are a student's where FSDP gives each a part of the adapters, after a kill, and where one rank
+    began and two go on, or the reverse. What goes wrong on one rank ends both with one sentence.
+    """
     runs = tmp_path / "sft"
     one = alone(settings, runs / "one")
+    # Near frames are told by names of both ranks.
+    train = replace(contrastive_settings.train, mask_near=20.0, batches="scenes")
+    near_masked = replace(contrastive_settings, train=train)
+    whole = tmp_path / "contrastive" / "one"
+    whole.mkdir(parents=True)
+    contrastive.main.__wrapped__(near_masked, Run("one", whole))
     told = [
         planned(settings, runs / "two"),
         planned(settings, runs / "more", after=one / "checkpoint-2"),
         planned(settings, runs / "parts", fsdp=True),
         planned(settings, runs / "on", fsdp=True, after=runs / "parts" / "checkpoint-2"),
         planned(settings, runs / "done", fsdp=True, after=runs / "parts" / "checkpoint-4"),
+        ranking(near_masked, tmp_path / "contrastive" / "two"),
         planned(settings, runs / "lost", fails_on=1),
     ]
     file = tmp_path / "runs.json"
@@ -136,6 +166,8 @@ def test_two_ranks_are_one_with_twice_the_accumulation(settings, few, tmp_path) 
     assert ended.returncode == 1
     for name in ("two", "parts"):
         same(one, runs / name)
+    same_journals(whole, whole.with_name("two"))
+    same_weights(whole, whole.with_name("two"), "retriever/model.safetensors")
     for name in ("more", "on"):
         same(one, runs / name, step=2)
     same_weights(one, runs / "done")

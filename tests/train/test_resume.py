@@ -14,8 +14,6 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import (
-    ContrastiveCommand,
-    ContrastiveTrainConfig,
     SftCommand,
 )
 from train import contrastive, samples, sft
@@ -26,22 +24,9 @@ from train.planned import ByLength, Samples
 from train.sft_trainer import Epochs
 
 
-def common(micro, store) -> dict:
-    return {"benchmark": micro, "store": str(store.folder.parent), "workers": 1}
-
-
 @pytest.fixture
 def sft_settings(few_steps) -> SftCommand:
     return few_steps(batch=4, validation_items=4, generated_items=8, permute_candidates=True)
-
-
-@pytest.fixture
-def contrastive_settings(micro, micro_store, retriever_cfg) -> ContrastiveCommand:
-    train = ContrastiveTrainConfig(
-        lr=1e-3, max_steps=4, batch=4, mini_batch=2, precision="fp32",
-        gradient_checkpointing=False, evaluations=2, validation_queries=4,
-    )  # fmt: skip
-    return ContrastiveCommand(**common(micro, micro_store), retriever=retriever_cfg, train=train)
 
 
 def train_twice(main, settings, folder: Path, step: int = 2) -> tuple[Path, Path]:

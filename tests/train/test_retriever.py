@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from datasets import Dataset
 from sentence_transformers import SentenceTransformer
-from sentence_transformers.base.sampler import NoDuplicatesBatchSampler
 
 from conf.errors import UserError
 from conf.schema import LoraConfig
@@ -17,7 +15,7 @@ from data.records import FPS, shown_frames
 from train import retriever
 from train.audit import audit_retriever
 from train.backbone import keep_differentiable
-from train.retriever import LateFrames, column_prompts, frame_input, query_input
+from train.retriever import frame_input, query_input
 from train.towers import count_towers
 
 
@@ -104,37 +102,3 @@ def test_adapters_are_read_back_over_the_4_bit_weights_they_were_trained_on(
     query = [query_input(micro_store.retrieval("train")[0], frames, cfg)]
     one, two = (m.encode(query, prompt_name="query") for m in (model, again))
     np.testing.assert_allclose(one, two, atol=1e-5)
-
-
-def test_no_frame_of_a_batch_is_a_negative_of_itself(micro_store) -> None:
-    """The library's sampler keeps rows that name one frame apart, whatever column it is in."""
-    rows = [retriever.row(q, 1) for q in micro_store.retrieval("train")]
-    frames = [f for row in rows for f in (row["target"], row["negative_0"])]
-    assert len(set(frames)) < len(frames)
-    sampler = NoDuplicatesBatchSampler(
-        Dataset.from_list(rows), batch_size=4, drop_last=True, generator=torch.Generator(), seed=0
-    )
-    for batch in sampler:
-        shown = [f for k in batch for f in (rows[k]["target"], rows[k]["negative_0"])]
-        assert len(set(shown)) == len(shown) == 8
-
-
-def test_a_batch_reads_the_pixels_of_its_rows_alone(
-    micro_store, frames, retriever_cfg, tmp_path
-) -> None:
-    model = load(micro_store, retriever_cfg, tmp_path)
-    queries = micro_store.retrieval("train")
-    rows = [retriever.row(queries[k], 1) for k in (3, 0)]
-    prompts = column_prompts(retriever_cfg, rows[0])
-    collate = LateFrames(preprocess_fn=model.preprocess, prompts=prompts)
-    collate.resolve(queries, frames, retriever_cfg)
-    batch = collate(rows)
-    one = model.preprocess(
-        [frame_input(queries[3].target, frames)], prompt=retriever_cfg.frame_instruction
-    )
-    torch.testing.assert_close(batch["target_pixel_values"][:36], one["pixel_values"])
-    assert {k.partition("_input_ids")[0] for k in batch if k.endswith("input_ids")} == {
-        "query",
-        "target",
-        "negative_0",
-    }

@@ -1,0 +1,189 @@
+"""A retriever's training, from its base to the weights that are written."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from datasets import Dataset
+from sentence_transformers import (
+    SentenceTransformer,
+    SentenceTransformerTrainer,
+    SentenceTransformerTrainingArguments,
+)
+from sentence_transformers.sentence_transformer.data_collator import (
+    SentenceTransformerDataCollator,
+)
+from sentence_transformers.sentence_transformer.losses import MatryoshkaLoss
+from transformers import set_seed
+
+from conf.entry import Run
+from conf.errors import UserError
+from conf.runs import rank
+from conf.schema import ContrastiveCommand, ContrastiveTrainConfig
+from data.frames import Frames
+from data.records import RetrievalQuery
+from data.store import Store
+from train import checkpoints, compatible, loop, ranks, retriever, room
+from train.audit import audit_retriever
+from train.batches import Batch, Composed, batch_of
+from train.inputs import Inputs
+from train.mining import HardNegatives
+from train.negatives import Weighing
+from train.ranking import HeldOutRanking
+from train.ranking_loss import RankingLoss
+from train.samples import held_out_scenes, shuffled
+
+log = logging.getLogger(__name__)
+
+
+def train_retriever(
+    cfg: ContrastiveCommand, run: Run, store: Store, share: int
+) -> dict[str, float]:
+    """Train a retriever in its run's folder and give what it measured there. `share` is a rank's
+    part of a step's queries."""
+    room.keep_big_blocks()
+    loop.keep_to_one_gpu()
+    # Adapters are drawn before the trainer sets its seed.
+    set_seed(cfg.seed)
+    training, validation = split(cfg, store)
+    log.info("loading retriever %s", cfg.retriever.name)
+    if rank() == 0:
+        compatible.note_base(run.folder, cfg.retriever.model)
+    frames = Frames(store, cfg.retriever.image_size)
+    model = retriever.load_retriever(
+        cfg.retriever,
+        cfg.train.precision,
+        corpus=retriever.corpus(store.retrieval("train"), cfg.retriever),
+        folder=run.folder / "untrained",
+    )
+    longest = retriever.longest_query(training, model.tokenizer)
+    log.info(audit_retriever(model, cfg.retriever, longest, frames))
+
+    checkpoint = checkpoints.newest_checkpoint(run.folder)
+    inputs = Inputs(model, frames, cfg.retriever, cfg.train.precision)
+    negatives = HardNegatives(training, cfg.train, model, inputs, store, run.folder)
+    trainer = RetrieverTrainer(
+        model=model,
+        args=arguments(cfg, run, checkpoint, share),
+        train_dataset=Dataset.from_list([{"query": k} for k in range(len(training))]),
+        evaluator=HeldOutRanking(validation, frames, cfg.retriever, cfg.train.mini_batch),
+        loss=loss_of(cfg, model, inputs, store),
+        data_collator=ByName(preprocess_fn=model.preprocess),
+        callbacks=[negatives],
+        batch_of=partial(named, cfg.train, training, negatives),
+        sampler=Composed(
+            training,
+            cfg.train.hard_negatives,
+            cfg.train.batch,
+            cfg.train.batches,
+            cfg.train.scene_queries,
+            cfg.seed,
+            ranks.ranks(),
+        ),
+    )
+    best = loop.train_and_log(
+        trainer, run, checkpoint, "train.mini_batch, which changes no gradient"
+    )
+    if rank() == 0:
+        model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)
+    log.info("the retriever is in %s", run.folder / "retriever")
+    return loop.evaluated(run.folder, best)
+
+
+def split(
+    cfg: ContrastiveCommand, store: Store
+) -> tuple[list[RetrievalQuery], list[RetrievalQuery]]:
+    """The queries trained on, and some of held-out scenes.
+
+    Raises:
+        UserError: there are none, or too few for a batch.
+    """
+    queries = store.retrieval("train")
+    held_out = held_out_scenes(store)
+    training = [q for q in queries if q.scene_id not in held_out]
+    # Queries stand builder by builder: a shuffled slice measures all of them.
+    validation = shuffled([q for q in queries if q.scene_id in held_out], cfg.seed)
+    validation = validation[: cfg.train.validation_queries]
+    loop.check_not_empty(len(training), "training queries")
+    loop.check_not_empty(len(validation), "queries of held-out training scenes")
+    if len(training) < cfg.train.batch:
+        raise UserError(
+            f"train.batch={cfg.train.batch} is more than the {len(training)} training queries of "
+            f"{store.folder}: lower it"
+        )
+    return training, validation
+
+
+def loss_of(
+    cfg: ContrastiveCommand, model: SentenceTransformer, inputs: Inputs, store: Store
+) -> MatryoshkaLoss:
+    train = cfg.train
+    # What is mined for one query may be another's target.
+    identical = train.mask_identical or train.mine_every > 0
+    ranking = RankingLoss(
+        model,
+        inputs,
+        Weighing(store, identical, train.mask_near, train.hard_weight),
+        scale=train.scale,
+        mini_batch=train.mini_batch,
+        mini_batch_tokens=train.mini_batch_tokens,
+        reuse_features=train.reuse_features,
+        ahead=train.workers,
+    )
+    return MatryoshkaLoss(model, ranking, list(cfg.retriever.widths), train.width_weights)
+
+
+def arguments(
+    cfg: ContrastiveCommand, run: Run, checkpoint: Path | None, share: int
+) -> SentenceTransformerTrainingArguments:
+    shared: dict[str, Any] = loop.arguments(cfg.train, run, cfg.seed, checkpoint)
+    return SentenceTransformerTrainingArguments(
+        # Batches are names alone; what they stand for is made while the model computes.
+        **{**shared, "dataloader_num_workers": 0},
+        per_device_train_batch_size=share,
+        dataloader_drop_last=True,
+    )
+
+
+def named(
+    train: ContrastiveTrainConfig,
+    queries: Sequence[RetrievalQuery],
+    negatives: HardNegatives,
+    places: Sequence[int],
+) -> Batch:
+    """The batch of the queries at these places, with the hard negatives that are theirs now."""
+    asked = [negatives.given(queries[k]) for k in places]
+    return batch_of(asked, train.hard_negatives, train.distinct_frames, train.shared_prefixes)
+
+
+class ByName(SentenceTransformerDataCollator):
+    """Leaves a batch the places of its queries: one that is made ahead may come after a mining."""
+
+    def __call__(self, rows: list[dict[str, int]]) -> dict[str, list[int]]:
+        return {"places": [row["query"] for row in rows]}
+
+
+class RetrieverTrainer(SentenceTransformerTrainer):
+    """The library's trainer over batches of places, composed by a sampler of ours and named by
+    `batch_of` when they are taken."""
+
+    def __init__(
+        self,
+        *args: Any,
+        sampler: Composed,
+        batch_of: Callable[[Sequence[int]], Batch],
+        **settings: Any,
+    ) -> None:
+        self._sampler = sampler
+        self._batch_of = batch_of
+        super().__init__(*args, **settings)
+
+    def get_batch_sampler(self, *_: Any, **__: Any) -> Composed:
+        return self._sampler
+
+    def collect_features(self, inputs: dict[str, list[int]]) -> tuple[list[Batch], None]:
+        return [self._batch_of(inputs["places"])], None
