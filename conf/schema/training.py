@@ -59,6 +59,8 @@ class TrainConfig:
         )
         if self.lr <= 0:
             problems.append(f"train.lr={self.lr} must be above 0")
+        if not 0 <= self.adam_beta2 < 1:
+            problems.append(f"train.adam_beta2={self.adam_beta2} must be 0 or more and below 1")
         if self.schedule not in ("cosine", "linear", "constant"):
             problems.append(
                 f"train.schedule={self.schedule}: the options are cosine, linear and constant"
