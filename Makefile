@@ -41,8 +41,9 @@ run: setup ## Train and measure the tiny student and the tiny retriever, and rep
 	$(BIN)/python -m evaluation.retrieve model=checkpoints/contrastive/default
 	$(BIN)/python -m evaluation.report
 
+# Servers and ranks that tests start have threads of their own.
 test: setup vllm-env ## Run every test
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
 # What the tests of trainers and of their evaluation import takes longer than all quick tests.
 check: setup lint ## Lint, then run the quick tests

@@ -16,6 +16,7 @@ import hashlib
 import io
 import json
 import logging
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,8 +34,9 @@ log = logging.getLogger(__name__)
 
 ABOUT, NOTES = "about.json", "[0-9]*.json"
 KINDS = {"frame": "frames", "query": "queries"}
-PART = 512
-"""Embeddings of one file: what a kill can cost, and what is read at once."""
+PART, SECONDS = 512, 30
+"""A file is written after so many embeddings, or so long: a kill costs no more. It is read at once,
+and ends with a batch, so that what goes on after a kill passes the model in the same batches."""
 
 Thing = TypeVar("Thing")
 
@@ -63,7 +65,7 @@ class Embeddings:
         """Embed those of `things` that are not there yet, `batch` at a time, under a progress bar.
 
         Args:
-            things: by name; one after the other is embedded, in this order.
+            things: by name; they are embedded in this order.
             embed: gives (things, entries) fp32; where it gives fewer entries for some than for
                 others, their rows are filled up with zeros.
 
@@ -86,12 +88,16 @@ class Embeddings:
                 desc=f"embedding {KINDS[self.kind]}",
                 unit=self.kind,
             ) as bar:
-                for names in batched(waiting, PART):
-                    rows = []
-                    for some in batched(names, batch):
-                        rows.append(embed([things[name] for name in some]))
-                        self._check_finite(rows[-1], some)
-                        bar.update(len(some))
+                names, rows, begun = [], [], time.monotonic()
+                for some in batched(waiting, batch):
+                    names += some
+                    rows.append(embed([things[name] for name in some]))
+                    self._check_finite(rows[-1], some)
+                    bar.update(len(some))
+                    if len(names) >= PART or time.monotonic() - begun > SECONDS:
+                        self._add(names, filled_up(rows))
+                        names, rows, begun = [], [], time.monotonic()
+                if names:
                     self._add(names, filled_up(rows))
 
     def parts(self, names: Sequence[str]) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from transformers import set_seed
 from conf.entry import Run
 from conf.errors import UserError
 from conf.runs import rank
-from conf.schema import ContrastiveCommand
+from conf.schema import ContrastiveCommand, ContrastiveTrainConfig
 from data.frames import Frames
 from data.records import RetrievalQuery
 from data.store import Store
@@ -32,6 +33,7 @@ from train.audit import audit_retriever
 from train.batches import Batch, Composed, batch_of
 from train.inputs import Inputs
 from train.late_loss import LateRankingLoss
+from train.mining import HardNegatives
 from train.negatives import Weighing
 from train.ranking import HeldOutRanking, LateHeldOutRanking
 from train.ranking_loss import RankingLoss
@@ -65,6 +67,8 @@ def train_retriever(
     log.info(audit_retriever(model, cfg.retriever, longest, frames))
 
     checkpoint = checkpoints.newest_checkpoint(run.folder)
+    inputs = Inputs(model, frames, cfg.retriever, cfg.train.precision)
+    negatives = HardNegatives(training, cfg.train, model, inputs, store, run.folder)
     late = cfg.retriever.late is not None
     trainer = (LateTrainer if late else RetrieverTrainer)(
         model=model,
@@ -73,8 +77,10 @@ def train_retriever(
         evaluator=(LateHeldOutRanking if late else HeldOutRanking)(
             validation, frames, cfg.retriever, cfg.train.mini_batch
         ),
-        loss=loss_of(cfg, model, frames, store),
-        data_collator=ByName(cfg, training, model),
+        loss=loss_of(cfg, model, inputs, store),
+        data_collator=ByName(preprocess_fn=model.preprocess),
+        callbacks=[negatives],
+        batch_of=partial(named, cfg.train, training, negatives),
         sampler=Composed(
             training,
             cfg.train.hard_negatives,
@@ -119,13 +125,15 @@ def split(
 
 
 def loss_of(
-    cfg: ContrastiveCommand, model: Retriever, frames: Frames, store: Store
+    cfg: ContrastiveCommand, model: Retriever, inputs: Inputs, store: Store
 ) -> MatryoshkaLoss | LateRankingLoss:
     train, late = cfg.train, cfg.retriever.late is not None
+    # What is mined for one query may be another's target.
+    identical = train.mask_identical or train.mine_every > 0
     ranking = (LateRankingLoss if late else RankingLoss)(
         model,
-        Inputs(model, frames, cfg.retriever, train.precision),
-        Weighing(store, train.mask_identical, train.mask_near, train.hard_weight),
+        inputs,
+        Weighing(store, identical, train.mask_near, train.hard_weight),
         scale=train.scale,
         mini_batch=train.mini_batch,
         mini_batch_tokens=train.mini_batch_tokens,
@@ -151,39 +159,44 @@ def arguments(
     )
 
 
+def named(
+    train: ContrastiveTrainConfig,
+    queries: Sequence[RetrievalQuery],
+    negatives: HardNegatives,
+    places: Sequence[int],
+) -> Batch:
+    """The batch of the queries at these places, with the hard negatives that are theirs now."""
+    asked = [negatives.given(queries[k]) for k in places]
+    return batch_of(asked, train.hard_negatives, train.distinct_frames, train.shared_prefixes)
+
+
 class ByName(SentenceTransformerDataCollator):
-    """Makes a `Batch` of the places of queries, under the one name that the trainer looks for."""
+    """Leaves a batch the places of its queries: one that is made ahead may come after a mining."""
 
-    def __init__(
-        self, cfg: ContrastiveCommand, queries: Sequence[RetrievalQuery], model: Retriever
-    ) -> None:
-        super().__init__(preprocess_fn=model.preprocess)
-        self._train = cfg.train
-        self._queries = queries
-
-    def __call__(self, rows: list[dict[str, int]]) -> dict[str, Batch]:
-        train = self._train
-        queries = [self._queries[row["query"]] for row in rows]
-        return {
-            "batch": batch_of(
-                queries, train.hard_negatives, train.distinct_frames, train.shared_prefixes
-            )
-        }
+    def __call__(self, rows: list[dict[str, int]]) -> dict[str, list[int]]:
+        return {"places": [row["query"] for row in rows]}
 
 
 class NamedBatches:
-    """What a trainer of the library's needs for batches that hold names, composed by a sampler of
-    ours."""
+    """What a trainer of the library's needs for batches of places, composed by a sampler of ours
+    and named by `batch_of` when they are taken."""
 
-    def __init__(self, *args: Any, sampler: Composed, **settings: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        sampler: Composed,
+        batch_of: Callable[[Sequence[int]], Batch],
+        **settings: Any,
+    ) -> None:
         self._sampler = sampler
+        self._batch_of = batch_of
         super().__init__(*args, **settings)
 
     def get_batch_sampler(self, *_: Any, **__: Any) -> Composed:
         return self._sampler
 
-    def collect_features(self, inputs: dict[str, Batch]) -> tuple[list[Batch], None]:
-        return [inputs["batch"]], None
+    def collect_features(self, inputs: dict[str, list[int]]) -> tuple[list[Batch], None]:
+        return [self._batch_of(inputs["places"])], None
 
 
 class RetrieverTrainer(NamedBatches, SentenceTransformerTrainer):

@@ -59,6 +59,8 @@ class TrainConfig:
         )
         if self.lr <= 0:
             problems.append(f"train.lr={self.lr} must be above 0")
+        if not 0 <= self.adam_beta2 < 1:
+            problems.append(f"train.adam_beta2={self.adam_beta2} must be 0 or more and below 1")
         if self.schedule not in ("cosine", "linear", "constant"):
             problems.append(
                 f"train.schedule={self.schedule}: the options are cosine, linear and constant"
@@ -153,6 +155,11 @@ class ContrastiveTrainConfig(TrainConfig):
     """Tokens that pass the model at once, in place of train.mini_batch."""
     hard_negatives: int = 1
     """Same-scene wrong-time frames a query."""
+    mine_every: int = 0
+    """Steps after which hard negatives are mined anew: the wrong frames that the retriever then
+    ranks highest. 0 keeps the benchmark's."""
+    mine_margin: float = 24.0
+    """Mined frames of the target's scene are displaced by so many px (at 336 x 336) from it."""
     scale: float = 50.0
     """Inverse temperature of the scores: cosine similarities, which retriever.late sums up."""
     distinct_frames: bool = True
@@ -186,6 +193,8 @@ class ContrastiveTrainConfig(TrainConfig):
                 "scene_queries": 1,
                 "mini_batch_tokens": 1,
                 "mask_near": 0,
+                "mine_every": 0,
+                "mine_margin": 0,
             },
         )
         for name in ("scale", "hard_weight"):
@@ -199,6 +208,11 @@ class ContrastiveTrainConfig(TrainConfig):
             problems.append(
                 f"train.batch={self.batch} with train.hard_negatives=0 leaves no negatives: give a "
                 "batch of 2 or more, or hard negatives"
+            )
+        if self.mine_every and not self.hard_negatives:
+            problems.append(
+                f"train.mine_every={self.mine_every} with train.hard_negatives=0 mines nothing: "
+                "give hard negatives, or leave train.mine_every=0"
             )
         if not 1 <= self.mini_batch <= self.batch:
             problems.append(

@@ -53,7 +53,7 @@ def test_a_file_names_a_command_that_composes_it(path):
 def test_a_student_brings_its_recipe():
     tiny = settings("python -m train.sft")
     paper = settings("python -m train.sft student=qwen3_vl_8b")
-    assert (tiny.train.lr, tiny.train.batch, tiny.train.micro_batch) == (2e-3, 16, 8)
+    assert (tiny.train.lr, tiny.train.batch, tiny.train.micro_batch) == (2e-3, 16, 4)
     assert tiny.train.regime == "cot"
     assert (paper.train.lr, paper.train.batch, paper.train.micro_batch) == (2e-5, 16, 1)
     assert (paper.train.epochs, paper.train.precision) == (3, "bf16")

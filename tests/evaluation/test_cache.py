@@ -63,6 +63,17 @@ def test_parts_hold_each_asked_one_once(tmp_path) -> None:
     assert np.array_equal(np.stack([seen[k] for k in range(len(some))]), kept.rows(some))
 
 
+def test_a_slow_model_loses_no_more_than_a_batch(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(cache, "SECONDS", -1)
+    model = Model(bad=(70,))
+    kept = Embeddings(tmp_path, "frame", ABOUT)
+    with pytest.raises(UserError, match="scene-070/70"):
+        kept.complete(THINGS, model, 16)
+    again = Model()
+    kept.complete(THINGS, again, 16)
+    assert again.asked == list(range(64, 2500))
+
+
 def test_only_what_is_new_is_embedded(tmp_path) -> None:
     filled(tmp_path)
     model = Model()

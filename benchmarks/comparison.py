@@ -1,0 +1,181 @@
+"""The paper's comparison at tiny scale: zero-shot, answer-only, CoT, and CoT without each of its
+parts, each over three seeds, on a test split of over a thousand items.
+
+    python -m benchmarks.comparison
+
+Trains and measures what is missing, each by the project's own commands and in runs of their own, so
+that it may be stopped and started again, and prints one table. A figure is the mean over the seeds
+with its 95% interval when whole scenes are drawn again; so is a difference, of the same items.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from conf.compose import compose
+from conf.schema import SelectCommand
+from data.records import FAMILIES, SelectionItem
+from data.store import open_store
+from evaluation.metrics import bootstrap_by_scene
+
+REGIMES = ("answer_only", "cot", "cot_no_candidate_analysis", "cot_no_match_layout")
+MODES = {"answer_only": ["answer"]}
+BOTH = ["reasoning", "answer"]
+SEEDS = (0, 1, 2)
+PAIRS = (
+    (("cot", "reasoning"), ("answer_only", "answer")),
+    (("cot", "answer"), ("answer_only", "answer")),
+    (("cot", "reasoning"), ("cot", "answer")),
+    (("cot", "reasoning"), ("cot_no_candidate_analysis", "reasoning")),
+    (("cot", "reasoning"), ("cot_no_match_layout", "reasoning")),
+    (("cot", "reasoning"), ("zero-shot", "reasoning")),
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--benchmark", default="comparison")
+    parser.add_argument("--student", default="tiny")
+    parser.add_argument("--store", default="store")
+    parser.add_argument("--checkpoints", default="checkpoints")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at once, each with a thread")
+    parser.add_argument("--seeds", type=int, default=len(SEEDS))
+    args = parser.parse_args()
+    plan = Plan(args.benchmark, args.student, args.store, Path(args.checkpoints), args.jobs)
+    seeds = SEEDS[: args.seeds]
+    run(plan.built())
+    # Seed by seed, so that a comparison of fewer is there early.
+    wanted = [(regime, seed) for seed in seeds for regime in REGIMES]
+    with ThreadPoolExecutor(args.jobs) as pool:
+        list(pool.map(partial(made, plan), [("zero-shot", 0), *wanted]))
+    print_table(plan, seeds)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is compared, where it lies, and how many runs go at once."""
+
+    benchmark: str
+    student: str
+    store: str
+    checkpoints: Path
+    jobs: int
+
+    def built(self) -> list[str]:
+        return ["data.build", f"benchmark={self.benchmark}", f"store={self.store}"]
+
+    def trained(self, regime: str, seed: int) -> list[str]:
+        return ["train.sft", f"+exp={regime}", f"seed={seed}", *self._common(regime, seed)]
+
+    def measured(self, regime: str, seed: int) -> list[str]:
+        if regime == "zero-shot":
+            return ["evaluation.select", *self._common(regime, seed)]
+        folder = self.checkpoints / "sft" / self.name(regime, seed)
+        return ["evaluation.select", f"model={folder}", *self._common(regime, seed)]
+
+    def name(self, regime: str, seed: int) -> str:
+        return f"{self.benchmark}-{regime}-{seed}"
+
+    def _common(self, regime: str, seed: int) -> list[str]:
+        return [
+            f"student={self.student}", f"benchmark={self.benchmark}", f"store={self.store}",
+            f"checkpoints={self.checkpoints}", f"run={self.name(regime, seed)}",
+        ]  # fmt: skip
+
+
+def made(plan: Plan, wanted: tuple[str, int]) -> None:
+    """Train and measure one student; what is there already is not done again."""
+    regime, seed = wanted
+    threads = max(1, (os.cpu_count() or 1) // plan.jobs)
+    if regime != "zero-shot":
+        run(plan.trained(regime, seed), threads)
+    if not (plan.checkpoints / "select" / plan.name(regime, seed) / "metrics.json").exists():
+        run(plan.measured(regime, seed), threads)
+
+
+def run(command: Sequence[str], threads: int | None = None) -> None:
+    limit = {} if threads is None else {"OMP_NUM_THREADS": str(threads)}
+    print("python -m", *command, flush=True)
+    done = subprocess.run(
+        [sys.executable, "-m", *command],
+        env={**os.environ, **limit},
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command)} has failed:\n{done.stderr[-2000:]}")
+
+
+Group = tuple[str, str]
+"""A regime, and a mode in which its students are asked."""
+
+
+def print_table(plan: Plan, seeds: Sequence[int]) -> None:
+    cfg = compose("evaluation.select", SelectCommand, [f"benchmark={plan.benchmark}"])
+    items = open_store(Path(plan.store) / cfg.benchmark.name).selection("test")
+    right = {
+        (regime, mode): np.stack(
+            [answered(plan, regime, mode, seed, items) for seed in used], axis=1
+        )
+        for regime, used in [("zero-shot", (0,)), *((regime, seeds) for regime in REGIMES)]
+        for mode in MODES.get(regime, BOTH)
+    }
+    print(f"\n{len(items)} test items, {len(seeds)} seeds")
+    print("| | asked for | " + " | ".join([*FAMILIES, "macro", "parsed"]) + " |")
+    print("|---" * (len(FAMILIES) + 4) + "|")
+    for (regime, mode), values in right.items():
+        cells = [figure(values[..., 0], items, [family]) for family in FAMILIES]
+        cells += [figure(values[..., 0], items, FAMILIES), f"{100 * values[..., 1].mean():.1f}"]
+        print(f"| {regime} | {mode} | " + " | ".join(cells) + " |", flush=True)
+    print("\n| difference | " + " | ".join([*FAMILIES, "macro"]) + " |")
+    print("|---" * (len(FAMILIES) + 2) + "|")
+    for one, two in PAIRS:
+        apart = right[one][..., 0].mean(axis=1) - right[two][..., 0].mean(axis=1)
+        cells = [figure(apart[:, None], items, [f], "+") for f in FAMILIES]
+        cells.append(figure(apart[:, None], items, FAMILIES, "+"))
+        print(f"| {' '.join(one)} less {' '.join(two)} | " + " | ".join(cells) + " |", flush=True)
+
+
+def answered(
+    plan: Plan, regime: str, mode: str, seed: int, items: Sequence[SelectionItem]
+) -> np.ndarray:
+    """(items, 2) whether a student's answers are right, and whether they can be read."""
+    path = plan.checkpoints / "select" / plan.name(regime, seed) / "answers.jsonl"
+    rows = [json.loads(line) for line in path.read_text().splitlines()[1:]]
+    found = {row["item_id"]: row for row in rows if row["mode"] == mode}
+    return np.array(
+        [(found[i.item_id]["right"], found[i.item_id]["letter"] is not None) for i in items], float
+    )
+
+
+def figure(
+    values: np.ndarray, items: Sequence[SelectionItem], families: Sequence[str], sign: str = ""
+) -> str:
+    """The mean of families' means over items and seeds (items, seeds), with its interval, in
+    percent."""
+    codes = np.array([FAMILIES.index(item.family) for item in items])
+    wanted = [FAMILIES.index(family) for family in families]
+    kept = np.isin(codes, wanted)
+
+    def mean(rows: np.ndarray) -> float:
+        return float(np.mean([rows[rows[:, 0] == k, 1].mean() for k in wanted]))
+
+    table = np.stack([codes, values.mean(axis=1)], axis=1)[kept]
+    scenes = [item.scene_id for item, keep in zip(items, kept, strict=True) if keep]
+    low, high = bootstrap_by_scene(table, scenes, mean, seed=0)
+    return f"{100 * mean(table):{sign}.1f} [{100 * low:{sign}.1f}, {100 * high:{sign}.1f}]"
+
+
+if __name__ == "__main__":
+    main()

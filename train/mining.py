@@ -1,0 +1,132 @@
+"""Hard negatives from the retriever as it is: the wrong frames that it ranks highest."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from sentence_transformers import SentenceTransformer
+from sentence_transformers.util import semantic_search
+from tqdm import tqdm
+from transformers import TrainerCallback
+from transformers.trainer_callback import TrainerControl, TrainerState
+
+from conf.runs import rank, write_text
+from conf.schema import ContrastiveTrainConfig
+from data.geometry import displacements
+from data.records import FrameRef, RetrievalQuery
+from data.store import Store
+from train.batches import Batch, batch_of
+from train.inputs import Inputs
+from train.ranks import from_main
+
+log = logging.getLogger(__name__)
+
+Mined = dict[str, list[FrameRef]]
+"""The hard negatives of queries, by their ids."""
+SPARE = 64
+"""How many more frames than are wanted are looked at: those near the target are no negatives."""
+
+
+class HardNegatives(TrainerCallback):
+    """Which hard negatives the training queries have: the benchmark's, and every `train.mine_every`
+    steps those frames of the pool, all that training queries name, that the retriever ranks
+    highest, without the target and what its scene's oracle displaces by less than
+    `train.mine_margin` px (at 336 x 336) from it.
+
+    They are in the run's folder, a file a mining, so that a run that goes on has those it had.
+    """
+
+    def __init__(
+        self,
+        queries: Sequence[RetrievalQuery],
+        train: ContrastiveTrainConfig,
+        model: SentenceTransformer,
+        inputs: Inputs,
+        store: Store,
+        folder: Path,
+    ) -> None:
+        self._queries = queries
+        self._every, self._margin = train.mine_every, train.mine_margin
+        self._count, self._mini_batch = train.hard_negatives, train.mini_batch
+        self._model, self._inputs = model, inputs
+        self._store, self._folder = store, folder
+        self._mined: Mined = {}
+
+    def given(self, query: RetrievalQuery) -> RetrievalQuery:
+        """A query with the hard negatives that are its own now."""
+        mined = self._mined.get(query.query_id)
+        return query if mined is None else replace(query, hard_negatives=tuple(mined))
+
+    def on_train_begin(self, args, state: TrainerState, control: TrainerControl, **_: Any) -> None:
+        if self._every and (last := state.global_step // self._every * self._every):
+            self._mined = read(self._path(last))
+
+    def on_step_end(self, args, state: TrainerState, control: TrainerControl, **_: Any) -> None:
+        step = state.global_step
+        if self._every and step % self._every == 0 and step < state.max_steps:
+            self._mined = from_main(self._mine)
+            if rank() == 0:
+                write(self._mined, self._path(step))
+
+    def _mine(self) -> Mined:
+        batch = batch_of(self._queries, self._count, distinct=True, shared=True)
+        was_training = self._model.training
+        self._model.eval()
+        asked = self._embedded("queries", self._inputs.of_prefixes, batch, len(batch.prefixes))
+        shown = self._embedded("frames", self._inputs.of_frames, batch, len(batch.frames))
+        self._model.train(was_training)
+        found = semantic_search(asked, shown, top_k=min(self._count + SPARE, len(shown)))
+        ranked = [[batch.frames[hit["corpus_id"]] for hit in hits] for hits in found]
+        return {
+            query.query_id: wrong(query, frames, self._store, self._margin, self._count)
+            for query, frames in zip(batch.queries, ranked, strict=True)
+        }
+
+    @torch.no_grad()
+    def _embedded(
+        self, what: str, make: Callable[[Batch, int, int], dict[str, Any]], batch: Batch, rows: int
+    ) -> torch.Tensor:
+        """(rows, width) fp32 embeddings, on the CPU."""
+        parts = []
+        starts = range(0, rows, self._mini_batch)
+        for start in tqdm(starts, desc=f"mining: {what}", unit="batch", leave=False):
+            inputs = make(batch, start, min(start + self._mini_batch, rows))
+            given = self._inputs.on_device(inputs)
+            parts.append(self._model(given)["sentence_embedding"].float().cpu())
+        return torch.cat(parts)
+
+    def _path(self, step: int) -> Path:
+        return self._folder / "mined" / f"{step}.json"
+
+
+def wrong(
+    query: RetrievalQuery, ranked: Sequence[FrameRef], store: Store, margin: float, count: int
+) -> list[FrameRef]:
+    """The first `count` of the ranked frames that are not the query's target or near it; the
+    benchmark's own where there are not so many."""
+    target = query.target
+    apart = displacements(store.scene(target.scene_id))[target.frame]
+    far = [
+        frame
+        for frame in [*ranked, *query.hard_negatives]
+        if frame.scene_id != target.scene_id
+        or (frame.frame != target.frame and apart[frame.frame] >= margin)
+    ]
+    return [*dict.fromkeys([*far, *query.hard_negatives])][:count]
+
+
+def write(mined: Mined, path: Path) -> None:
+    path.parent.mkdir(exist_ok=True)
+    rows = {name: [asdict(frame) for frame in frames] for name, frames in mined.items()}
+    write_text(path, json.dumps(rows))
+
+
+def read(path: Path) -> Mined:
+    rows = json.loads(path.read_text())
+    return {name: [FrameRef(**frame) for frame in frames] for name, frames in rows.items()}
