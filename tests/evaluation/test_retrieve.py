@@ -19,6 +19,7 @@ from conf.errors import UserError
 from conf.schema import (
     ArchitectureConfig,
     ContrastiveCommand,
+    LateConfig,
     LoraConfig,
     RetrieveCommand,
     RetrieverConfig,
@@ -41,14 +42,17 @@ CFG = RetrieverConfig(
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory, micro, micro_store) -> Path:
+    return save_run(CFG, tmp_path_factory.mktemp("contrastive") / "run", micro, micro_store)
+
+
+def save_run(cfg: RetrieverConfig, folder: Path, micro, micro_store) -> Path:
     """A finished run of the trainer, as it leaves it."""
-    folder = tmp_path_factory.mktemp("contrastive") / "run"
-    texts = retriever.corpus(micro_store.retrieval("train"), CFG)
-    built = retriever.load_retriever(CFG, "fp32", texts, folder / "untrained")
+    texts = retriever.corpus(micro_store.retrieval("train"), cfg)
+    built = retriever.load_retriever(cfg, "fp32", texts, folder / "untrained")
     for weight in built.parameters():
         weight.data += 0.01
     built.save_pretrained(str(folder / "retriever"), create_model_card=False)
-    settings = ContrastiveCommand(benchmark=micro, retriever=CFG)
+    settings = ContrastiveCommand(benchmark=micro, retriever=cfg)
     OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
     (folder / "metrics.json").write_text("{}")
     return folder
@@ -56,7 +60,7 @@ def saved(tmp_path_factory, micro, micro_store) -> Path:
 
 @pytest.fixture
 def world(tmp_path, saved, micro, micro_store) -> Callable[..., dict]:
-    """Measures a copy of the run on a copy of the store; the report."""
+    """Measures a copy of the run on a copy of the store; the report, without the times."""
     shutil.copytree(saved, tmp_path / "run")
     shutil.copytree(micro_store.folder, tmp_path / "store" / "micro")
     shutil.rmtree(tmp_path / "store" / "micro" / EMBEDDINGS, ignore_errors=True)
@@ -70,7 +74,9 @@ def world(tmp_path, saved, micro, micro_store) -> Callable[..., dict]:
             model=str(tmp_path / "run"),
         )  # fmt: skip
         retrieve.main.__wrapped__(replace(cfg, **settings), run)
-        return json.loads((run.folder / "report.json").read_text())
+        report = json.loads((run.folder / "report.json").read_text())
+        assert all(row.pop("seconds") is not None for row in report["rows"])
+        return report
 
     return measure
 
@@ -120,6 +126,33 @@ def test_it_is_measured_once_and_read_back(world, tmp_path, micro_store) -> None
     edit_config(tmp_path / "run", train__precision="fp32")
     with pytest.raises(UserError, match="is damaged and cannot be read"):
         world("three")
+
+
+def test_one_of_many_vectors_is_measured_by_late_interaction(
+    world, tmp_path, micro, micro_store
+) -> None:
+    shutil.rmtree(tmp_path / "run")
+    cfg = replace(CFG, late=LateConfig(width=24))
+    save_run(cfg, tmp_path / "run", micro, micro_store)
+    first = world()
+    queries, database = micro_store.standard_test(), micro_store.database()
+    frames = Frames(micro_store, 96)
+    model = retriever.load_trained(cfg, "fp32", tmp_path / "run" / "retriever")
+    asked = model.encode_query([retriever.query_input(q, frames, CFG) for q in queries])
+    shown = model.encode_document([retriever.frame_input(f, frames) for f in database])
+    gold = np.array([database.index(q.target) for q in queries])
+    row = first["rows"][0]
+    plain = rank_metrics(model.similarity(asked, shown).numpy(), gold, [1])
+    assert row["mrr"]["value"] == pytest.approx(plain["mrr"], rel=0.01)
+    assert row["bytes"] == sum(v.numel() for v in shown) * 4
+    names = dict.fromkeys((row["name"], row["width"]) for row in first["rows"])
+    assert list(names) == [("run", 24), ("untrained small, late", 24)]
+    assert "MiB" in (tmp_path / "one" / "report.txt").read_text()
+    (tmp_path / "run" / "retriever" / "config.json").unlink()
+    (tmp_path / "run" / "untrained" / "config.json").unlink()
+    assert world("two") == first
+    with pytest.raises(UserError, match=r"index=faiss holds one vector a frame"):
+        world("three", index="faiss")
 
 
 @pytest.mark.slow
