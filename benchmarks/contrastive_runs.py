@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from datasets import Dataset
-from sentence_transformers import SentenceTransformerTrainer
+from sentence_transformers import SentenceTransformer, SentenceTransformerTrainer
 from sentence_transformers.sentence_transformer.data_collator import (
     SentenceTransformerDataCollator,
 )
@@ -25,6 +25,7 @@ from conf.schema import ContrastiveCommand
 from data.build import ensure_benchmark
 from data.frames import Frames
 from data.records import RetrievalQuery
+from data.store import Store
 from train import retriever, room
 from train.batches import Batch, Composed, batch_of
 from train.contrast import ByName, RetrieverTrainer, arguments, loss_of, named
@@ -44,15 +45,30 @@ class Figures:
 
 
 def train(cfg: ContrastiveCommand, steps: int, plain: bool, folder: Path) -> Figures:
-    """Train `steps` steps in `folder`."""
+    """Train `steps` steps of the settings' own benchmark and retriever in `folder`."""
     room.keep_big_blocks()
     set_seed(SEED)
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     queries = store.retrieval("train")
-    frames = Frames(store, cfg.retriever.image_size)
     model = retriever.load_retriever(
         cfg.retriever, cfg.train.precision, retriever.corpus(queries, cfg.retriever), folder
     )
+    frames = Frames(store, cfg.retriever.image_size)
+    return trained(cfg, model, queries, frames, store, steps, plain, folder)
+
+
+def trained(
+    cfg: ContrastiveCommand,
+    model: SentenceTransformer,
+    queries: Sequence[RetrievalQuery],
+    frames: Any,
+    store: Store | None,
+    steps: int,
+    plain: bool,
+    folder: Path,
+) -> Figures:
+    """Train `steps` steps of a model and queries. `frames` are `data.frames.Frames`, or what gives
+    pixels like them; `store` is asked for a scene's oracle where the objective needs it."""
     cfg = replace(cfg, train=replace(cfg.train, max_steps=steps))
     order = Composed(
         queries,
@@ -63,8 +79,7 @@ def train(cfg: ContrastiveCommand, steps: int, plain: bool, folder: Path) -> Fig
         SEED,
     )
     clock = Clock(model.device)
-    build = plains if plain else ours
-    trainer = build(cfg, model, queries, frames, store, folder, order)
+    trainer = (plains if plain else ours)(cfg, model, queries, frames, store, folder, order)
     trainer.add_callback(clock)
     for callback in (ProgressCallback, PrinterCallback):
         trainer.remove_callback(callback)

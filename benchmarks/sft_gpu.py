@@ -210,6 +210,22 @@ class Bench:
 
 def built(name: str, cfg: StudentConfig, device: torch.device) -> tuple[nn.Module, ProcessorMixin]:
     """A student of a released shape with random bf16 or 4-bit weights, and adapters."""
+    model = random_model(name, cfg.quantization, device)
+    model.config.use_cache = False
+    backbone.keep_differentiable(model)
+    student = backbone.add_adapters(model, cfg.lora).to(device)
+    towers.check_towers(towers.count_towers(student), cfg)
+    said = [instruction("reasoning", "cot"), *(answer_line(x) for x in LETTERS), SAID]
+    processor = build_processor(said * 20, 512, cfg.image_size)
+    backbone.pin_sizes(processor, cfg.image_size, cfg.frames)
+    return student, processor
+
+
+def random_model(
+    name: str, quantization: str, device: torch.device
+) -> Qwen3VLForConditionalGeneration:
+    """A model of a released shape with random bf16 or 4-bit weights, that knows the tiny
+    tokenizer's special tokens."""
     config = Qwen3VLConfig.from_dict(json.loads(CONFIGS[name].read_text()))
     for key, token in (
         ("image_token_id", "<|image_pad|>"),
@@ -225,16 +241,9 @@ def built(name: str, cfg: StudentConfig, device: torch.device) -> tuple[nn.Modul
             model = Qwen3VLForConditionalGeneration(config)
     finally:
         torch.set_default_dtype(kept)
-    if cfg.quantization == "nf4":
+    if quantization == "nf4":
         quantise(model)
-    model.config.use_cache = False
-    backbone.keep_differentiable(model)
-    student = backbone.add_adapters(model, cfg.lora).to(device)
-    towers.check_towers(towers.count_towers(student), cfg)
-    said = [instruction("reasoning", "cot"), *(answer_line(x) for x in LETTERS), SAID]
-    processor = build_processor(said * 20, 512, cfg.image_size)
-    backbone.pin_sizes(processor, cfg.image_size, cfg.frames)
-    return student, processor
+    return model
 
 
 def quantise(model: nn.Module) -> None:

@@ -171,11 +171,16 @@ def add_adapters(model: PreTrainedModel, lora: LoraConfig) -> nn.Module:
     try:
         return peft.get_peft_model(model, config)
     except (ValueError, re.error) as error:
-        raise UserError(
-            f"student.lora.targets={lora.targets} adapts nothing in this model: give a pattern "
-            "that matches whole names of linear layers, such as "
-            "model.language_model.layers.0.self_attn.q_proj"
-        ) from error
+        raise nothing_adapted("student", lora) from error
+
+
+def nothing_adapted(group: str, lora: LoraConfig) -> UserError:
+    """What to tell a user whose pattern matches nothing that can be adapted."""
+    return UserError(
+        f"{group}.lora.targets={lora.targets} adapts nothing in this model: give a pattern that "
+        "matches whole names of linear layers, such as "
+        "model.language_model.layers.0.self_attn.q_proj"
+    )
 
 
 def load_student(

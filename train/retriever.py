@@ -7,6 +7,7 @@ generation prompt at the end, and the last token's state, normalised, as the emb
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,10 @@ from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
 from transformers import AutoConfig
 
-from conf.schema import RetrieverConfig
+from conf.schema import LoraConfig, RetrieverConfig
 from data.frames import Frames
 from data.records import FPS, FRAMES, FrameRef, RetrievalQuery, shown_frames
+from train.attention import choose_attention
 from train.backbone import (
     DTYPES,
     UNREADABLE,
@@ -27,6 +29,7 @@ from train.backbone import (
     keep_differentiable,
     load_failure,
     nf4_config,
+    nothing_adapted,
     pin_sizes,
 )
 from train.compatible import check_processor, check_tower
@@ -86,24 +89,39 @@ def load_retriever(
         model = SentenceTransformer(modules=[backbone, pooling, Normalize()], **whole)
     # Rows name queries by number: there is no text of theirs that a model card could show.
     model.model_card_data.generate_widget_examples = False
-    keep_differentiable(backbone)
-    if cfg.lora.rank:
-        import peft
-
-        backbone.requires_grad_(False)
-        model.add_adapter(
-            peft.LoraConfig(
-                r=cfg.lora.rank,
-                lora_alpha=cfg.lora.alpha,
-                lora_dropout=cfg.lora.dropout,
-                target_modules=cfg.lora.targets,
-            )
-        )
-        # They come in the precision of a base that is not quantised, in whose steps updates vanish.
-        for weight in backbone.parameters():
-            if weight.requires_grad:
-                weight.data = weight.data.float()
+    prepare(model, cfg, precision)
     return model
+
+
+def prepare(model: Retriever, cfg: RetrieverConfig, precision: str) -> None:
+    """Make a loaded retriever ready to train: its attention, and adapters where it has some."""
+    # Prefixes are shared by masks.
+    choose_attention(model[0].model, precision, cfg.max_length, masks=True)
+    keep_differentiable(model[0])
+    if cfg.lora.rank:
+        add_adapters(model, cfg.lora)
+
+
+def add_adapters(model: Retriever, lora: LoraConfig) -> None:
+    """Freeze the backbone and add LoRA to its language tower's projections, in fp32 whatever the
+    base has: updates of this size vanish in bf16's steps.
+
+    Raises:
+        UserError: the pattern is none, or matches no module that can be adapted.
+    """
+    import peft
+
+    model[0].requires_grad_(False)
+    config = peft.LoraConfig(
+        r=lora.rank, lora_alpha=lora.alpha, lora_dropout=lora.dropout, target_modules=lora.targets
+    )
+    try:
+        model.add_adapter(config)
+    except (ValueError, re.error) as error:
+        raise nothing_adapted("retriever", lora) from error
+    for weight in model[0].parameters():
+        if weight.requires_grad:
+            weight.data = weight.data.float()
 
 
 def built(cfg: RetrieverConfig, corpus: list[str], folder: Path) -> str:
@@ -129,10 +147,13 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
     }
     try:
         if cfg.late is not None:
-            return load_late(folder, **options)
-        return SentenceTransformer(str(folder), **options)
+            model = load_late(folder, **options)
+        else:
+            model = SentenceTransformer(str(folder), **options)
     except UNREADABLE as error:
         raise damaged(folder, error) from error
+    choose_attention(model[0].model, precision, cfg.max_length, masks=True)
+    return model
 
 
 def weight_options(cfg: RetrieverConfig, precision: str) -> dict[str, Any]:
