@@ -12,17 +12,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.jobs import run, run_all
 from conf.compose import compose
 from conf.schema import SelectCommand
 from data.records import FAMILIES, SelectionItem
@@ -52,25 +49,23 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="runs at once, each with a thread")
     parser.add_argument("--seeds", type=int, default=len(SEEDS))
     args = parser.parse_args()
-    plan = Plan(args.benchmark, args.student, args.store, Path(args.checkpoints), args.jobs)
+    plan = Plan(args.benchmark, args.student, args.store, Path(args.checkpoints))
     seeds = SEEDS[: args.seeds]
     run(plan.built())
     # Seed by seed, so that a comparison of fewer is there early.
     wanted = [(regime, seed) for seed in seeds for regime in REGIMES]
-    with ThreadPoolExecutor(args.jobs) as pool:
-        list(pool.map(partial(made, plan), [("zero-shot", 0), *wanted]))
+    run_all(partial(make, plan), [("zero-shot", 0), *wanted], args.jobs)
     print_table(plan, seeds)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is compared, where it lies, and how many runs go at once."""
+    """What is compared, and where it lies."""
 
     benchmark: str
     student: str
     store: str
     checkpoints: Path
-    jobs: int
 
     def built(self) -> list[str]:
         return ["data.build", f"benchmark={self.benchmark}", f"store={self.store}"]
@@ -94,27 +89,13 @@ class Plan:
         ]  # fmt: skip
 
 
-def made(plan: Plan, wanted: tuple[str, int]) -> None:
-    """Train and measure one student; what is there already is not done again."""
+def make(plan: Plan, wanted: tuple[str, int], threads: int) -> None:
+    """Train and measure one student."""
     regime, seed = wanted
-    threads = max(1, (os.cpu_count() or 1) // plan.jobs)
     if regime != "zero-shot":
         run(plan.trained(regime, seed), threads)
     if not (plan.checkpoints / "select" / plan.name(regime, seed) / "metrics.json").exists():
         run(plan.measured(regime, seed), threads)
-
-
-def run(command: Sequence[str], threads: int | None = None) -> None:
-    limit = {} if threads is None else {"OMP_NUM_THREADS": str(threads)}
-    print("python -m", *command, flush=True)
-    done = subprocess.run(
-        [sys.executable, "-m", *command],
-        env={**os.environ, **limit},
-        capture_output=True,
-        text=True,
-    )
-    if done.returncode:
-        raise SystemExit(f"{' '.join(command)} has failed:\n{done.stderr[-2000:]}")
 
 
 Group = tuple[str, str]
