@@ -1,9 +1,9 @@
 """What the tiny base learns from: questions whose answers the oracle holds, so that it can see and
 write before it is ever asked to choose.
 
-A frame is described by its objects and their places; a clip by the built-in narrator, with the
-frame that comes of it shown or not; of several frames the one is named that is the later, or that
-fits a description. None of it is the selection task itself.
+A frame is described by its objects and their places, alone and as one of four candidates; a clip by
+the built-in narrator, with the frame that comes of it shown or not; of several frames the one is
+named that is the later, or that fits a description. None of it is the selection task itself.
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ from train.conversation import Clip, Sample, Sight, answer_line, conversation
 from train.planned import Planned, rng_of
 
 FRAME = "Describe the frame."
+CANDIDATE = "Describe candidate {}."
 CLIP = "Describe the scene, how its objects move, and what will come of it."
 LATER = 'Which candidate comes later? End with a line "Answer:" and the letter.'
 MATCH = (
     "Which candidate shows {}? Say of each candidate, in a line of its own, whether it matches and "
     'why. End with a line "Answer:" and the letter.'
 )
-ASKED = (FRAME, CLIP, LATER, MATCH)
-FRAMES = 8
-"""Frames described for each item in an epoch."""
+ASKED = (FRAME, CANDIDATE, CLIP, LATER, MATCH)
+FRAMES = 4
+"""Frames described for each item in an epoch, and as many among candidates."""
 MOVED = 0.08
 """Share of the view's width by which an object has moved in the later of two frames, at least."""
 CLEAR = 0.3
@@ -46,11 +47,12 @@ NAMED = 4
 def kinds(
     store: Store, items: list[SelectionItem], cfg: StudentConfig, frames: Frames, seed: int
 ) -> dict[str, list[Planned]]:
-    """Samples of each kind from some items. Which frame is described or is the later, and the
-    order of the two, is another in each epoch."""
+    """Samples of each kind from some items. Which frame is described or is the later, among which
+    others, and in which order, is another in each epoch."""
     make = _Maker(store, cfg, frames, seed)
     return {
         "frame": [make.frame(item, k) for item in items for k in range(FRAMES)],
+        "candidate": [make.candidate(item, items, k) for item in items for k in range(FRAMES)],
         "clip": [clip for item in items for clip in make.clip(item)],
         "later": [later for item in items for later in make.later(item)],
         "match": [match for item in items for match in make.matched(item)],
@@ -72,13 +74,44 @@ class _Maker:
 
     def _frame(self, item: SelectionItem, k: int, epoch: int) -> Sample:
         rng = rng_of(self.seed, epoch, item.item_id, "frame", k)
-        shown = [(c.scene_id, c.frame) for c in item.candidates]
-        shown += [(item.scene_id, f) for f in self._prefix(item)]
-        scene_id, frame = shown[rng.integers(len(shown))]
+        scene_id, frame = self._any(item, rng)
         pixels = self.frames.array(scene_id, frame)
         told = account(self.store.scene(scene_id), frame)
         sights = self._sights([(scene_id, frame)])
         return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], told, None, sights)
+
+    def candidate(self, item: SelectionItem, others: list[SelectionItem], k: int) -> Planned:
+        """One of four frames, which are an item's candidates or, the easier to tell apart, of four
+        items."""
+        account_of = account(self.store.scene(item.scene_id), item.prefix_stop)
+        make = partial(self._candidate, item, others, k)
+        return Planned(f"{CANDIDATE} {account_of}", len(LETTERS), make)
+
+    def _candidate(
+        self, item: SelectionItem, others: list[SelectionItem], k: int, epoch: int
+    ) -> Sample:
+        rng = rng_of(self.seed, epoch, item.item_id, "candidate", k)
+        if rng.random() < 0.5:
+            own = [(c.scene_id, c.frame) for c in item.candidates]
+            shown = [own[place] for place in rng.permutation(len(own))]
+        else:
+            drawn = [others[place] for place in rng.integers(len(others), size=len(LETTERS))]
+            shown = [self._any(one, rng) for one in drawn]
+        asked = rng.integers(len(LETTERS))
+        parts: list[str | np.ndarray] = []
+        for letter, (scene_id, frame) in zip(LETTERS, shown, strict=True):
+            parts += [f"\nCandidate {letter}: ", self.frames.array(scene_id, frame)]
+        parts.append(f"\n{CANDIDATE.format(LETTERS[asked])}")
+        scene_id, frame = shown[asked]
+        told = account(self.store.scene(scene_id), frame)
+        name = f"{item.item_id} (candidate {k})"
+        return conversation(name, parts, told, None, self._sights(shown))
+
+    def _any(self, item: SelectionItem, rng: np.random.Generator) -> tuple[str, int]:
+        """Any of the frames that an item shows."""
+        shown = [(c.scene_id, c.frame) for c in item.candidates]
+        shown += [(item.scene_id, f) for f in self._prefix(item)]
+        return shown[rng.integers(len(shown))]
 
     def clip(self, item: SelectionItem) -> Iterator[Planned]:
         """The clip with the frame that comes of it, to be read off, or without, to be foreseen."""

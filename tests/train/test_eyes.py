@@ -42,6 +42,28 @@ def test_a_frame_is_told_object_by_object(micro_store, kinds) -> None:
         assert len(told) == len(there)
 
 
+def test_the_candidate_that_is_asked_for_is_told(micro_store, frames, kinds) -> None:
+    every = {
+        frames.array(item.scene_id, f).tobytes(): shown(micro_store, item.scene_id, f)
+        for item in micro_store.selection("train")
+        for f in range(128)
+    }
+    asked = set()
+    for planned in kinds["candidate"][:12]:
+        for epoch in range(2):
+            sample = planned.make(epoch)
+            letter = re.fullmatch(r"\nDescribe candidate (\w)\.", sample.content[-1]["text"]).group(
+                1
+            )
+            asked.add(letter)
+            told = re.findall(r"The (\w+ \w+ \w+) is (near the [\w-]+)\.", sample.response)
+            assert len(sample.images) == 4
+            pixels = sample.images[LETTERS.index(letter)].tobytes()
+            # A candidate may be of a test scene's look-alike, whose frames are not among these.
+            assert pixels not in every or dict(told) == every[pixels]
+    assert asked == set(LETTERS)
+
+
 def test_one_candidate_alone_fits_a_description(micro_store, kinds) -> None:
     items = {item.item_id: item for item in micro_store.selection("train")}
     assert kinds["match"]
