@@ -59,6 +59,15 @@ def kinds(
     }
 
 
+Picture = tuple[str, int, str]
+"""A scene's frame, and the letter under which it is a candidate, empty where it is none."""
+
+
+def lettered(frames: list[tuple[str, int]]) -> list[Picture]:
+    """Frames as candidates in their order."""
+    return [(*frame, letter) for frame, letter in zip(frames, LETTERS, strict=False)]
+
+
 class _Maker:
     """Makes samples of items; what is left to chance follows from seed, epoch and item."""
 
@@ -77,7 +86,7 @@ class _Maker:
         scene_id, frame = self._any(item, rng)
         pixels = self.frames.array(scene_id, frame)
         told = account(self.store.scene(scene_id), frame)
-        sights = self._sights([(scene_id, frame)])
+        sights = self._sights([(scene_id, frame, "")])
         return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], told, None, sights)
 
     def candidate(self, item: SelectionItem, others: list[SelectionItem], k: int) -> Planned:
@@ -105,7 +114,7 @@ class _Maker:
         scene_id, frame = shown[asked]
         told = account(self.store.scene(scene_id), frame)
         name = f"{item.item_id} (candidate {k})"
-        return conversation(name, parts, told, None, self._sights(shown))
+        return conversation(name, parts, told, None, self._sights(lettered(shown)))
 
     def _any(self, item: SelectionItem, rng: np.random.Generator) -> tuple[str, int]:
         """Any of the frames that an item shows."""
@@ -126,7 +135,7 @@ class _Maker:
         shown = rng_of(self.seed, epoch, item.item_id, "clip").random() < 0.5
         pixels = self.frames.array(item.scene_id, item.target_frame)
         later = ["Later: ", pixels, "\n"] if shown else []
-        images = [item.target_frame] if shown else []
+        images = [(item.scene_id, item.target_frame, "")] if shown else []
         return self._after_prefix(item, [*later, CLIP], text, images)
 
     def later(self, item: SelectionItem) -> Iterator[Planned]:
@@ -145,7 +154,8 @@ class _Maker:
         for letter, frame in zip(LETTERS, images, strict=False):
             parts += [f"\nCandidate {letter}: ", self.frames.array(item.scene_id, frame)]
         right = LETTERS[order.tolist().index(1)]
-        return self._after_prefix(item, [*parts, f"\n{LATER}"], answer_line(right), images)
+        shown = lettered([(item.scene_id, frame) for frame in images])
+        return self._after_prefix(item, [*parts, f"\n{LATER}"], answer_line(right), shown)
 
     def matched(self, item: SelectionItem) -> Iterator[Planned]:
         """A description that one candidate alone fits, where there is such."""
@@ -166,24 +176,24 @@ class _Maker:
         parts: list[str | np.ndarray] = []
         for letter, c in zip(LETTERS, item.candidates, strict=True):
             parts += [f"\nCandidate {letter}: ", self.frames.array(c.scene_id, c.frame)]
-        sights = self._sights([(c.scene_id, c.frame) for c in item.candidates])
+        sights = self._sights(lettered([(c.scene_id, c.frame) for c in item.candidates]))
         parts.append(f"\n{asked}")
         return conversation(f"{item.item_id} (match)", parts, answer, None, sights)
 
     def _after_prefix(
-        self, item: SelectionItem, parts: list[str | np.ndarray], told: str, images: list[int]
+        self, item: SelectionItem, parts: list[str | np.ndarray], told: str, images: list[Picture]
     ) -> Sample:
         scene, shown = self.store.scene(item.scene_id), self._prefix(item)
         clip = Clip(self.frames.stack(item.scene_id, shown), shown, scene.fps, scene.frames)
         # A visual token of a clip shows two frames; its object is where the first has it.
-        sights = self._sights([(item.scene_id, f) for f in [*shown[::2], *images]])
+        sights = self._sights([*((item.scene_id, f, "") for f in shown[::2]), *images])
         return conversation(f"{item.item_id} (clip and frames)", parts, told, clip, sights)
 
-    def _sights(self, pictures: list[tuple[str, int]]) -> list[Sight]:
-        """What a sample's pictures show, each a scene's frame."""
+    def _sights(self, pictures: list[Picture]) -> list[Sight]:
+        """What a sample's pictures show, and of a candidate under which letter."""
         return [
-            Sight(k, place, words)
-            for k, (scene_id, frame) in enumerate(pictures)
+            Sight(k, place, (*words, *letter))
+            for k, (scene_id, frame, letter) in enumerate(pictures)
             for place, words in sights(self.store.scene(scene_id), frame)
         ]
 

@@ -1,5 +1,5 @@
 """Teach a base to see, token by token: at the place of a visual token that shows an object, the
-model names the object.
+model names the object and, in a candidate, the candidate's letter.
 
 What a sample's answer says of its pictures is a weak sign of what they show: a model that writes it
 well may hardly look. The words of the object at each visual token are a strong one, beside it.
@@ -25,8 +25,11 @@ WEIGHT = 6.0
 """A named object weighs as much as this many supervised tokens."""
 PLACES = ("top", "left", "right", "center", "bottom")
 """First words of the places that an object is near."""
-WORDS = 3
-"""Words that name an object: its colour, material and shape."""
+WORDS = 4
+"""Words at most that a visual token is told: an object's colour, material and shape, and a
+candidate's letter."""
+NONE = -1
+"""Stands where a token is told fewer words."""
 
 
 def seen_words(processor: ProcessorMixin) -> dict[str, list[int]]:
@@ -41,7 +44,8 @@ def first_token(processor: ProcessorMixin, word: str) -> int:
 
 class SightCollator(Collator):
     """Batches that also hold `sights` (N, 2 + WORDS): row and position of a visual token, and the
-    first tokens of the words for what it shows. All positions keep their logits."""
+    first tokens of the words that it is told, filled up with NONE. All positions keep their logits.
+    """
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
         batch = super().__call__(samples)
@@ -69,7 +73,8 @@ class SightCollator(Collator):
         for sight in sample.sights:
             column, line = (min(int(share * grid), grid - 1) for share in sight.place)
             position = positions[sight.picture * each + line * grid + column]
-            found.append([row, position, *(first_token(self._processor, w) for w in sight.words)])
+            words = [first_token(self._processor, word) for word in sight.words]
+            found.append([row, position, *words, *[NONE] * (WORDS - len(words))])
         return found
 
 
@@ -104,4 +109,6 @@ def unnamed(logits: torch.Tensor, sights: torch.Tensor) -> torch.Tensor:
     """
     row, position, words = sights[:, 0], sights[:, 1], sights[:, 2:]
     told = logits[row, position].float().log_softmax(dim=-1)
-    return -told.gather(1, words).mean(dim=1).sum()
+    given = words != NONE
+    each = told.gather(1, words.clamp(min=0)).masked_fill(~given, 0.0)
+    return -(each.sum(dim=1) / given.sum(dim=1)).sum()

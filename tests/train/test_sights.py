@@ -10,7 +10,7 @@ import torch
 
 from train import eyes
 from train.collate import Collator
-from train.sights import WORDS, SightCollator, first_token, unnamed
+from train.sights import NONE, WORDS, SightCollator, first_token, unnamed
 
 
 def test_words_stand_at_the_tokens_that_show_them(
@@ -34,7 +34,11 @@ def test_words_stand_at_the_tokens_that_show_them(
         for sight in sample.sights:
             x, y = (min(math.floor(share * side), side - 1) for share in sight.place)
             words = [first_token(processor, word) for word in sight.words]
-            wanted.append([row, int(cells[sight.picture, y, x]), *words])
+            filled = [*words, *[NONE] * (WORDS - len(words))]
+            wanted.append([row, int(cells[sight.picture, y, x]), *filled])
+            if len(words) == WORDS and sample.clip is None:
+                before = sample.content[2 * sight.picture]["text"]
+                assert before == f"\nCandidate {sight.words[-1]}: "
     assert batch["sights"].tolist() == wanted
     assert {row for row, *_ in wanted} == set(range(len(samples)))
 
@@ -49,13 +53,14 @@ def test_sights_are_of_what_a_frame_shows(micro_store) -> None:
 
 
 def test_the_best_answer_names_each_word_as_often() -> None:
-    """No answer is below the entropy of three words, which the even one alone reaches."""
-    sights = torch.tensor([[0, 1, 4, 5, 6]])
+    """No answer is below the entropy of three words, which the even one alone reaches; a word that
+    is not given counts for nothing."""
+    sights = torch.tensor([[0, 1, 4, 5, 6, NONE]])
     even = torch.full((1, 3, 10), -torch.inf)
     even[0, 1, [4, 5, 6]] = 0.0
-    assert unnamed(even, sights).item() == pytest.approx(math.log(WORDS))
+    assert unnamed(even, sights).item() == pytest.approx(math.log(3))
     tilted = even.clone()
     tilted[0, 1, 4] = 1.0
-    assert unnamed(tilted, sights).item() > math.log(WORDS)
+    assert unnamed(tilted, sights).item() > math.log(3)
     elsewhere = torch.zeros(1, 3, 10)
     assert unnamed(elsewhere, sights.repeat(2, 1)).item() == pytest.approx(2 * math.log(10))
