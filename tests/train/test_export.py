@@ -109,7 +109,7 @@ def test_a_merged_weight_is_the_dequantised_one_and_its_adapters_product(
 
 
 def test_the_measured_difference_is_told_and_small(forms) -> None:
-    for format, most in (("fp32", 1e-5), ("bf16", 0.02)):
+    for format, most in (("fp32", 1e-5), ("bf16", 0.05)):
         measured, folder = forms[format]
         assert json.loads((folder / "export.json").read_text())["measured"] == measured
         for mode in ("reasoning", "answer"):

@@ -51,12 +51,12 @@ def samples(micro_store, frames, student_cfg) -> list[Sample]:
 def attending(request: pytest.FixtureRequest, model: PreTrainedModel) -> PreTrainedModel:
     """A model with adapters that are not zero, so that gradients reach all of them."""
     model.set_attn_implementation(ATTENTIONS[request.param])
+    torch.manual_seed(0)
     adapted = backbone.add_adapters(model, LoraConfig(rank=2))
-    generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for name, weight in adapted.named_parameters():
             if "lora_B" in name:
-                weight.copy_(torch.randn(weight.shape, generator=generator) * 0.1)
+                weight.normal_(std=0.1)
     return adapted.eval()
 
 
@@ -99,7 +99,7 @@ def test_alone_padded_left_padded_right_and_packed_are_one(samples, processor, a
         torch.testing.assert_close(loss, mean, atol=1e-5, rtol=0)
         for one, two in zip(gradients(attending, loss), expected, strict=True):
             assert two.abs().max() > 1e-4
-            torch.testing.assert_close(one, two, atol=1e-5, rtol=1e-3)
+            assert (one - two).norm() < 1e-3 * two.norm()
 
 
 def test_each_packed_samples_loss_is_its_own(samples, processor, attending) -> None:
