@@ -21,6 +21,7 @@ from conf.schema import (
     TeacherConfig,
 )
 from data.frames import Frames
+from data.records import RetrievalQuery
 from data.store import Store
 from train import samples
 from train.tiny import build_model, build_processor
@@ -131,3 +132,20 @@ def contrastive_settings(
         retriever=retriever_cfg,
         train=train,
     )
+
+
+@pytest.fixture(scope="session")
+def queries(micro_store: Store) -> list[RetrievalQuery]:
+    """Ten of several lengths, some of one prefix and some that name one frame."""
+    asked = micro_store.retrieval("train")[:6]
+    again = [
+        replace(
+            q,
+            query_id=f"{q.query_id} again",
+            question=f"{q.question} Or else, which frame comes before that?",
+            target=q.hard_negatives[0],
+            hard_negatives=(q.target, asked[0].target),
+        )
+        for q in asked[1:5]
+    ]
+    return [*asked, *again]

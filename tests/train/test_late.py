@@ -51,23 +51,6 @@ def late_cfg(retriever_cfg):
     return replace(retriever_cfg, late=LateConfig(width=24))
 
 
-@pytest.fixture(scope="module")
-def queries(micro_store):
-    """Ten of several lengths, some of one prefix and some that name one frame."""
-    asked = micro_store.retrieval("train")[:6]
-    again = [
-        replace(
-            q,
-            query_id=f"{q.query_id} again",
-            question=f"{q.question} Or else, which frame comes before that?",
-            target=q.hard_negatives[0],
-            hard_negatives=(q.target, asked[0].target),
-        )
-        for q in asked[1:5]
-    ]
-    return [*asked, *again]
-
-
 @pytest.fixture(scope="module", params=["whole", "adapters", "pooled"])
 def trained(request, micro_store, late_cfg, saved_base, tmp_path_factory):
     cfg = late_cfg

@@ -29,23 +29,6 @@ NEGATIVES = 2
 WEIGHTS = [1.0, 0.5]
 
 
-@pytest.fixture(scope="module")
-def queries(micro_store):
-    """Ten, some of one prefix and some that name one frame."""
-    asked = micro_store.retrieval("train")[:6]
-    again = [
-        replace(
-            q,
-            query_id=f"{q.query_id} again",
-            question=f"{q.question} Or else, which frame comes before that?",
-            target=q.hard_negatives[0],
-            hard_negatives=(q.target, asked[0].target),
-        )
-        for q in asked[1:5]
-    ]
-    return [*asked, *again]
-
-
 @pytest.fixture(scope="module", params=["whole", "adapters"])
 def trained(request, micro_store, retriever_cfg, saved_base, tmp_path_factory):
     """A retriever trained whole, and one with adapters that already do something."""
