@@ -6,11 +6,14 @@ parts, each over three seeds, on a test split of over a thousand items.
 Trains and measures what is missing, each by the project's own commands and in runs of their own, so
 that it may be stopped and started again, and prints one table. A figure is the mean over the seeds
 with its 95% interval when whole scenes are drawn again; so is a difference, of the same items.
+The letters that each student gave are kept in benchmarks/letters/: a run that is kept there is not
+made again, and `--table` reads no more than them.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,8 +24,9 @@ import numpy as np
 
 from benchmarks.jobs import run, run_all
 from conf.compose import compose
+from conf.runs import write_text
 from conf.schema import SelectCommand
-from data.records import FAMILIES, SelectionItem
+from data.records import FAMILIES
 from data.store import open_store
 from evaluation.metrics import bootstrap_by_scene
 
@@ -40,21 +44,29 @@ PAIRS = (
 )
 
 
+LETTERS = Path(__file__).parent / "letters"
+UNREAD = "-"
+"""Stands for an answer in which no letter could be read."""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--benchmark", default="comparison")
     parser.add_argument("--student", default="tiny")
     parser.add_argument("--store", default="store")
     parser.add_argument("--checkpoints", default="checkpoints")
+    parser.add_argument("--letters", type=Path, default=LETTERS, help="where answers are kept")
     parser.add_argument("--jobs", type=int, default=1, help="runs at once, each with a thread")
     parser.add_argument("--seeds", type=int, default=len(SEEDS))
+    parser.add_argument("--table", action="store_true", help="of the answers that are kept")
     args = parser.parse_args()
-    plan = Plan(args.benchmark, args.student, args.store, Path(args.checkpoints))
+    plan = Plan(args.benchmark, args.student, args.store, Path(args.checkpoints), args.letters)
     seeds = SEEDS[: args.seeds]
-    run(plan.built())
-    # Seed by seed, so that a comparison of fewer is there early.
-    wanted = [(regime, seed) for seed in seeds for regime in REGIMES]
-    run_all(partial(make, plan), [("zero-shot", 0), *wanted], args.jobs)
+    if not args.table:
+        run(plan.built())
+        # Seed by seed, so that a comparison of fewer is there early.
+        wanted = [("zero-shot", 0), *((regime, seed) for seed in seeds for regime in REGIMES)]
+        run_all(partial(make, plan), [w for w in wanted if not plan.kept(*w).exists()], args.jobs)
     print_table(plan, seeds)
 
 
@@ -66,6 +78,7 @@ class Plan:
     student: str
     store: str
     checkpoints: Path
+    letters: Path
 
     def built(self) -> list[str]:
         return ["data.build", f"benchmark={self.benchmark}", f"store={self.store}"]
@@ -79,6 +92,9 @@ class Plan:
         folder = self.checkpoints / "sft" / self.name(regime, seed)
         return ["evaluation.select", f"model={folder}", *self._common(regime, seed)]
 
+    def kept(self, regime: str, seed: int) -> Path:
+        return self.letters / f"{self.name(regime, seed)}.csv"
+
     def name(self, regime: str, seed: int) -> str:
         return f"{self.benchmark}-{regime}-{seed}"
 
@@ -90,12 +106,44 @@ class Plan:
 
 
 def make(plan: Plan, wanted: tuple[str, int], threads: int) -> None:
-    """Train and measure one student."""
+    """Train and measure one student, and keep its answers."""
     regime, seed = wanted
     if regime != "zero-shot":
         run(plan.trained(regime, seed), threads)
-    if not (plan.checkpoints / "select" / plan.name(regime, seed) / "metrics.json").exists():
+    measured = plan.checkpoints / "select" / plan.name(regime, seed)
+    if not (measured / "metrics.json").exists():
         run(plan.measured(regime, seed), threads)
+    keep(plan, regime, measured / "answers.jsonl", plan.kept(regime, seed))
+
+
+def keep(plan: Plan, regime: str, answers: Path, path: Path) -> None:
+    """Write what a student answered to every test item, in a column a mode."""
+    cfg = compose("evaluation.select", SelectCommand, [f"benchmark={plan.benchmark}"])
+    rows = [json.loads(line) for line in answers.read_text().splitlines()[1:]]
+    letters = {(row["item_id"], row["mode"]): row["letter"] or UNREAD for row in rows}
+    modes = MODES.get(regime, BOTH)
+    lines = [",".join(["item_id", "family", "scene_id", "right", *modes])]
+    for item in open_store(Path(plan.store) / cfg.benchmark.name).selection("test"):
+        given = [letters[item.item_id, mode] for mode in modes]
+        lines.append(",".join([item.item_id, item.family, item.scene_id, item.letter, *given]))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, "\n".join(lines) + "\n")
+
+
+Row = dict[str, str]
+"""An item and what a student answered, by the names of the columns."""
+
+
+def kept_rows(plan: Plan, regime: str, seed: int) -> list[Row]:
+    """
+    Raises:
+        SystemExit: the run has not been made.
+    """
+    path = plan.kept(regime, seed)
+    if not path.exists():
+        raise SystemExit(f"error: {path} is not there: run without --table, or with fewer --seeds")
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 Group = tuple[str, str]
@@ -103,15 +151,12 @@ Group = tuple[str, str]
 
 
 def print_table(plan: Plan, seeds: Sequence[int]) -> None:
-    cfg = compose("evaluation.select", SelectCommand, [f"benchmark={plan.benchmark}"])
-    items = open_store(Path(plan.store) / cfg.benchmark.name).selection("test")
-    right = {
-        (regime, mode): np.stack(
-            [answered(plan, regime, mode, seed, items) for seed in used], axis=1
-        )
-        for regime, used in [("zero-shot", (0,)), *((regime, seeds) for regime in REGIMES)]
-        for mode in MODES.get(regime, BOTH)
-    }
+    items = kept_rows(plan, "zero-shot", 0)
+    right: dict[Group, np.ndarray] = {}
+    for regime, used in [("zero-shot", (0,)), *((regime, seeds) for regime in REGIMES)]:
+        runs = [kept_rows(plan, regime, seed) for seed in used]
+        for mode in MODES.get(regime, BOTH):
+            right[regime, mode] = np.stack([answered(rows, mode) for rows in runs], axis=1)
     print(f"\n{len(items)} test items, {len(seeds)} seeds")
     print("| | asked for | " + " | ".join([*FAMILIES, "macro", "parsed"]) + " |")
     print("|---" * (len(FAMILIES) + 4) + "|")
@@ -128,24 +173,17 @@ def print_table(plan: Plan, seeds: Sequence[int]) -> None:
         print(f"| {' '.join(one)} less {' '.join(two)} | " + " | ".join(cells) + " |", flush=True)
 
 
-def answered(
-    plan: Plan, regime: str, mode: str, seed: int, items: Sequence[SelectionItem]
-) -> np.ndarray:
+def answered(rows: Sequence[Row], mode: str) -> np.ndarray:
     """(items, 2) whether a student's answers are right, and whether they can be read."""
-    path = plan.checkpoints / "select" / plan.name(regime, seed) / "answers.jsonl"
-    rows = [json.loads(line) for line in path.read_text().splitlines()[1:]]
-    found = {row["item_id"]: row for row in rows if row["mode"] == mode}
-    return np.array(
-        [(found[i.item_id]["right"], found[i.item_id]["letter"] is not None) for i in items], float
-    )
+    return np.array([(row[mode] == row["right"], row[mode] != UNREAD) for row in rows], float)
 
 
 def figure(
-    values: np.ndarray, items: Sequence[SelectionItem], families: Sequence[str], sign: str = ""
+    values: np.ndarray, items: Sequence[Row], families: Sequence[str], sign: str = ""
 ) -> str:
     """The mean of families' means over items and seeds (items, seeds), with its interval, in
     percent."""
-    codes = np.array([FAMILIES.index(item.family) for item in items])
+    codes = np.array([FAMILIES.index(item["family"]) for item in items])
     wanted = [FAMILIES.index(family) for family in families]
     kept = np.isin(codes, wanted)
 
@@ -153,7 +191,7 @@ def figure(
         return float(np.mean([rows[rows[:, 0] == k, 1].mean() for k in wanted]))
 
     table = np.stack([codes, values.mean(axis=1)], axis=1)[kept]
-    scenes = [item.scene_id for item, keep in zip(items, kept, strict=True) if keep]
+    scenes = [item["scene_id"] for item, keep in zip(items, kept, strict=True) if keep]
     low, high = bootstrap_by_scene(table, scenes, mean, seed=0)
     return f"{100 * mean(table):{sign}.1f} [{100 * low:{sign}.1f}, {100 * high:{sign}.1f}]"
 
