@@ -31,6 +31,7 @@ from train.batches import Batch, Composed, batch_of
 from train.contrast import ByName, RetrieverTrainer, arguments, loss_of, named
 from train.inputs import Inputs
 from train.mining import HardNegatives
+from train.precision import settled
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ def train(cfg: ContrastiveCommand, steps: int, plain: bool, folder: Path) -> Fig
     """Train `steps` steps of the settings' own benchmark and retriever in `folder`."""
     room.keep_big_blocks()
     set_seed(SEED)
+    cfg.train.precision = settled(cfg.train.precision)
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     queries = store.retrieval("train")
     model = retriever.load_retriever(

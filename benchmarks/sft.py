@@ -236,7 +236,7 @@ def train_one(
     store: str,
     steps: int,
     images: bool = False,
-    precision: str = "bf16",
+    precision: str = "auto",
     quantization: str = "nf4",
     convention: str = "ours",
     **switches: Any,
@@ -251,16 +251,17 @@ def train_one(
     from teacher.narrate import ensure_rationales
     from train import backbone, room, samples
     from train.planned import ByLength
+    from train.precision import settled
 
     variant = sft_runs.Variant(**switches)
     cfg = compose("train.sft", SftCommand, OVERRIDES)
-    cfg.train.precision, cfg.student.quantization = precision, quantization
+    cfg.train.precision, cfg.student.quantization = settled(precision), quantization
     built = ensure_benchmark(cfg.benchmark, Path(store), cfg.workers)
     rationales = ensure_rationales(built, cfg.teacher)
     if variant.trainer == "ours":
         room.keep_big_blocks()
     set_seed(sft_runs.SEED)
-    model, processor = backbone.load_student(cfg.student, precision, list)
+    model, processor = backbone.load_student(cfg.student, cfg.train.precision, list)
     training, _ = samples.splits(built, rationales, cfg, Frames(built, cfg.student.image_size))
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
     order = islice(ByLength(lengths, cfg.train.batch, cfg.seed), steps * cfg.train.batch)

@@ -20,7 +20,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
 
     folder = Path(cfg.model) if cfg.model is not None else None
     trained = settings_of(folder, ContrastiveCommand, "retriever") if folder else cfg
-    preset, precision = trained.retriever, trained.train.precision
+    preset = trained.retriever
     if cfg.index == "faiss":
         from evaluation.index import import_faiss
 
@@ -38,6 +38,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     from data.frames import Frames
     from evaluation import embedding, figures, index, measures, ranking, tables
     from evaluation.checks import check_retrieval
+    from train.precision import settled
 
     queries, database = store.standard_test(), store.database("test")
     check_retrieval(store, queries, database)
@@ -46,6 +47,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     names = [embedding.frame_name(f) for f in database]
     targets = [embedding.frame_name(q.target) for q in queries]
     rows, curves, indexes = [], [], []
+    precision = settled(trained.train.precision)
     for embedder in embedding.embedders(folder, preset, precision, store, run.folder):
         asked = embedding.embed_queries(embedder, queries, store, frames, cfg.batch).rows(ids)
         shown = embedding.embed_frames(embedder, database, store, frames, cfg.batch)

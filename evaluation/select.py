@@ -20,7 +20,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 
     folder = Path(cfg.model) if cfg.model is not None else None
     trained = settings_of(folder, SftCommand, "student") if folder else cfg
-    student, precision, regime = trained.student, trained.train.precision, trained.train.regime
+    student, regime = trained.student, trained.train.regime
     modes = cfg.modes or (["answer"] if regime == "answer_only" else ["reasoning", "answer"])
     if folder is not None and regime == "answer_only" and "reasoning" in modes:
         raise UserError(
@@ -36,12 +36,14 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from evaluation import answers, figures, tables
     from evaluation.metrics import accuracy_by, accuracy_table
     from train import backbone, compatible, room
+    from train.precision import settled
 
     items = spread(store.selection("test", cfg.suite), cfg.limit, cfg.seed)
     if not items:
         suite = cfg.suite or store.suite
         raise UserError(f"{store.folder} has no test items of the {suite} suite to measure on")
     room.keep_big_blocks()
+    precision = settled(trained.train.precision)
     if folder is not None:
         compatible.check_base(folder, student.model)
         weights = product_folder(folder, "student")

@@ -35,6 +35,7 @@ from train.inputs import Inputs
 from train.late_loss import LateRankingLoss
 from train.mining import HardNegatives
 from train.negatives import Weighing
+from train.precision import settled
 from train.ranking import HeldOutRanking, LateHeldOutRanking
 from train.ranking_loss import RankingLoss
 from train.retriever import Retriever
@@ -50,10 +51,11 @@ def train_retriever(
     part of a step's queries."""
     room.keep_big_blocks()
     loop.keep_to_one_gpu()
+    cfg.train.precision = settled(cfg.train.precision)
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
     training, validation = split(cfg, store)
-    log.info("loading retriever %s", cfg.retriever.name)
+    log.info("loading retriever %s, to compute in %s", cfg.retriever.name, cfg.train.precision)
     if rank() == 0:
         compatible.note_base(run.folder, cfg.retriever.model)
     frames = Frames(store, cfg.retriever.image_size)

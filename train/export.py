@@ -66,12 +66,14 @@ def main(cfg: ExportStudentCommand, run: Run) -> Measured:
     from data.store import digest
     from train.card import text
     from train.compatible import check_base
+    from train.precision import settled
     from train.trained import EXPORT, export_record
 
     adapters = trained.student / "adapter_model.safetensors"
     if not adapters.exists():
         raise UserError(f"{trained.student} holds no adapters: delete the run and train again")
     check_base(trained.folder, trained.settings.student.model)
+    trained.settings.train.precision = settled(trained.settings.train.precision)
     weights = digest(adapters)
     folder = run.folder / "student"
     if folder.exists():

@@ -25,6 +25,7 @@ from train.features import Features, Keyed
 from train.generate import HeldOutAnswers
 from train.packing import PackingCollator, rope_of
 from train.planned import ByLength, Samples
+from train.precision import settled
 from train.sft_trainer import Epochs, LetterChoice, StudentTrainer, TokenChoice, token_mean
 from train.sights import SightCollator, SightTrainer, seen_words
 
@@ -37,9 +38,10 @@ def train_student(
     """Train a student in its run's folder and give what it measured there."""
     room.keep_big_blocks()
     loop.keep_to_one_gpu()
+    cfg.train.precision = settled(cfg.train.precision)
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
-    log.info("loading student %s", cfg.student.name)
+    log.info("loading student %s, to compute in %s", cfg.student.name, cfg.train.precision)
     if rank() == 0:
         compatible.note_base(run.folder, cfg.student.model)
     model, processor = backbone.load_student(

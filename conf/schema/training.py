@@ -25,8 +25,9 @@ class TrainConfig:
     epochs: float = 3.0
     max_steps: int = -1
     """Optimizer steps; -1 leaves it to `epochs`."""
-    precision: str = "bf16"
-    """bf16 or fp32: what the passes compute in; adapters and optimizer stay fp32."""
+    precision: str = "auto"
+    """bf16 or fp32: what the passes compute in; adapters and optimizer stay fp32. auto is bf16 on a
+    GPU or CPU that has instructions for it, and else fp32, which is then several times as fast."""
     gradient_checkpointing: bool = True
     """Whether activations are computed again in the backward pass: less memory, more time."""
     evaluations: int = 10
@@ -65,8 +66,10 @@ class TrainConfig:
             problems.append(
                 f"train.schedule={self.schedule}: the options are cosine, linear and constant"
             )
-        if self.precision not in ("bf16", "fp32"):
-            problems.append(f"train.precision={self.precision}: the options are bf16 and fp32")
+        if self.precision not in ("auto", "bf16", "fp32"):
+            problems.append(
+                f"train.precision={self.precision}: the options are auto, bf16 and fp32"
+            )
         if self.max_steps < 1 and (self.max_steps != -1 or self.epochs <= 0):
             problems.append(
                 f"train.max_steps={self.max_steps} and train.epochs={self.epochs}: give one or "
