@@ -1,9 +1,9 @@
 """What the tiny base learns from: questions whose answers the oracle holds, so that it can see and
 write before it is ever asked to choose.
 
-A frame is described by its objects and their places, alone and as one of four candidates; a clip by
-the built-in narrator, with the frame that comes of it shown or not; of several frames the one is
-named that is the later, or that fits a description. None of it is the selection task itself.
+A frame is described by its objects and their places, alone and among four candidates, one after the
+other; a clip by the built-in narrator, with the frame that comes of it shown or not; of several
+frames the one is named that is the later, or that fits a description. None of it is the selection task itself.
 """
 
 from __future__ import annotations
@@ -24,16 +24,18 @@ from train.conversation import Clip, Sample, Sight, answer_line, conversation
 from train.planned import Planned, rng_of
 
 FRAME = "Describe the frame."
-CANDIDATE = "Describe candidate {}."
+CANDIDATES = "Describe each candidate."
 CLIP = "Describe the scene, how its objects move, and what will come of it."
 LATER = 'Which candidate comes later? End with a line "Answer:" and the letter.'
 MATCH = (
     "Which candidate shows {}? Say of each candidate, in a line of its own, whether it matches and "
     'why. End with a line "Answer:" and the letter.'
 )
-ASKED = (FRAME, CANDIDATE, CLIP, LATER, MATCH)
-FRAMES = 4
-"""Frames described for each item in an epoch, and as many among candidates."""
+ASKED = (FRAME, CANDIDATES, CLIP, LATER, MATCH)
+FRAMES = 2
+"""Frames described for each item in an epoch."""
+SETS = 4
+"""Sets of candidates described for each item in an epoch."""
 MOVED = 0.08
 """Share of the view's width by which an object has moved in the later of two frames, at least."""
 CLEAR = 0.3
@@ -52,7 +54,7 @@ def kinds(
     make = _Maker(store, cfg, frames, seed)
     return {
         "frame": [make.frame(item, k) for item in items for k in range(FRAMES)],
-        "candidate": [make.candidate(item, items, k) for item in items for k in range(FRAMES)],
+        "candidates": [make.candidates(item, items, k) for item in items for k in range(SETS)],
         "clip": [clip for item in items for clip in make.clip(item)],
         "later": [later for item in items for later in make.later(item)],
         "match": [match for item in items for match in make.matched(item)],
@@ -89,32 +91,31 @@ class _Maker:
         sights = self._sights([(scene_id, frame, "")])
         return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], told, None, sights)
 
-    def candidate(self, item: SelectionItem, others: list[SelectionItem], k: int) -> Planned:
-        """One of four frames, which are an item's candidates or, the easier to tell apart, of four
-        items."""
-        account_of = account(self.store.scene(item.scene_id), item.prefix_stop)
-        make = partial(self._candidate, item, others, k)
-        return Planned(f"{CANDIDATE} {account_of}", len(LETTERS), make)
+    def candidates(self, item: SelectionItem, others: list[SelectionItem], k: int) -> Planned:
+        """Four frames: an item's candidates or, the easier to tell apart, of four items."""
+        told = account(self.store.scene(item.scene_id), item.prefix_stop)
+        text = f"{CANDIDATES} " + "\n".join(f"Candidate {letter}: {told}" for letter in LETTERS)
+        return Planned(text, len(LETTERS), partial(self._candidates, item, others, k))
 
-    def _candidate(
+    def _candidates(
         self, item: SelectionItem, others: list[SelectionItem], k: int, epoch: int
     ) -> Sample:
-        rng = rng_of(self.seed, epoch, item.item_id, "candidate", k)
+        rng = rng_of(self.seed, epoch, item.item_id, "candidates", k)
         if rng.random() < 0.5:
             own = [(c.scene_id, c.frame) for c in item.candidates]
             shown = [own[place] for place in rng.permutation(len(own))]
         else:
             drawn = [others[place] for place in rng.integers(len(others), size=len(LETTERS))]
             shown = [self._any(one, rng) for one in drawn]
-        asked = rng.integers(len(LETTERS))
         parts: list[str | np.ndarray] = []
+        told = []
         for letter, (scene_id, frame) in zip(LETTERS, shown, strict=True):
             parts += [f"\nCandidate {letter}: ", self.frames.array(scene_id, frame)]
-        parts.append(f"\n{CANDIDATE.format(LETTERS[asked])}")
-        scene_id, frame = shown[asked]
-        told = account(self.store.scene(scene_id), frame)
-        name = f"{item.item_id} (candidate {k})"
-        return conversation(name, parts, told, None, self._sights(lettered(shown)))
+            told.append(f"Candidate {letter}: {account(self.store.scene(scene_id), frame)}")
+        parts.append(f"\n{CANDIDATES}")
+        sights = self._sights(lettered(shown))
+        name = f"{item.item_id} (candidates {k})"
+        return conversation(name, parts, "\n".join(told), None, sights)
 
     def _any(self, item: SelectionItem, rng: np.random.Generator) -> tuple[str, int]:
         """Any of the frames that an item shows."""
