@@ -11,7 +11,7 @@ from huggingface_hub import ModelCardData
 from conf.schema import SftCommand
 from conf.sweep import AT_START
 from train.compatible import BASE
-from train.loop import BEST_STEP
+from train.journal import BEST_STEP
 
 SHOWN_PACKAGES = ("torch", "transformers", "peft", "bitsandbytes")
 WHAT = {

@@ -28,7 +28,7 @@ from conf.schema import ContrastiveCommand, ContrastiveTrainConfig
 from data.frames import Frames
 from data.records import RetrievalQuery
 from data.store import Store
-from train import checkpoints, compatible, loop, ranks, retriever, room
+from train import checkpoints, compatible, journal, loop, ranks, retriever, room
 from train.audit import audit_retriever
 from train.batches import Batch, Composed, batch_of
 from train.inputs import Inputs
@@ -99,7 +99,7 @@ def train_retriever(
     if rank() == 0:
         model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)
     log.info("the retriever is in %s", run.folder / "retriever")
-    return loop.evaluated(run.folder, best)
+    return journal.evaluated(run.folder, best)
 
 
 def split(

@@ -3,7 +3,8 @@ write before it is ever asked to choose.
 
 A frame is described by its objects and their places, alone and among four candidates, one after the
 other; a clip by the built-in narrator, with the frame that comes of it shown or not; of several
-frames the one is named that is the later, or that fits a description. None of it is the selection task itself.
+frames the one is named that is the later, or that fits a description. None of it is the selection
+task itself.
 """
 
 from __future__ import annotations

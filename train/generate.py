@@ -19,7 +19,8 @@ from conf.schema import StudentConfig
 from train.backbone import DTYPES
 from train.choice import parse
 from train.collate import Collator
-from train.loop import WRITTEN, is_out_of_memory
+from train.journal import WRITTEN
+from train.loop import is_out_of_memory
 from train.planned import Samples
 
 log = logging.getLogger(__name__)

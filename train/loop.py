@@ -1,4 +1,4 @@
-"""What both trainers share: arguments, journal, progress, resuming, and the end of a run."""
+"""What both trainers share: arguments, the course of a run, resuming, and its end."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import json
 import logging
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -18,44 +20,24 @@ from transformers import (
     PrinterCallback,
     ProgressCallback,
     Trainer,
-    TrainerCallback,
     TrainingArguments,
 )
-from transformers.trainer_callback import TrainerControl, TrainerState
+from transformers.trainer_callback import TrainerState
 
 from conf.entry import Run
 from conf.errors import UserError
 from conf.processes import visible_gpus
-from conf.runs import rank, write_text
+from conf.runs import rank
 from conf.schema import TrainConfig
-from conf.sweep import AT_START
 from train.backbone import unwritten
 from train.checkpoints import STATE
+from train.journal import Bar, Journal, NamedMeasure, read_journal
 from train.plots import curves_figure
 
 log = logging.getLogger(__name__)
 
-JOURNAL = "metrics.jsonl"
-WRITTEN = "samples.jsonl"
-"""What a student wrote at each evaluation of its run, one JSON line an answer."""
-BEST_STEP = "best_step"
-"""Name of the step whose checkpoint a run kept, among what it evaluated."""
-UNSHARED = ("_runtime", "_per_second", "total_flos", "train_loss")
-"""Ends of the logged names that no two runs share: timings, and the trainer's mean over the run,
-which counts only the steps since it was resumed."""
-
 PROJECT = "dynapix"
 """Under which trackers file a run."""
-SHOWN = {
-    "generated_parse_rate": "parsed",
-    "generated_accuracy": "right",
-    "letter_accuracy": "letter",
-    "token_accuracy": "token",
-    "loss": "loss",
-    "recall@10": "recall@10",
-}
-"""What the bar shows, by the end of its name, and what it is called there."""
-
 SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
 
 
@@ -136,33 +118,57 @@ def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: st
             no checkpoint, no evaluation has the named measure, or whatever else a user can mend,
             also where a worker process found it.
     """
+    watch(trainer, run)
+    check_fsdp(trainer, checkpoint)
+    with explained(trainer, run.folder, lower):
+        fit(trainer, checkpoint)
+    if rank() == 0:
+        curves_figure(read_journal(run.folder), run.folder / "curves.png")
+    best = trainer.state.best_global_step
+    if best:
+        named = f"{trainer.args.metric_for_best_model} is best, {trainer.state.best_metric:.4g}"
+        log.info("what is kept is the checkpoint of step %d, where %s", best, named)
+    return best
+
+
+def watch(trainer: Trainer, run: Run) -> None:
+    """Have the run's progress shown, kept and sent to its trackers."""
     trainer.remove_callback(ProgressCallback)
     trainer.remove_callback(PrinterCallback)
     trainer.add_callback(Bar())
     if rank() == 0:
         trainer.add_callback(Journal(run.folder))
     trainer.add_callback(NamedMeasure())
-    check_fsdp(trainer, checkpoint)
     # What a tracker keeps on disk belongs to the run; TensorBoard's is there by itself.
     os.environ.setdefault("WANDB_DIR", str(run.folder))
     os.environ.setdefault("WANDB_PROJECT", PROJECT)
+
+
+def fit(trainer: Trainer, checkpoint: Path | None) -> None:
+    """Train to the last step, from the start or a checkpoint."""
     if checkpoint is not None:
         log.info("going on from %s", checkpoint)
+    if checkpoint is not None and is_last(checkpoint):
+        # The trainer would take a step more.
+        trainer.state = TrainerState.load_from_json(str(checkpoint / STATE))
+        best = trainer.state.best_global_step or trainer.state.global_step
+        load(trainer, checkpoint.with_name(f"checkpoint-{best}"))
+        return
+    # What is told meanwhile stands above the bar.
+    with logging_redirect_tqdm():
+        trainer.train(resume_from_checkpoint=str(checkpoint) if checkpoint else None)
+
+
+@contextmanager
+def explained(trainer: Trainer, folder: Path, lower: str) -> Iterator[None]:
+    """Turn what the libraries raise at a user's machine into what its user can do."""
     try:
-        if checkpoint is not None and is_last(checkpoint):
-            # The trainer would take a step more.
-            trainer.state = TrainerState.load_from_json(str(checkpoint / STATE))
-            best = trainer.state.best_global_step or trainer.state.global_step
-            load(trainer, checkpoint.with_name(f"checkpoint-{best}"))
-        else:
-            # What is told meanwhile stands above the bar.
-            with logging_redirect_tqdm():
-                trainer.train(resume_from_checkpoint=str(checkpoint) if checkpoint else None)
+        yield
     except SafetensorError as error:
-        raise unwritten(run.folder, str(error)) from error
+        raise unwritten(folder, str(error)) from error
     except RuntimeError as error:
         if is_unwritten(error):
-            raise unwritten(run.folder, "a file was cut short; the disk may be full") from error
+            raise unwritten(folder, "a file was cut short; the disk may be full") from error
         if not is_out_of_memory(error):
             raise
         raise UserError(
@@ -171,13 +177,6 @@ def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: st
         ) from error
     except UserError as error:
         raise UserError(sentence(error)) from error
-    if rank() == 0:
-        curves_figure(read_journal(run.folder), run.folder / "curves.png")
-    best = trainer.state.best_global_step
-    if best:
-        named = f"{trainer.args.metric_for_best_model} is best, {trainer.state.best_metric:.4g}"
-        log.info("what is kept is the checkpoint of step %d, where %s", best, named)
-    return best
 
 
 def sentence(error: UserError) -> str:
@@ -237,106 +236,6 @@ def is_out_of_memory(error: RuntimeError) -> bool:
 def is_unwritten(error: RuntimeError) -> bool:
     """Whether torch could not write a file whole; it has no other sign of a full disk."""
     return "PytorchStreamWriter" in str(error) or "unexpected pos" in str(error)
-
-
-def evaluated(folder: Path, best: int | None = None) -> dict[str, float]:
-    """What a run evaluated at first and of what it kept: `<name>_at_start` and `<name>`. What it
-    kept is that of its last step, or of the step `best`, which is then given too."""
-    records = [r for r in read_journal(folder) if any(k.startswith("eval_") for k in r)]
-    results: dict[str, float] = {}
-    if best is not None:
-        records = [r for r in records if r["step"] <= best]
-        results[BEST_STEP] = float(best)
-    for record in records:
-        for key, value in record.items():
-            if key.startswith("eval_"):
-                name = key.removeprefix("eval_")
-                results.setdefault(f"{name}{AT_START}", value)
-                results[name] = value
-    return results
-
-
-class Journal(TrainerCallback):
-    """Appends what the trainer logs to the run's metrics.jsonl, and on resuming drops the lines
-    past the checkpoint from it and from samples.jsonl, so that both are an undisturbed run's."""
-
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / JOURNAL
-
-    def on_train_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
-        resumed = state.global_step > 0
-        for path in (self._path, self._path.with_name(WRITTEN)):
-            kept = [r for r in read_lines(path) if resumed and r["step"] <= state.global_step]
-            if kept or path.exists():
-                write_text(path, "".join(json.dumps(r) + "\n" for r in kept))
-
-    def on_log(self, args, state: TrainerState, control: TrainerControl, logs=None, **_) -> None:
-        values = {k: v for k, v in (logs or {}).items() if not k.endswith(UNSHARED)}
-        if not values.keys() - {"epoch"}:
-            return
-        with open(self._path, "a") as file:
-            file.write(json.dumps({"step": state.global_step, **values}) + "\n")
-
-
-class NamedMeasure(TrainerCallback):
-    """Holds train.best against what the evaluation at the start measured, before the first step."""
-
-    def on_step_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
-        best = args.metric_for_best_model
-        if best is None or state.best_global_step:
-            return
-        names = {k for r in state.log_history for k in r if k.startswith("eval_")}
-        names = sorted(k for k in names if not k.endswith((*UNSHARED, "_preparation_time")))
-        if f"eval_{best.removeprefix('eval_')}" not in names:
-            raise UserError(
-                f"train.best={best} is nothing that an evaluation of this run measures; the "
-                f"options are {', '.join(names)}"
-            )
-
-
-class Bar(ProgressCallback):
-    """The trainer's bar with its newest figures in it."""
-
-    def __init__(self, max_str_len: int = 100) -> None:
-        super().__init__(max_str_len)
-        self._figures: dict[str, dict[str, str]] = {"": {}}
-
-    def on_prediction_step(self, args, state, control, **_) -> None:
-        """An evaluation's own bar would break the line of the run's."""
-
-    def on_log(self, args, state, control, logs=None, **_) -> None:
-        for name, value in (logs or {}).items():
-            shown = next((end for end in SHOWN if name.endswith(end)), None)
-            if shown and not name.endswith(UNSHARED):
-                mode = name.removesuffix(shown).removeprefix("eval_").strip("_")
-                self._figures.setdefault(mode, {})[SHOWN[shown]] = f"{value:.3g}"
-        if self.training_bar is not None:
-            told = [
-                " ".join([mode, *(f"{name}={value}" for name, value in figures.items())]).strip()
-                for mode, figures in self._figures.items()
-                if figures
-            ]
-            self.training_bar.set_postfix_str(", ".join(told))
-
-
-def read_journal(folder: Path) -> list[dict[str, Any]]:
-    """The lines of a run's metrics.jsonl; one torn by a kill is passed over."""
-    return read_lines(folder / JOURNAL)
-
-
-def read_lines(path: Path) -> list[dict[str, Any]]:
-    """The JSON lines of a file that tell their step."""
-    if not path.exists():
-        return []
-    records = []
-    for line in path.read_text(errors="replace").splitlines():
-        try:
-            record = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(record, dict) and "step" in record:
-            records.append(record)
-    return records
 
 
 def check_not_empty(samples: int, what: str) -> None:

@@ -18,7 +18,17 @@ from conf.schema import SftCommand, SftTrainConfig
 from data.frames import Frames
 from data.records import Rationale
 from data.store import Store
-from train import backbone, checkpoints, compatible, loop, memory, ranks, room, samples
+from train import (
+    backbone,
+    checkpoints,
+    compatible,
+    journal,
+    loop,
+    memory,
+    ranks,
+    room,
+    samples,
+)
 from train.audit import audit
 from train.collate import Collator, letter_ids
 from train.features import Features, Keyed
@@ -79,7 +89,7 @@ def train_student(
     if rank() == 0:
         backbone.save(model, processor, run.folder / "student", cfg.train.precision, weights)
     log.info("the student is in %s", run.folder / "student")
-    return loop.evaluated(run.folder, best)
+    return journal.evaluated(run.folder, best)
 
 
 def split(

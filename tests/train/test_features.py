@@ -16,7 +16,7 @@ from train.backbone import load_student
 from train.collate import Collator
 from train.conversation import Clip, Sample, conversation, selection_sample
 from train.features import KEYS, Features, Keyed, keys_of
-from train.loop import read_journal
+from train.journal import read_journal
 from train.sft_trainer import token_mean
 
 PLENTY = 1 << 40

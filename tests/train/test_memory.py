@@ -12,7 +12,7 @@ from torch import nn
 
 from conf.entry import Run
 from conf.schema import SftCommand, SftTrainConfig
-from train import loop, memory, room, sft
+from train import journal, memory, room, sft
 from train.backbone import load_student
 from train.collate import Collator
 from train.memory import Choice, choose, settle, sizes
@@ -217,7 +217,7 @@ def test_what_is_chosen_learns_what_a_given_one_learns(
         folder: Path = tmp_path / name
         folder.mkdir()
         sft.main.__wrapped__(replace(settings, student=plain, train=train), Run(name, folder))
-        journals.append(loop.read_journal(folder))
+        journals.append(journal.read_journal(folder))
     chosen = json.loads((tmp_path / "auto" / memory.NOTE).read_text())
     assert chosen["gradient_checkpointing"] == short
     assert not (tmp_path / "given" / memory.NOTE).exists()

@@ -13,7 +13,7 @@ from conf.entry import Run
 from data.geometry import displacements
 from data.records import FrameRef
 from train import contrastive
-from train.loop import read_journal
+from train.journal import read_journal
 from train.mining import read, wrong
 from train.retriever import frame_input, load_trained, query_input
 from train.samples import held_out_scenes

@@ -18,7 +18,7 @@ from train import backbone, sft
 from train.attention import BY_FRAME
 from train.collate import IGNORED, Collator, Encoded, encode, pad
 from train.conversation import Sample, selection_sample
-from train.loop import read_journal
+from train.journal import read_journal
 from train.packing import PackingCollator, pack, rope_of
 from train.sft_trainer import token_mean
 

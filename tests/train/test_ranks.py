@@ -24,10 +24,10 @@ from torch.utils.data import BatchSampler
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import ContrastiveCommand, LateConfig, SftCommand
-from train import contrastive, loop, ranks, samples, sft
+from train import contrastive, journal, ranks, samples, sft
 from train.collate import IGNORED, Collator
 from train.conversation import selection_sample
-from train.loop import read_journal
+from train.journal import read_journal
 from train.planned import ByLength, Planned, Samples
 from train.sft_trainer import token_losses, token_mean
 
@@ -187,7 +187,7 @@ def test_two_ranks_are_one(settings, contrastive_settings, few, tmp_path) -> Non
     assert (record["ranks"], record["earlier_starts"]) == (2, [])
     assert (runs / "two" / "run.log").read_text().count("loading student") == 1
     assert json.loads((runs / "two" / "metrics.json").read_text()) == pytest.approx(
-        loop.evaluated(one), rel=1e-5
+        journal.evaluated(one), rel=1e-5
     )
 
 

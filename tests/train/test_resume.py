@@ -17,7 +17,7 @@ from conf.schema import LateConfig, SftCommand
 from train import contrastive, samples, sft
 from train.checkpoints import newest_checkpoint
 from train.compatible import check_base, note_base
-from train.loop import read_journal
+from train.journal import read_journal
 from train.planned import ByLength, Samples
 from train.sft_trainer import Epochs
 

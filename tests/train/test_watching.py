@@ -27,7 +27,7 @@ from evaluation.answers import AnswerLog, ask_all
 from train import backbone, sft
 from train.conversation import conversation
 from train.generate import HeldOutAnswers
-from train.loop import Bar, read_journal, read_lines
+from train.journal import Bar, read_journal, read_lines
 from train.planned import Planned, Samples
 
 
