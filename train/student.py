@@ -87,7 +87,9 @@ def train_student(
     best = loop.train_and_log(trainer, run, checkpoint, memory.lower(train))
     weights = loop.gathered(trainer)
     if rank() == 0:
-        backbone.save(model, processor, run.folder / "student", cfg.train.precision, weights)
+        # A base for others is written as bases are released, whatever it was computed in.
+        written = "bf16" if cfg.train.regime == "describe" else cfg.train.precision
+        backbone.save(model, processor, run.folder / "student", written, weights)
     log.info("the student is in %s", run.folder / "student")
     return journal.evaluated(run.folder, best)
 
