@@ -87,10 +87,9 @@ class Plan:
         return ["train.sft", f"+exp={regime}", f"seed={seed}", *self._common(regime, seed)]
 
     def measured(self, regime: str, seed: int) -> list[str]:
-        if regime == "zero-shot":
-            return ["evaluation.select", *self._common(regime, seed)]
         folder = self.checkpoints / "sft" / self.name(regime, seed)
-        return ["evaluation.select", f"model={folder}", *self._common(regime, seed)]
+        student = [] if regime == "zero-shot" else [f"model={folder}"]
+        return ["evaluation.select", *student, "batch=64", *self._common(regime, seed)]
 
     def kept(self, regime: str, seed: int) -> Path:
         return self.letters / f"{self.name(regime, seed)}.csv"
