@@ -28,7 +28,7 @@ class StudyCommand(CommandConfig):
     seed: int = 0
     """Of the draw of items, and of each annotator's order of items and candidates."""
     host: str = "127.0.0.1"
-    """Address that the server listens at; 0.0.0.0 for all of this machine's."""
+    """Address that the server listens at; 0.0.0.0 for all of this machine's, with public=."""
     port: int = 8765
     public: str | None = None
     """Where annotators reach it, such as https://study.example.org behind a proxy; null takes host
@@ -37,7 +37,8 @@ class StudyCommand(CommandConfig):
     @property
     def address(self) -> str:
         """What links begin with."""
-        return (self.public or f"http://{self.host}:{self.port}").rstrip("/")
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return (self.public or f"http://{host}:{self.port}").rstrip("/")
 
     def check(self) -> list[str]:
         least = {"annotators": 1, "practice": 0, "rest_every": 1}
@@ -46,6 +47,11 @@ class StudyCommand(CommandConfig):
             problems.append(f"items={self.items} asks nothing: give a number or a file")
         if not 0 < self.port < 65536:
             problems.append(f"port={self.port} is no port: give one of 1 to 65535")
+        if self.public is None and self.host in ("0.0.0.0", "::"):
+            problems.append(
+                f"host={self.host} does not say where annotators reach the study: give public=, "
+                "such as https://study.example.org"
+            )
         if self.public is not None and not _is_root(self.public):
             problems.append(
                 f"public={self.public} is no address of a host, such as https://study.example.org"

@@ -135,6 +135,37 @@ def test_a_taken_port_ends_the_command_with_a_sentence(path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"items": "0"}, "items=0 asks nothing"),
+        ({"items": ""}, "items= asks nothing"),
+        ({"annotators": 0}, "annotators=0 must be 1 or more"),
+        ({"port": 70000}, "port=70000 is no port"),
+        ({"public": "study.example.org"}, "is no address of a host"),
+        ({"public": "https://example.org/study"}, "is no address of a host"),
+        ({"host": "0.0.0.0"}, "does not say where annotators reach the study"),
+    ],
+)
+def test_settings_that_cannot_work_are_told(settings, said) -> None:
+    [problem] = StudyCommand(**settings).check()
+    assert said in problem
+
+
+@pytest.mark.parametrize(
+    ("settings", "address"),
+    [
+        ({}, "http://127.0.0.1:8765"),
+        ({"host": "::1", "port": 80}, "http://[::1]:80"),
+        ({"host": "0.0.0.0", "public": "https://a.example/"}, "https://a.example"),
+    ],
+)
+def test_links_begin_with_where_annotators_reach_the_study(settings, address) -> None:
+    cfg = StudyCommand(**settings)
+    assert cfg.check() == []
+    assert cfg.address == address
+
+
 def test_an_address_of_another_machine_is_told() -> None:
     with pytest.raises(UserError, match=r"host=192\.0\.2\.1 is no address of this machine"):
         serving.listener("192.0.2.1", 8765)
