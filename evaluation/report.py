@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from conf.entry import Run, command
 from conf.errors import UserError
@@ -25,7 +25,8 @@ Row = TypeVar("Row", "SelectionRow", "RetrievalRow")
 def main(cfg: ReportCommand, run: Run) -> None:
     root = Path(cfg.checkpoints)
     selected, retrieved = _finished(root, "select"), _finished(root, "retrieve")
-    if not selected and not retrieved:
+    studies = _finished(root, "export_study")
+    if not selected and not retrieved and not studies:
         raise UserError(
             f"nothing is measured below {root}: run python -m evaluation.select "
             "model=checkpoints/sft/RUN or python -m evaluation.retrieve "
@@ -36,6 +37,7 @@ def main(cfg: ReportCommand, run: Run) -> None:
         RetrievalRow,
         SelectionRow,
         cost_table,
+        human_table,
         retrieval_table,
         selection_table,
     )
@@ -59,9 +61,18 @@ def main(cfg: ReportCommand, run: Run) -> None:
         parts.append(f"benchmark {benchmark}\n{retrieval_table(rows)}\n\n{cost_table(rows)}")
         pictures.append(run.folder / f"retrieval-{benchmark}.png")
         retrieval_figure(rows, pictures[-1])
-    picture = run.folder / "report.png"
-    compose_page([p for p in pictures if p.exists()], picture)
-    page = "\n\n".join(parts) + f"\n\npicture: {picture}"
+    for folder in studies:
+        try:
+            found = _report(folder)
+            head = f"study {folder.name} on benchmark {found['benchmark']}"
+            parts.append(f"{head}\n{human_table(found)}")
+        except (KeyError, TypeError) as error:
+            raise _unreadable(folder) from error
+    if drawn := [p for p in pictures if p.exists()]:
+        picture = run.folder / "report.png"
+        compose_page(drawn, picture)
+        parts.append(f"picture: {picture}")
+    page = "\n\n".join(parts)
     log.info("%s", page)
     write_text(run.folder / "report.txt", page + "\n")
 
@@ -75,12 +86,23 @@ def _finished(root: Path, command_name: str) -> list[Path]:
 
 def _rows(folder: Path, row: type[Row]) -> list[Row]:
     try:
-        return [row.from_dict(r) for r in json.loads((folder / "report.json").read_text())["rows"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{folder / 'report.json'} is missing, damaged or of another version: delete {folder} "
-            "and measure again"
-        ) from error
+        return [row.from_dict(r) for r in _report(folder)["rows"]]
+    except (KeyError, TypeError) as error:
+        raise _unreadable(folder) from error
+
+
+def _report(folder: Path) -> dict[str, Any]:
+    try:
+        return json.loads((folder / "report.json").read_text())
+    except (OSError, ValueError) as error:
+        raise _unreadable(folder) from error
+
+
+def _unreadable(folder: Path) -> UserError:
+    return UserError(
+        f"{folder / 'report.json'} is missing, damaged or of another version: delete {folder} "
+        "and measure again"
+    )
 
 
 def training_table(runs: list[Path], root: Path) -> str:

@@ -211,6 +211,51 @@ def index_table(indexes: Sequence[dict[str, Any]]) -> str:
     return f"{table}\nR@k: of the exact first k, what share the index has among its own first k."
 
 
+def human_table(found: dict[str, Any]) -> str:
+    """What `evaluation.study.agreement.summary` found, beside the paper's study."""
+
+    def row(name: str, of: dict[str, Any]) -> list[str]:
+        shares = [of["families"].get(f, {}).get("value") for f in FAMILIES]
+        shares += [of["macro"], of["micro"]["value"]]
+        return [name, *map(_percent, shares), str(of["micro"]["n"])]
+
+    own = [row(name, of) for name, of in found["accuracy"].items()]
+    if found["majority"]:
+        own.append(row("Majority vote", found["majority"]))
+    times = [found["seconds"].get(f, {}).get("server") for f in FAMILIES]
+    own.append(["Median seconds", *("-" if t is None else f"{t:.1f}" for t in times), "", "", ""])
+    reference = [
+        [r.name, *map(_printed, (r.event, r.time, r.window, r.macro)), "", items]
+        for r, items in [*((r, "") for r in paper.HUMAN_ANNOTATORS), (paper.HUMAN_MAJORITY, "59")]
+    ]
+    seconds = [f"{paper.HUMAN_SECONDS[f]:.1f}" for f in FAMILIES]
+    reference.append(["Median seconds", *seconds, "", "", ""])
+    head = ["Human accuracy, %", *(f.capitalize() for f in FAMILIES), "Macro", "Micro", "Items"]
+    table = _table(head, {"": own, "paper (59 items of three simulators)": reference})
+    return "\n".join([table, *_human_notes(found)])
+
+
+def _human_notes(found: dict[str, Any]) -> list[str]:
+    depth = [f"{items} by {votes}" for votes, items in found["depth"].items()]
+    kappa, alpha = found["fleiss_kappa"], found["krippendorff_alpha"]
+    undecided = found["majority"]["undecided"] if found["majority"] else 0
+    return [
+        f"{found['judgments']:,} judgments of {found['items']:,} items; items by how many answered "
+        f"them: {', '.join(depth)}.",
+        f"Majority is more than half of an item's votes; items without one, counted wrong: "
+        f"{undecided}.",
+        f"Fleiss' kappa {_agreed(kappa['value'])} on the {kappa['items']} items that all "
+        f"{len(found['annotators'])} answered (paper {paper.HUMAN_KAPPA:.2f} on 19).",
+        f"Krippendorff's alpha {_agreed(alpha['value'])} on the {alpha['items']} items of two "
+        "votes or more.",
+        "Seconds are of pages that were loaded once.",
+    ]
+
+
+def _agreed(value: float | None) -> str:
+    return "undefined" if value is None else f"{value:.2f}"
+
+
 def _heads() -> list[str]:
     return [*(f"R@{k}" for k in RECALLS), "MRR", "Median", "Tied"]
 

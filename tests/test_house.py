@@ -24,6 +24,8 @@ COMMANDS = (
     "evaluation.select",
     "evaluation.retrieve",
     "evaluation.report",
+    "evaluation.study",
+    "evaluation.study.export",
 )
 HEAVY = {"torch", "transformers", "sentence_transformers", "pybullet", "matplotlib", "datasets"}
 

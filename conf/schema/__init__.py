@@ -34,6 +34,7 @@ from conf.schema.models import (
     RetrieverConfig,
     StudentConfig,
 )
+from conf.schema.study import ExportStudyCommand, StudyCommand
 from conf.schema.teacher import TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainConfig
 
@@ -47,6 +48,7 @@ __all__ = [
     "ContrastiveTrainConfig",
     "ExportCommand",
     "ExportStudentCommand",
+    "ExportStudyCommand",
     "GalleryCommand",
     "LateConfig",
     "LoraConfig",
@@ -63,6 +65,7 @@ __all__ = [
     "SftTrainConfig",
     "StatisticsCommand",
     "StudentConfig",
+    "StudyCommand",
     "TeacherConfig",
     "TrainConfig",
 ]

@@ -23,6 +23,8 @@ SCHEMAS = {
     "evaluation.select": schema.SelectCommand,
     "evaluation.retrieve": schema.RetrieveCommand,
     "evaluation.report": schema.ReportCommand,
+    "evaluation.study": schema.StudyCommand,
+    "evaluation.study.export": schema.ExportStudyCommand,
 }
 
 

@@ -1,0 +1,48 @@
+"""Export a study's votes, its server running or not, and say how right and how agreed they are."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+from conf.entry import Run, command
+from conf.errors import UserError
+from conf.runs import run_below, write_text
+from conf.schema import ExportStudyCommand
+
+log = logging.getLogger(__name__)
+
+VOTES = "votes.jsonl"
+
+
+@command("evaluation.study.export", ExportStudyCommand)
+def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
+    from evaluation.study import storage
+    from evaluation.study.agreement import summary
+    from evaluation.study.votes import votes_of
+    from evaluation.tables import human_table
+
+    runs = Path(cfg.checkpoints) / "study"
+    path = runs / run_below(cfg.run, str(runs)) / storage.DATABASE
+    if not storage.begun(path):
+        raise UserError(f"{path} is not there: begin a study with python -m evaluation.study")
+    db = storage.open_study(path)
+    with storage.transaction(db):
+        votes = list(votes_of(db))
+        about, items = storage.about(db), len(storage.item_ids(db, practice=False))
+        annotators = storage.annotators(db)
+    if not votes:
+        raise UserError(f"{path} holds no votes yet")
+    found = {"benchmark": about["benchmark"], **summary(votes, items, annotators)}
+    write_text(run.folder / VOTES, "".join(json.dumps(v.to_row()) + "\n" for v in votes))
+    write_text(run.folder / "report.json", json.dumps(found, indent=1))
+    table = human_table(found)
+    write_text(run.folder / "report.txt", table + "\n")
+    log.info("%s\n\nvotes: %s", table, run.folder / VOTES)
+    families = {f"majority_{f}": i["value"] for f, i in found["majority"]["families"].items()}
+    return {**families, "majority_macro": found["majority"]["macro"]}
+
+
+if __name__ == "__main__":
+    main()

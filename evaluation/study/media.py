@@ -1,0 +1,87 @@
+"""What an annotator sees of an item, encoded anew from its pixels and with nothing beside them."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from data.frames import Frames
+from data.records import SelectionItem
+
+VIDEO, IMAGE = "video/mp4", "image/png"
+PREFIX = -1
+"""Slot of an item's prefix; 0 to 3 are its candidates, in the item's own order."""
+CRF = "12"
+"""x264's constant rate factor: no loss that is seen."""
+SEI = "6"
+"""H.264 units in which x264 writes its version and settings."""
+
+
+@dataclass(frozen=True)
+class Medium:
+    slot: int
+    kind: str
+    width: int
+    height: int
+    content: bytes
+
+
+def media_of(item: SelectionItem, frames: Frames) -> list[Medium]:
+    """An item's prefix as a video at the scene's own rate, every frame of it, and its candidates as
+    images that are all of one size in bytes."""
+    shown = list(range(item.prefix_start, item.prefix_stop + 1))
+    prefix = frames.stack(item.scene_id, shown)
+    video = encode_video(prefix, frames.scene(item.scene_id).fps)
+    images = [frames.array(c.scene_id, c.frame) for c in item.candidates]
+    files = padded([encode_image(pixels) for pixels in images])
+    return [
+        _medium(PREFIX, VIDEO, prefix[0], video),
+        *(_medium(k, IMAGE, images[k], file) for k, file in enumerate(files)),
+    ]
+
+
+def encode_image(pixels: np.ndarray) -> bytes:
+    """A PNG of (height, width, 3) uint8."""
+    from PIL import Image
+
+    target = io.BytesIO()
+    Image.fromarray(pixels).save(target, "PNG")
+    return target.getvalue()
+
+
+def padded(files: list[bytes]) -> list[bytes]:
+    """The files at the size of the largest: how well an image compresses would tell it from the
+    others. What follows the end of a PNG is not read."""
+    size = max(map(len, files))
+    return [file.ljust(size, b"\0") for file in files]
+
+
+def encode_video(pixels: np.ndarray, fps: float) -> bytes:
+    """An mp4 (H.264) of (frames, height, width, 3) uint8 without dates or an encoder's name. An odd
+    side gets its last line twice, which the codec needs."""
+    import av
+    from av.bitstream import BitStreamFilterContext
+
+    _, height, width, _ = pixels.shape
+    even = np.pad(pixels, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+    target = io.BytesIO()
+    with av.open(target, "w", format="mp4", options={"fflags": "+bitexact"}) as container:
+        rate = Fraction(fps).limit_denominator(1001)
+        stream = container.add_stream("libx264", rate=rate, options={"crf": CRF})
+        stream.height, stream.width = even.shape[1:3]
+        stream.pix_fmt = "yuv420p"
+        plain = BitStreamFilterContext(f"filter_units=remove_types={SEI}", stream)
+        images = (av.VideoFrame.from_ndarray(frame, format="rgb24") for frame in even)
+        for image in (*images, None):
+            for packet in stream.encode(image):
+                container.mux(plain.filter(packet))
+        container.mux(plain.filter(None))
+    return target.getvalue()
+
+
+def _medium(slot: int, kind: str, pixels: np.ndarray, content: bytes) -> Medium:
+    height, width, _ = pixels.shape
+    return Medium(slot, kind, width, height, content)

@@ -1,0 +1,58 @@
+"""A study of the small benchmark, prepared once, and servers over copies of it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from conf.schema import StudyCommand
+from evaluation.study import preparing, storage
+from tests.evaluation.study.running import Server
+
+ITEMS = 59
+SMALL = 4
+
+
+def prepare(micro, micro_store, root: Path, items: int) -> Path:
+    cfg = StudyCommand(
+        benchmark=micro, store=str(micro_store.folder.parent), items=str(items), annotators=3
+    )
+    folder = root / "study" / str(items)
+    folder.mkdir(parents=True)
+    db = preparing.begin(cfg, folder / storage.DATABASE)
+    preparing.add_media(cfg, db, folder)
+    db.close()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def prepared(tmp_path_factory, micro, micro_store) -> Path:
+    """The run folder of a study of 59 items by three annotators, before it is served."""
+    return prepare(micro, micro_store, tmp_path_factory.mktemp("prepared"), ITEMS)
+
+
+@pytest.fixture(scope="session")
+def prepared_small(tmp_path_factory, micro, micro_store) -> Path:
+    return prepare(micro, micro_store, tmp_path_factory.mktemp("prepared"), SMALL)
+
+
+Serve = Callable[..., Server]
+
+
+@pytest.fixture(scope="module")
+def serve(tmp_path_factory) -> Iterator[Serve]:
+    """Starts the command over a copy of a prepared run folder."""
+    servers = []
+
+    def start(prepared: Path, *settings: str) -> Server:
+        folder = tmp_path_factory.mktemp("checkpoints") / "study" / prepared.name
+        shutil.copytree(prepared, folder)
+        servers.append(Server(folder, f"items={prepared.name}", *settings))
+        return servers[-1].start()
+
+    yield start
+    for server in servers:
+        server.kill()

@@ -1,0 +1,174 @@
+"""A real `python -m evaluation.study` to be started and killed, and annotators who speak HTTP."""
+
+from __future__ import annotations
+
+import re
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from html import unescape
+from http.client import HTTPConnection, HTTPException, HTTPMessage
+from pathlib import Path
+from urllib.parse import urlencode
+
+ROOT = Path(__file__).parents[3]
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
+
+
+class Server:
+    """The command on a study in checkpoints/study/NAME; its port stays when it is started again."""
+
+    def __init__(self, folder: Path, *settings: str) -> None:
+        self.folder, self.settings = folder, settings
+        self.port = free_port()
+        self.process: subprocess.Popen[str] | None = None
+
+    def command(self) -> list[str]:
+        checkpoints = self.folder.parent.parent
+        where = [f"run={self.folder.name}", f"checkpoints={checkpoints}", f"port={self.port}"]
+        return [sys.executable, "-m", "evaluation.study", *where, *self.settings]
+
+    def start(self) -> Server:
+        said = open(self.folder / "said.txt", "a")  # noqa: SIM115
+        self.process = subprocess.Popen(
+            self.command(), cwd=ROOT, stdout=said, stderr=subprocess.STDOUT, text=True
+        )
+        said.close()
+        Visitor(self.port).ask("GET", "/static/icon.svg")
+        return self
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def links(self) -> dict[str, str]:
+        lines = (self.folder / "links.txt").read_text().splitlines()
+        pairs = [line.split() for line in lines if not line.startswith("#")]
+        return {name: link.rpartition("/")[2] for name, link in pairs}
+
+
+@dataclass(frozen=True)
+class Reply:
+    status: int
+    headers: HTTPMessage
+    body: bytes
+
+    @property
+    def text(self) -> str:
+        return self.body.decode()
+
+    def hidden(self, name: str) -> str:
+        """The value of a hidden field of the page's form."""
+        return unescape(re.search(rf'name="{name}" value="([^"]*)"', self.text)[1])
+
+    def media(self) -> list[str]:
+        """Paths of the prefix and of the candidates, in the order they are shown."""
+        return re.findall(r'data-src="([^"]+)"', self.text)
+
+    @property
+    def action(self) -> str | None:
+        found = re.search(r'action="([^"]+)"', self.text)
+        return found and found[1]
+
+
+class Visitor:
+    """Somebody with a cookie jar, who asks again until a server is there."""
+
+    def __init__(self, port: int, patience: float = 60) -> None:
+        self.port, self.patience = port, patience
+        self.cookie: str | None = None
+        self._open: HTTPConnection | None = None
+
+    def ask(self, method: str, path: str, fields: dict | None = None, **headers: str) -> Reply:
+        if self.cookie:
+            headers.setdefault("Cookie", self.cookie)
+        body = None
+        if fields is not None:
+            body = urlencode(fields)
+            headers["Content-Type"] = "application/x-www-form-urlencoded"
+        until = time.monotonic() + self.patience
+        while True:
+            try:
+                if self._open is None:
+                    self._open = HTTPConnection("127.0.0.1", self.port, timeout=60)
+                self._open.request(method, path, body, headers)
+                reply = self._open.getresponse()
+                found = Reply(reply.status, reply.msg, reply.read())
+                break
+            except (OSError, HTTPException):
+                self._open = None
+                if time.monotonic() > until:
+                    raise
+                time.sleep(0.05)
+        if given := found.headers.get("Set-Cookie"):
+            self.cookie = given.partition(";")[0]
+        return found
+
+    def home(self) -> Reply:
+        return self.ask("GET", "/")
+
+    def sign_in(self, link: str) -> Visitor:
+        assert self.ask("POST", "/link", {"link": link}).status == 303
+        return self
+
+    def load(self, page: Reply) -> Reply:
+        return self.ask("POST", "/loaded", both(page))
+
+    def answer(self, page: Reply, letter: str, seconds: float = 1.5) -> Reply:
+        return self.ask("POST", "/answer", both(page) | {"choice": letter, "seconds": seconds})
+
+    def pass_by(self, page: Reply) -> Reply:
+        """Leave a page that asks nothing."""
+        return self.ask("POST", page.action, both(page) if page.action == "/go-on" else
+                        {"form_key": page.hidden("form_key")})  # fmt: skip
+
+    def to_question(self) -> Reply:
+        """The first page of the study itself."""
+        while True:
+            page = self.home()
+            if page.action != "/answer":
+                self.pass_by(page)
+            elif "Practice" in page.text:
+                self.load(page)
+                self.answer(page, "A")
+            else:
+                return page
+
+
+def both(page: Reply) -> dict[str, str]:
+    return {"form_key": page.hidden("form_key"), "key": page.hidden("key")}
+
+
+@dataclass
+class Annotator:
+    """Goes through a whole study, and keeps what was answered (letter by the item's key)."""
+
+    visitor: Visitor
+    choose: Callable[[int], str]
+    given: dict[str, str] = field(default_factory=dict)
+    rests: int = 0
+
+    def take_part(self, most: int | None = None) -> None:
+        while most is None or len(self.given) < most:
+            page = self.visitor.home()
+            if page.action is None:
+                return
+            if page.action != "/answer":
+                self.rests += "Time for a break" in page.text
+                self.visitor.pass_by(page)
+                continue
+            for path in page.media():
+                assert self.visitor.ask("GET", path).status in (200, 404)
+            self.visitor.load(page)
+            letter = self.choose(len(self.given))
+            assert self.visitor.answer(page, letter).status == 303
+            if "Practice" not in page.text:
+                self.given[page.hidden("key")] = letter

@@ -1,0 +1,156 @@
+"""Accuracy, majority and agreement, held against laws and an independent library."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections import Counter
+
+import krippendorff
+import numpy as np
+import pytest
+
+from conf.entry import Run
+from conf.errors import UserError
+from conf.schema import ReportCommand
+from data.records import FAMILIES
+from evaluation import report
+from evaluation.study.agreement import fleiss_kappa, krippendorff_alpha, majority, summary
+from evaluation.study.votes import Vote
+from evaluation.tables import human_table
+
+
+def vote(annotator: str, item: int, choice: int, family: str = "event", **changes) -> Vote:
+    told = {
+        "suite": "dynapix", "subtype": "x", "answer": 0, "letter": "A", "seconds": 10.0 + item,
+        "client_seconds": 9.0 + item, "loads": 1, "answered": "2026-01-31T00:00:00+00:00",
+    }  # fmt: skip
+    return Vote(annotator, f"i{item}", family=family, choice=choice, **{**told, **changes})
+
+
+def drawn(rng, items: int, depths: list[int]) -> list[list[int]]:
+    """Votes that agree more than chance."""
+    truth = rng.integers(4, size=items)
+    return [
+        [int(t) if rng.random() < 0.6 else int(rng.integers(4)) for _ in range(rng.choice(depths))]
+        for t in truth
+    ]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_alpha_is_that_of_an_independent_library(seed) -> None:
+    rng = np.random.default_rng(seed)
+    items = drawn(rng, 40, [1, 2, 3, 5])
+    table = np.array([np.bincount(c, minlength=4) for c in items])
+    expected = krippendorff.alpha(value_counts=table, level_of_measurement="nominal")
+    assert krippendorff_alpha(items) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_kappa_is_agreement_above_chance(seed) -> None:
+    items = drawn(np.random.default_rng(seed), 30, [3])
+    pairs = [a == b for c in items for a, b in itertools.combinations(c, 2)]
+    votes = Counter(itertools.chain(*items))
+    chance = sum((n / sum(votes.values())) ** 2 for n in votes.values())
+    observed = sum(pairs) / len(pairs)
+    assert fleiss_kappa(items) == pytest.approx((observed - chance) / (1 - chance), abs=1e-12)
+
+
+def test_agreement_does_not_hang_on_names_of_candidates_or_on_order() -> None:
+    rng = np.random.default_rng(0)
+    items = drawn(rng, 25, [3])
+    names = rng.permutation(4)
+    renamed = [[int(names[c]) for c in reversed(choices)] for choices in reversed(items)]
+    assert fleiss_kappa(renamed) == pytest.approx(fleiss_kappa(items))
+    assert krippendorff_alpha(renamed) == pytest.approx(krippendorff_alpha(items))
+    whole = [[0, 0, 0], [1, 1, 1], [3, 3, 3]]
+    assert fleiss_kappa(whole) == krippendorff_alpha(whole) == 1
+
+
+@pytest.mark.parametrize("items", [[], [[0], [1]], [[2, 2, 2], [2, 2, 2]]])
+def test_agreement_is_undefined_where_nothing_could_differ(items) -> None:
+    assert fleiss_kappa(items) is None
+    assert krippendorff_alpha(items) is None
+
+
+def test_kappa_refuses_uneven_depth() -> None:
+    with pytest.raises(ValueError, match="as many votes"):
+        fleiss_kappa([[0, 1], [0, 1, 1]])
+
+
+@pytest.mark.parametrize(
+    ("choices", "wins"),
+    [([2], 2), ([1, 1], 1), ([1, 2], None), ([0, 1, 2], None), ([3, 1, 3], 3), ([0, 0, 1, 1], None),
+     ([0, 0, 1, 2], None), ([0, 0, 0, 1], 0)],
+)  # fmt: skip
+def test_majority_is_strictly_more_than_half(choices, wins) -> None:
+    assert majority(choices) == wins
+
+
+def test_a_study_of_the_papers_shape() -> None:
+    """59 items, of which 10 have one vote, 30 two and 19 three: 127 judgments."""
+    rng = np.random.default_rng(0)
+    depths = [1] * 10 + [2] * 30 + [3] * 19
+    votes = [
+        vote(name, k, int(rng.integers(2)), FAMILIES[k % 3])
+        for k, depth in enumerate(depths)
+        for name in rng.permutation(["A1", "A2", "A3"])[:depth]
+    ]
+    found = summary(votes, 60, ["A1", "A2", "A3"])
+    assert (found["items"], found["judgments"]) == (60, 127)
+    assert found["depth"] == {"0": 1, "1": 10, "2": 30, "3": 19}
+    assert found["fleiss_kappa"]["items"] == 19
+    assert found["krippendorff_alpha"]["items"] == 49
+    assert sum(of["micro"]["n"] for of in found["accuracy"].values()) == 127
+    assert found["majority"]["micro"]["n"] == 59
+    by_item = {k: [v.choice for v in votes if v.item_id == f"i{k}"] for k in range(59)}
+    ties = sum(len(c) == 2 and c[0] != c[1] for c in by_item.values())
+    assert found["majority"]["undecided"] == ties > 0
+    right = sum(c.count(0) * 2 > len(c) for c in by_item.values())
+    assert found["majority"]["micro"]["value"] == pytest.approx(right / 59)
+    for name, of in found["accuracy"].items():
+        own = [v.right for v in votes if v.annotator == name]
+        assert of["micro"]["value"] == pytest.approx(sum(own) / len(own))
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    table = human_table(found)
+    assert "10 by 1, 30 by 2, 19 by 3" in table
+    assert max(map(len, table.splitlines())) <= 100
+
+
+def test_an_annotator_who_gave_nothing_has_no_row_and_leaves_no_complete_case() -> None:
+    found = summary([vote("A1", k, 0) for k in range(3)], 3, ["A1", "A2"])
+    assert list(found["accuracy"]) == ["A1"]
+    assert found["fleiss_kappa"] == {"value": None, "items": 0}
+    assert found["krippendorff_alpha"] == {"value": None, "items": 0}
+    assert "undefined" in human_table(found)
+
+
+def test_times_are_medians_of_pages_that_were_loaded_once() -> None:
+    votes = [vote("A1", k, 0, seconds=s, client_seconds=s / 2) for k, s in enumerate([4, 9, 5])]
+    votes.append(vote("A1", 3, 0, seconds=1e5, loads=2))
+    found = summary(votes, 4, ["A1"])["seconds"]
+    assert found == {"event": {"server": 5.0, "client": 2.5, "votes": 3}}
+
+
+def test_the_report_shows_an_exported_study_alone_too(tmp_path) -> None:
+    exported = tmp_path / "export_study" / "pilot"
+    exported.mkdir(parents=True)
+    (exported / "metrics.json").write_text("{}")
+    votes = [vote(name, k, k % 3, FAMILIES[k % 3]) for k in range(6) for name in ("A1", "A2")]
+    found = {"benchmark": "tiny", **summary(votes, 6, ["A1", "A2"])}
+    (exported / "report.json").write_text(json.dumps(found))
+    run = Run("x", tmp_path / "report")
+    run.folder.mkdir()
+    report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path)), run)
+    page = (run.folder / "report.txt").read_text()
+    assert page == f"study pilot on benchmark tiny\n{human_table(found)}\n"
+
+    (exported / "report.json").write_text('{"benchmark": "tiny"}')
+    with pytest.raises(UserError, match="damaged or of another version"):
+        report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path)), run)
+
+
+def test_a_vote_comes_back_from_its_row() -> None:
+    given = vote("A1", 1, 2)
+    assert Vote.from_row(json.loads(json.dumps(given.to_row()))) == given
+    assert given.to_row()["right"] is False

@@ -1,0 +1,202 @@
+"""The pages in a real Chromium: on a phone, on a desk, and by keyboard alone."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.remote.webelement import WebElement
+from selenium.webdriver.support.ui import WebDriverWait
+
+from evaluation.study import storage
+from evaluation.study.votes import Vote, votes_of
+
+pytestmark = pytest.mark.slow
+
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+PATIENCE = 60
+SMALLEST = 44
+"""Pixels of the least side of what a finger is to hit."""
+OVERFLOW = "return document.documentElement.scrollWidth > document.documentElement.clientWidth"
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory) -> Iterator[webdriver.Chrome]:
+    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    assert browser, "the study's pages are tested in Chromium: apt-get install chromium"
+    assert driver, "the study's pages are tested in Chromium: apt-get install chromium-driver"
+    options = webdriver.ChromeOptions()
+    options.binary_location = browser
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
+        options.add_argument(flag)
+    opened = webdriver.Chrome(options=options, service=Service(driver))
+    yield opened
+    opened.quit()
+
+
+@pytest.fixture(scope="module")
+def served(serve, prepared_small):
+    return serve(prepared_small, "rest_every=2")
+
+
+def sign_in(browser: webdriver.Chrome, served, name: str) -> None:
+    browser.get(f"http://127.0.0.1:{served.port}/link/{served.links()[name]}")
+
+
+def find(browser: webdriver.Chrome, what: str) -> WebElement:
+    return browser.find_element(By.CSS_SELECTOR, what)
+
+
+def await_page(browser: webdriver.Chrome) -> str:
+    """Wait until a page is all there, and tell which: its button's word, or its heading."""
+    WebDriverWait(browser, PATIENCE, 0.05).until(
+        lambda b: (
+            b.execute_script("return document.readyState") == "complete"
+            and not b.find_elements(By.CSS_SELECTOR, ".loading")
+        )
+    )
+    buttons = browser.find_elements(By.CSS_SELECTOR, "button.primary")
+    return buttons[0].text if buttons else find(browser, "h1").text
+
+
+def await_next(browser: webdriver.Chrome, act: Callable[[], None]) -> str:
+    """Do what leads to another page, and tell which."""
+    browser.execute_script("window.here = true")
+    act()
+    WebDriverWait(browser, PATIENCE, 0.05).until(
+        lambda b: not b.execute_script("return window.here === true")
+    )
+    return await_page(browser)
+
+
+def votes(served, name: str) -> list[Vote]:
+    db = storage.open_study(served.folder / storage.DATABASE)
+    found = [v for v in votes_of(db) if v.annotator == name]
+    db.close()
+    return found
+
+
+def check_fits(browser: webdriver.Chrome) -> None:
+    assert not browser.execute_script(OVERFLOW), "the page is wider than the screen"
+    for touched in browser.find_elements(By.CSS_SELECTOR, "button, label, .button"):
+        assert min(touched.size.values()) >= SMALLEST, touched.text
+
+
+@pytest.mark.parametrize(
+    ("name", "width", "height", "phone"),
+    [("A1", 390, 844, True), ("A2", 1280, 800, False)],
+    ids=["phone", "desk"],
+)
+def test_by_hand_all_of_it_fits_and_counts(chromium, served, name, width, height, phone) -> None:
+    screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": phone}
+    chromium.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    sign_in(chromium, served, name)
+    seen, given = [await_page(chromium)], []
+    while seen[-1] != "Thank you":
+        assert chromium.execute_script("return innerWidth") == width
+        check_fits(chromium)
+        if seen[-1] == "Confirm":
+            label = chromium.find_elements(By.TAG_NAME, "label")[len(given) % 4]
+            assert not find(chromium, "button.primary").is_enabled()
+            label.click()
+            given.append(label.text)
+        seen.append(await_next(chromium, find(chromium, "button.primary").click))
+    practice = ["Confirm", "Continue"] * 3
+    study = ["Continue", "Confirm", "Confirm", "Continue", "Confirm", "Confirm", "Thank you"]
+    assert seen == ["Sign in", "I agree to take part", *practice, *study]
+    found = votes(served, name)
+    assert [v.letter for v in found] == given[3:] == ["D", "A", "B", "C"]
+    for vote in found:
+        assert 0 < vote.client_seconds <= vote.seconds + 0.1
+        assert vote.loads == 1
+
+
+def test_by_keyboard_alone(chromium, served) -> None:
+    """Nothing is clicked. A page that is left and loaded again asks the same."""
+    chromium.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+    def press(*keys: str) -> Callable[[], None]:
+        return lambda: ActionChains(chromium).send_keys(*keys).perform()
+
+    sign_in(chromium, served, "A3")
+    page, given = await_page(chromium), []
+    ways = [("b",), ("3",), ("a", "d"), ("c", Keys.ARROW_RIGHT), ("2",), ("D",), ("1",)]
+    while page != "Thank you":
+        if page == "Confirm":
+            question = find(chromium, "main").get_attribute("data-key")
+            if len(given) == 4:
+                chromium.get(chromium.current_url)
+                assert await_page(chromium) == "Confirm"
+                assert find(chromium, "main").get_attribute("data-key") == question
+            for key in ways[len(given)]:
+                press(key)()
+            chosen = find(chromium, "input:checked")
+            given.append(chosen.get_attribute("value"))
+            assert chromium.switch_to.active_element == chosen
+        page = await_next(chromium, press(Keys.ENTER))
+    assert given == ["B", "C", "D", "D", "B", "D", "A"]
+    found = votes(served, "A3")
+    assert [v.letter for v in found] == given[3:]
+    assert [v.loads for v in found] == [1, 2, 1, 1]
+
+
+def test_the_video_plays_once_and_again_by_key_and_button(chromium, serve, prepared_small) -> None:
+    served = serve(prepared_small)
+    sign_in(chromium, served, "A1")
+    await_next(chromium, find(chromium, "button.primary").click)
+    await_next(chromium, find(chromium, "button.primary").click)
+
+    def ended(browser: webdriver.Chrome) -> bool:
+        return browser.execute_script("return document.querySelector('video').ended")
+
+    def play_by(act: Callable[[], None]) -> None:
+        WebDriverWait(chromium, PATIENCE, 0.05).until(ended)
+        act()
+        assert not ended(chromium)
+
+    play_by(ActionChains(chromium).send_keys("r").perform)
+    play_by(find(chromium, "#replay").click)
+    assert find(chromium, "video").get_attribute("src").startswith("blob:")
+    errors = [e for e in chromium.get_log("browser") if e["level"] == "SEVERE"]
+    assert not errors
+
+
+def test_a_server_that_goes_and_comes_back_costs_nothing(chromium, serve, prepared_small) -> None:
+    served = serve(prepared_small)
+    sign_in(chromium, served, "A1")
+    await_next(chromium, find(chromium, "button.primary").click)
+    await_next(chromium, find(chromium, "button.primary").click)
+    key = find(chromium, "main").get_attribute("data-key")
+    chromium.find_elements(By.TAG_NAME, "label")[1].click()
+    served.kill()
+    chromium.execute_script("window.here = true")
+    find(chromium, "button.primary").click()
+    WebDriverWait(chromium, PATIENCE, 0.05).until(
+        lambda b: "cannot be reached" in find(b, "#status").text
+    )
+    served.start()
+    until = time.monotonic() + PATIENCE
+    while chromium.execute_script("return window.here === true"):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    assert await_page(chromium) == "Continue"
+    db = storage.open_study(served.folder / storage.DATABASE)
+    [turn] = db.execute("SELECT letter FROM turn WHERE token = ?", (key,)).fetchall()
+    db.close()
+    assert turn["letter"] == "B"

@@ -1,0 +1,63 @@
+"""What is shown holds the frames' pixels and nothing else."""
+
+from __future__ import annotations
+
+import io
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from data.frames import Frames
+from evaluation.study.media import IMAGE, PREFIX, VIDEO, encode_video, media_of
+
+END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+
+
+@pytest.fixture(scope="module")
+def item(micro_store):
+    return next(i for i in micro_store.selection("test") if i.family == "time")
+
+
+def test_candidates_are_their_pixels_in_files_of_one_size(micro_store, item) -> None:
+    frames = Frames(micro_store)
+    prefix, *candidates = media_of(item, frames)
+    assert (prefix.slot, prefix.kind) == (PREFIX, VIDEO)
+    assert [m.slot for m in candidates] == [0, 1, 2, 3]
+    assert {m.kind for m in candidates} == {IMAGE}
+    assert len({len(m.content) for m in candidates}) == 1
+    for medium, candidate in zip(candidates, item.candidates, strict=True):
+        with Image.open(io.BytesIO(medium.content)) as image:
+            pixels = frames.array(candidate.scene_id, candidate.frame)
+            assert np.array_equal(np.asarray(image), pixels)
+            assert not image.info
+            assert image.size == (medium.width, medium.height)
+        head, end, rest = medium.content.partition(END)
+        assert end
+        assert not rest.strip(b"\0")
+        assert all(chunk not in head for chunk in (b"tEXt", b"tIME", b"eXIf", b"iTXt", b"zTXt"))
+
+
+def test_a_prefix_is_every_frame_at_the_scenes_rate_and_nothing_else(micro_store, item) -> None:
+    frames = Frames(micro_store)
+    prefix = media_of(item, frames)[0]
+    shown = list(range(item.prefix_start, item.prefix_stop + 1))
+    with av.open(io.BytesIO(prefix.content)) as video:
+        stream = video.streams.video[0]
+        assert float(stream.average_rate) == frames.scene(item.scene_id).fps
+        decoded = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+        told = {**video.metadata, **stream.metadata}
+    assert len(decoded) == len(shown)
+    expected = frames.stack(item.scene_id, shown).astype(int)
+    assert np.abs(np.stack(decoded) - expected).mean() < 3
+    assert set(told) <= {"major_brand", "minor_version", "compatible_brands", "language",
+                         "handler_name"}  # fmt: skip
+    assert not any(word in prefix.content for word in (b"x264", b"Lav", item.scene_id.encode()))
+
+
+def test_a_prefix_of_odd_sides_is_shown_whole() -> None:
+    pixels = np.random.default_rng(0).integers(256, size=(4, 51, 75, 3)).astype(np.uint8)
+    with av.open(io.BytesIO(encode_video(pixels, 30.0))) as video:
+        assert (video.streams.video[0].width, video.streams.video[0].height) == (76, 52)
+        assert len(list(video.decode(video=0))) == 4

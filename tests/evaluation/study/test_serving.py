@@ -1,0 +1,330 @@
+"""A whole study over HTTP, and everything that somebody might try with its server."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import re
+import sqlite3
+import stat
+import time
+from collections import Counter
+from threading import Thread
+from urllib.parse import urlencode
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from conf.entry import Run
+from conf.schema import ExportStudyCommand
+from data.frames import Frames
+from data.records import LETTERS
+from evaluation.study import export, storage
+from evaluation.study.guards import HEADERS
+from evaluation.study.votes import Vote, votes_of
+from tests.evaluation.study.conftest import ITEMS, SMALL
+from tests.evaluation.study.running import Annotator, Visitor, both
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def small(serve, prepared_small):
+    """A server of four items, for tests that each take another annotator."""
+    return serve(prepared_small)
+
+
+def rows(server, asked: str, *values) -> list[sqlite3.Row]:
+    db = storage.open_study(server.folder / storage.DATABASE)
+    try:
+        return db.execute(asked, values).fetchall()
+    finally:
+        db.close()
+
+
+@pytest.fixture
+def visitor(small) -> Visitor:
+    """The first annotator, signed in on another device each time."""
+    return Visitor(small.port).sign_in(small.links()["A1"])
+
+
+def test_a_study_of_59_items_by_three_annotators_killed_midway(serve, prepared, tmp_path) -> None:
+    server = serve(prepared)
+    annotators = [
+        Annotator(
+            Visitor(server.port).sign_in(server.links()[name]),
+            lambda k, shift=shift: LETTERS[(k + shift) % 4],
+        )
+        for shift, name in enumerate(["A1", "A2", "A3"])
+    ]
+    threads = [Thread(target=a.take_part, daemon=True) for a in annotators]
+    for thread in threads:
+        thread.start()
+    for killed_after in (40, 100):
+        while sum(len(a.given) for a in annotators) < killed_after:
+            assert all(thread.is_alive() for thread in threads)
+            time.sleep(0.02)
+        server.kill()
+        server.start()
+    for thread in threads:
+        thread.join(timeout=300)
+    assert [len(a.given) for a in annotators] == [ITEMS] * 3
+    assert [a.rests for a in annotators] == [2] * 3
+    kept = rows(
+        server, "SELECT token, letter FROM turn JOIN item USING (item_id) WHERE NOT practice"
+    )
+    assert dict(map(tuple, kept)) == {k: v for a in annotators for k, v in a.given.items()}
+
+    run = Run("x", tmp_path)
+    asked = ExportStudyCommand(run=server.folder.name, checkpoints=str(server.folder.parents[1]))
+    export.main.__wrapped__(asked, run)
+    text = (tmp_path / export.VOTES).read_text()
+    votes = [Vote.from_row(json.loads(line)) for line in text.splitlines()]
+    assert Counter(v.annotator for v in votes) == {"A1": ITEMS, "A2": ITEMS, "A3": ITEMS}
+    assert len({(v.annotator, v.item_id) for v in votes}) == 3 * ITEMS
+    secrets = [r["link"] for r in rows(server, "SELECT link FROM annotator")]
+    assert not any(secret in text for secret in secrets)
+    found = json.loads((tmp_path / "report.json").read_text())
+    assert found["depth"] == {"3": ITEMS}
+    assert found["fleiss_kappa"]["items"] == ITEMS
+    # Three annotators have an item's right answer at three letters.
+    places = Counter((v.item_id, _place_of_answer(server, v)) for v in votes)
+    assert set(places.values()) == {1}
+
+
+def _place_of_answer(server, vote: Vote) -> int:
+    asked = "SELECT shown FROM plan WHERE annotator = ? AND item_id = ?"
+    [row] = rows(server, asked, vote.annotator, vote.item_id)
+    assert int(row["shown"][LETTERS.index(vote.letter)]) == vote.choice
+    return row["shown"].index(str(vote.answer))
+
+
+def test_a_letter_stands_for_the_candidate_that_was_shown_there(small, micro_store) -> None:
+    visitor = Visitor(small.port).sign_in(small.links()["A2"])
+    page = visitor.to_question()
+    shown = [visitor.ask("GET", path).body for path in page.media()[1:]]
+    visitor.load(page)
+    visitor.answer(page, "C", seconds=3.25)
+    [turn] = rows(small, "SELECT * FROM turn WHERE token = ?", page.hidden("key"))
+    item = next(i for i in micro_store.selection("test") if i.item_id == turn["item_id"])
+    chosen = item.candidates[turn["choice"]]
+    pixels = Frames(micro_store).array(chosen.scene_id, chosen.frame)
+    assert np.array_equal(np.asarray(Image.open(io.BytesIO(shown[2]))), pixels)
+    assert turn["client_seconds"] == 3.25
+    assert turn["opened"] <= turn["loaded"] <= turn["answered"]
+
+
+def test_nothing_that_is_sent_tells_the_right_answer(small, micro_store) -> None:
+    """Pages of two annotators differ in the question, the order of what they show, and in words
+    drawn at random: nothing else is there that could depend on the answer."""
+    items = {i.item_id: i for i in micro_store.selection()}
+    visitor = Visitor(small.port).sign_in(small.links()["A3"])
+    answers, places, names = [], [], []
+    for k in range(SMALL + 3):
+        while (page := visitor.home()).action != "/answer":
+            visitor.pass_by(page)
+        [turn] = rows(
+            small,
+            "SELECT * FROM turn JOIN plan USING (annotator, item_id) WHERE token = ?",
+            page.hidden("key"),
+        )
+        item = items[turn["item_id"]]
+        paths = page.media()
+        names += paths
+        replies = [visitor.ask("GET", path) for path in paths]
+        assert {r.status for r in replies} == {200}
+        for told in (page.text, *(str(r.headers) for r in replies), *paths):
+            assert not any(
+                word in told
+                for word in (item.item_id, item.scene_id, item.family, item.subtype, "target")
+            )
+        assert not re.search(
+            r"same_|cross_|oracle|correct answer|right", page.text.split("<main")[1]
+        )
+        candidates = replies[1:]
+        heads = [{k: v for k, v in r.headers.items() if k != "date"} for r in candidates]
+        assert all(head == heads[0] for head in heads)
+        assert set(heads[0]) == {"content-length", "content-type"} | {h.lower() for h in HEADERS}
+        # A condition on a header that is not sent gets the whole again, and so does a range.
+        again = visitor.ask("GET", paths[1], **{"If-None-Match": "*", "Range": "bytes=0-9"})
+        assert (again.status, again.body) == (200, candidates[0].body)
+        places.append(turn["shown"].index(str(item.answer)))
+        answers.append(item.answer)
+        visitor.load(page)
+        visitor.answer(page, LETTERS[k % 4])
+        if k >= 3:
+            # What was answered is not shown again.
+            assert {visitor.ask("GET", path).status for path in paths} == {404}
+    assert len(set(names)) == len(names)
+    assert sorted(places[3:]) == [0, 1, 2, 3]
+
+
+def test_a_link_signs_in_once_and_looking_at_it_does_not(small) -> None:
+    link = small.links()["A1"]
+    for _ in range(2):
+        assert Visitor(small.port).ask("GET", f"/link/{link}").status == 200
+    first = Visitor(small.port).sign_in(link)
+    assert first.home().status == 200
+    assert Visitor(small.port).ask("POST", "/link", {"link": link}).status == 410
+    assert Visitor(small.port).ask("GET", f"/link/{link}").status == 410
+    assert small.links()["A1"] != link
+    # A new link is for another device: the one before is signed out.
+    second = Visitor(small.port).sign_in(small.links()["A1"])
+    assert (first.home().status, second.home().status) == (401, 200)
+    assert second.home().text.count(small.links()["A1"]) == 0
+
+
+def test_links_and_answers_are_for_their_owner_alone(small) -> None:
+    for name in ("links.txt", storage.DATABASE):
+        assert stat.S_IMODE((small.folder / name).stat().st_mode) == 0o600
+    assert not any(
+        link in (small.folder / "run.log").read_text() for link in small.links().values()
+    )
+
+
+def test_a_cookie_is_kept_from_scripts_and_other_sites(small) -> None:
+    reply = Visitor(small.port).ask("POST", "/link", {"link": small.links()["A1"]})
+    assert {"httponly", "samesite=lax", "path=/"} <= set(
+        reply.headers["set-cookie"].lower().split("; ")
+    )
+
+
+def test_every_reply_carries_the_headers_that_shut_other_sites_out(small, visitor) -> None:
+    for path in ("/", "/nothing", "/static/study.css", "/static/nothing", "/link/x", "/media/x"):
+        told = visitor.ask("GET", path).headers
+        assert {name: told[name] for name in HEADERS} == HEADERS
+        assert not {"server", "etag", "last-modified"} & {name.lower() for name in told}
+    assert "unsafe" not in HEADERS["Content-Security-Policy"]
+
+
+def test_a_replayed_or_early_or_forged_answer_does_nothing(small, visitor) -> None:
+    page = visitor.to_question()
+    assert visitor.answer(page, "A").status == 303
+    [turn] = rows(small, "SELECT * FROM turn WHERE token = ?", page.hidden("key"))
+    assert turn["answered"] is None, "answered before anything was on the screen"
+    visitor.load(page)
+    visitor.answer(page, "B")
+    [kept] = map(tuple, rows(small, "SELECT * FROM turn WHERE token = ?", page.hidden("key")))
+    for letter in LETTERS:
+        assert visitor.answer(page, letter).status == 303
+    assert visitor.load(page).status == 409
+    [after] = map(tuple, rows(small, "SELECT * FROM turn WHERE token = ?", page.hidden("key")))
+    assert after == kept
+
+    # Another annotator's item, under one's own session.
+    other = Visitor(small.port).sign_in(small.links()["A2"])
+    theirs = other.to_question()
+    other.load(theirs)
+    mine = visitor.home()
+    forged = {"form_key": mine.hidden("form_key"), "key": theirs.hidden("key")}
+    assert visitor.ask("POST", "/loaded", forged).status == 409
+    visitor.ask("POST", "/answer", forged | {"choice": "A", "seconds": "1"})
+    [turn] = rows(small, "SELECT * FROM turn WHERE token = ?", theirs.hidden("key"))
+    assert (turn["answered"], turn["loads"]) == (None, 1)
+    assert {visitor.ask("GET", path).status for path in theirs.media()} == {404}
+
+
+@pytest.mark.parametrize(
+    ("changes", "status"),
+    [
+        ({"choice": "E"}, 400),
+        ({"choice": "<script>alert(1)</script>"}, 400),
+        ({"choice": "AB"}, 400),
+        ({"choice": ""}, 400),
+        ({"seconds": "nan"}, 400),
+        ({"seconds": "-1"}, 400),
+        ({"seconds": "1e300"}, 400),
+        ({"seconds": "'; DROP TABLE turn; --"}, 400),
+        ({"key": "' OR 1=1 --"}, 303),
+        ({"key": "\x00\ud7ff"}, 303),
+        ({"key": "x" * 5000}, 413),
+        ({"form_key": "x"}, 403),
+        ({"form_key": "é"}, 403),
+        ({f"f{k}": "" for k in range(50)}, 400),
+    ],
+)
+def test_hostile_fields_do_nothing(small, visitor, changes, status) -> None:
+    page = visitor.to_question()
+    visitor.load(page)
+    before = rows(small, "SELECT count(*), count(answered), max(rests) FROM turn, annotator")
+    reply = visitor.ask("POST", "/answer", {**both(page), "choice": "A", "seconds": "1", **changes})
+    assert reply.status == status
+    assert "<script>alert" not in reply.text
+    after = rows(small, "SELECT count(*), count(answered), max(rests) FROM turn, annotator")
+    assert list(map(tuple, before)) == list(map(tuple, after))
+
+
+def test_another_sites_forms_are_refused(visitor) -> None:
+    page = visitor.to_question()
+    for headers in (
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": f"https://127.0.0.1:{visitor.port + 1}"},
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Sec-Fetch-Site": "same-site"},
+    ):
+        for path in ("/consent", "/go-on", "/loaded", "/answer", "/link"):
+            assert visitor.ask("POST", path, both(page), **headers).status == 403
+    own = {"Origin": f"http://127.0.0.1:{visitor.port}"}
+    assert visitor.ask("POST", "/loaded", both(page), **own).status == 204
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/static/../app.py", "/static/%2e%2e/app.py", "/static/..%2fapp.py", "/media/../study.sqlite",
+     "/media/%00", "/study.sqlite", "/links.txt", "//etc/passwd", "/media/" + "a" * 4000,
+     "/link/%ff%fe", "/export", "/votes.jsonl"],
+)  # fmt: skip
+def test_tricks_with_paths_find_nothing(small, visitor, path) -> None:
+    reply = visitor.ask("GET", path)
+    assert reply.status in (404, 410)
+    assert "Traceback" not in reply.text
+    assert visitor.ask("DELETE", path).status in (404, 405)
+
+
+def test_without_a_session_there_is_nothing_to_see_or_do(small, visitor) -> None:
+    page = visitor.to_question()
+    for cookie in ("", "study=", "study=x", "study=' OR 1=1 --", "study=" + "x" * 4000):
+        stranger = Visitor(small.port)
+        stranger.cookie = cookie
+        assert stranger.home().status == 401
+        assert {stranger.ask("GET", path).status for path in page.media()} == {401}
+        assert stranger.load(page).status == 401
+
+
+def test_a_thousand_requests_at_once_are_answered_and_count_once(small, visitor) -> None:
+    page = visitor.to_question()
+    visitor.load(page)
+    votes = len(rows(small, "SELECT 1 FROM turn WHERE answered IS NOT NULL"))
+
+    async def one(k: int) -> int:
+        body = urlencode({**both(page), "choice": LETTERS[k % 4], "seconds": 1})
+        head = "GET /" if k % 2 else "POST /answer"
+        sent = "" if k % 2 else body
+        reader, writer = await asyncio.open_connection("127.0.0.1", small.port)
+        writer.write(
+            f"{head} HTTP/1.1\r\nHost: x\r\nConnection: close\r\nCookie: {visitor.cookie}\r\n"
+            f"Content-Length: {len(sent)}\r\n\r\n{sent}".encode()
+        )
+        status = await reader.readline()
+        await reader.read()
+        writer.close()
+        return int(status.split()[1])
+
+    async def all_at_once() -> Counter:
+        return Counter(await asyncio.gather(*(one(k) for k in range(1000))))
+
+    assert asyncio.run(all_at_once()) == {200: 500, 303: 500}
+    assert len(rows(small, "SELECT 1 FROM turn WHERE answered IS NOT NULL")) == votes + 1
+    assert visitor.home().status == 200
+
+
+def test_votes_hold_answers_to_the_study_alone(small) -> None:
+    db = storage.open_study(small.folder / storage.DATABASE)
+    practised = set(storage.item_ids(db, practice=True))
+    votes = list(votes_of(db))
+    db.close()
+    assert votes
+    assert not {v.item_id for v in votes} & practised
