@@ -21,18 +21,20 @@ from teacher.predicates import (
     facts_of,
 )
 
-NARRATOR_VERSION = "4"
-ENOUGH = 110
-"""Words under which a rationale is told in full: well above the 80 that it needs (paper, Rationale
-construction)."""
-SPARSE, FULL = (4, 1, 2, 1, 1), (6, 4, 6, 2, 2)
-"""Objects parsed, movers analysed, objects predicted, differences a candidate and pairs of each
-kind that are named: in a rationale, where four candidates take the room, and else."""
+NARRATOR_VERSION = "5"
+ENOUGH, ROOM = 110, 250
+"""Words under which a rationale is told in full, well above the 80 that it needs, and over which it
+is told in brief (paper, Rationale construction)."""
+BRIEF, SPARSE, FULL = (3, 1, 1, 1), (4, 1, 2, 1), (6, 4, 6, 2)
+"""Objects parsed, movers analysed, objects predicted and pairs of each kind that are named: in a
+rationale, where four candidates take the room, and else."""
 
 
 def narrate(predicates: Predicates, item: SelectionItem, seed: int, attempt: int = 0) -> str:
     """A rationale of 80 to 250 words; the same arguments give the same text."""
     text = _Voice(SPARSE, seed, item.item_id, attempt).rationale(predicates)
+    if len(text.split()) > ROOM:
+        text = _Voice(BRIEF, seed, item.item_id, attempt).rationale(predicates)
     if len(text.split()) < ENOUGH:
         text = _Voice(FULL, seed, item.item_id, attempt, padded=True).rationale(predicates)
     return text
@@ -50,9 +52,25 @@ def describe(scene: Scene, start: int, stop: int, target: int, seed: int) -> str
 def matches(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:
     """Whether each candidate matches the predicted state and why, a line a candidate; the same
     arguments give the same lines."""
-    voice = _Voice(SPARSE, item.item_id, "matches")
+    voice, key = _Voice(SPARSE, item.item_id, "matches"), telling(predicates)
     expected = {o.object: o.target_region for o in predicates.objects}
-    return tuple(voice.match(c, expected) for c in predicates.candidates)
+    return tuple(voice.match(c, key, expected) for c in predicates.candidates)
+
+
+def telling(predicates: Predicates) -> ObjectFacts:
+    """The object by whose place most candidates are told from the target; of several the first
+    that the prediction is about. All candidates are compared by it, so that each is described
+    before it is judged."""
+    wrong = [c.differences for c in predicates.candidates if not c.agrees]
+
+    def told_apart(o: ObjectFacts) -> int:
+        return sum(
+            any(d.object == o.object and d.kind in ("region", "missing") for d in differences)
+            for differences in wrong
+        )
+
+    ranked = sorted(predicates.objects, key=lambda o: _rank(predicates, o))
+    return max([o for o in ranked if o.target_sight == "shown"] or ranked, key=told_apart)
 
 
 def _sentences(statements: list[str]) -> str:
@@ -72,21 +90,22 @@ class _Voice:
     """A narrator whose choices of phrasing follow from `keys` alone."""
 
     def __init__(
-        self, detail: tuple[int, int, int, int, int], *keys: int | str, padded: bool = False
+        self, detail: tuple[int, int, int, int], *keys: int | str, padded: bool = False
     ) -> None:
         digest = hashlib.sha256(repr(keys).encode()).digest()
         self.rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-        self.parsed, self.analysed, self.predicted, self.differences, self.pairs = detail
+        self.parsed, self.analysed, self.predicted, self.pairs = detail
         self.padded = padded
 
     def pick(self, *options: str) -> str:
         return options[self.rng.integers(len(options))]
 
     def rationale(self, predicates: Predicates) -> str:
+        key = telling(predicates)
         return "\n".join(
             [
-                *self.opening(predicates),
-                f"Candidate analysis: {_sentences(self.candidates(predicates))}",
+                *self.opening(predicates, key),
+                f"Candidate analysis: {_sentences(self.candidates(predicates, key))}",
                 f"Outcome: {_sentences(self.outcome(predicates, predicates.answer))}",
                 f"Answer: {predicates.answer}",
             ]
@@ -97,12 +116,14 @@ class _Voice:
             [*self.opening(facts), f"Outcome: {_sentences(self.outcome(facts, None))}"]
         )
 
-    def opening(self, facts: Facts) -> list[str]:
+    def opening(self, facts: Facts, key: ObjectFacts | None = None) -> list[str]:
+        """All before the candidates, whose `key` object is predicted first."""
         ranked = sorted(facts.objects, key=lambda o: _rank(facts, o))
+        predicted = sorted(ranked, key=lambda o: o is not key) if key else ranked
         return [
             f"Scene parse: {_sentences(self.parse(facts, ranked))}",
             f"Motion analysis: {_sentences(self.motion(facts, ranked))}",
-            f"Prediction: {_sentences(self.prediction(facts, ranked))}",
+            f"Prediction: {_sentences(self.prediction(facts, predicted))}",
         ]
 
     def parse(self, facts: Facts, ranked: list[ObjectFacts]) -> list[str]:
@@ -206,30 +227,37 @@ class _Voice:
             f"the {o.object} should be {o.target_region}",
         )
 
-    def candidates(self, predicates: Predicates) -> list[str]:
+    def candidates(self, predicates: Predicates, key: ObjectFacts) -> list[str]:
         expected = {o.object: o.target_region for o in predicates.objects}
-        return [self.candidate(c, expected) for c in predicates.candidates]
+        return [self.candidate(c, key, expected) for c in predicates.candidates]
 
-    def candidate(self, candidate: CandidateFacts, expected: dict[str, str]) -> str:
-        name = f"candidate {candidate.letter}"
+    def candidate(
+        self, candidate: CandidateFacts, key: ObjectFacts, expected: dict[str, str]
+    ) -> str:
+        """Where a candidate shows the `key` object, and then whether it agrees."""
+        name, shown = f"candidate {candidate.letter}", f"shows the {key.object}"
         if candidate.agrees:
-            return self.pick(
-                f"{name} agrees with the prediction for every object",
-                f"{name} agrees, with every object where it should be",
-                f"{name} shows the expected layout",
-            )
-        differences = candidate.differences[: self.differences]
-        told = " and ".join(self.difference(d, expected) for d in differences)
-        if candidate.other_objects:
-            return f"{name} shows other objects and {told}"
-        return self.pick(f"{name} {told}", f"{name} wrongly {told}")
+            end = self.pick("", " with the prediction")
+            return f"{name} {shown} {key.target_region} and agrees{end}"
+        others = ", and shows other objects" * candidate.other_objects
+        differs = {d.object: d for d in candidate.differences}.get(key.object)
+        if differs is None:
+            why = self.difference(candidate.differences[0], expected)
+            return f"{name} {shown} {key.target_region} but {why}{others}"
+        if differs.kind == "displaced":
+            way = f" toward the {differs.heading}" if differs.heading else ""
+            return f"{name} {shown} {key.target_region} but {differs.extent} off{way}{others}"
+        if differs.kind == "missing":
+            return f"{name} lacks the {key.object}{others}"
+        return f"{name} {shown} {differs.region}, not {key.target_region}{others}"
 
-    def match(self, candidate: CandidateFacts, expected: dict[str, str]) -> str:
+    def match(self, candidate: CandidateFacts, key: ObjectFacts, expected: dict[str, str]) -> str:
         name = f"Candidate {candidate.letter}"
         if candidate.agrees:
             return f"{name} matches: every object is where it should be."
+        first = min(candidate.differences, key=lambda d: d.object != key.object)
         why = ["shows other objects"] * candidate.other_objects
-        why += [self.difference(d, expected) for d in candidate.differences[:1]]
+        why.append(self.difference(first, expected))
         return f"{name} does not match: it {' and '.join(why)}."
 
     def difference(self, d: Difference, expected: dict[str, str]) -> str:
