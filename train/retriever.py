@@ -32,7 +32,7 @@ from train.backbone import (
     nothing_adapted,
     pin_sizes,
 )
-from train.compatible import check_processor, check_tower
+from train.compatible import check_pooling, check_processor, check_tower
 from train.late import keep_projection_exact, late_modules, load_late
 from train.ranks import from_main
 from train.tiny import build_model, build_processor
@@ -56,12 +56,14 @@ def load_retriever(
 
     Raises:
         UserError: the model is not on this machine and cannot be fetched; it has no vision tower,
-            or a processor of another model.
+            or a processor of another model; it was saved by another pooling.
     """
     source = cfg.model
     if cfg.architecture is not None:
         source = from_main(partial(built, cfg, corpus, folder))
     check_reachable("retriever", source)
+    if cfg.late is None and (Path(source) / "modules.json").exists():
+        check_pooling(Path(source))
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     try:
         config = AutoConfig.from_pretrained(source, **origin)
