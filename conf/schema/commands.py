@@ -214,11 +214,6 @@ class ContrastiveCommand(CommandConfig):
                 "train.width_weights with retriever.late: its vectors have one width, leave the "
                 "weights null"
             )
-        if self.train.mine_every and self.retriever.late is not None:
-            problems.append(
-                f"train.mine_every={self.train.mine_every} with retriever.late: hard negatives are "
-                "mined by one vector a frame, leave train.mine_every=0"
-            )
         if self.train.reuse_features and not self.retriever.lora.rank:
             problems.append(
                 "train.reuse_features=true: without adapters the vision tower is trained, and what "

@@ -212,6 +212,10 @@ class ContrastiveTrainConfig(TrainConfig):
                 f"train.batch={self.batch} with train.hard_negatives=0 leaves no negatives: give a "
                 "batch of 2 or more, or hard negatives"
             )
+        if self.batches == "scenes" and self.scene_queries > self.batch:
+            problems.append(
+                f"train.scene_queries={self.scene_queries} must be at most train.batch={self.batch}"
+            )
         if self.mine_every and not self.hard_negatives:
             problems.append(
                 f"train.mine_every={self.mine_every} with train.hard_negatives=0 mines nothing: "
