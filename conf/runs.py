@@ -24,6 +24,9 @@ from conf.errors import SettingsError, UserError
 ELSEWHERE = ("run", "store", "checkpoints", "workers", "host", "port", "public")
 """Keys that say where and how fast a run goes, not what comes out of it."""
 
+TRAINERS = {"student": "sft", "retriever": "contrastive"}
+"""The folders of runs below checkpoints/, by what they train."""
+
 PACKAGES = (
     "torch",
     "transformers",
@@ -77,6 +80,11 @@ def run_below(run: str, folder: str) -> str:
     return os.path.normpath(run) if path.startswith("..") else path
 
 
+def runs_of(checkpoints: str, product: str) -> str:
+    """The folder of the runs that train a product, student or retriever."""
+    return f"{checkpoints}/{TRAINERS.get(product, product)}"
+
+
 def is_name(run: str) -> bool:
     """Whether a run's name leads to a folder below another one; a sweep's job is SWEEP/NUMBER."""
     return not os.path.isabs(run) and run.split(os.sep)[0] not in (".", "..")
@@ -90,6 +98,7 @@ def finished(run: Run) -> dict[str, float] | None:
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 OmegaConf.register_new_resolver("run_below", run_below, replace=True)
+OmegaConf.register_new_resolver("runs_of", runs_of, replace=True)
 
 
 def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[str]) -> None:

@@ -28,7 +28,7 @@ from train.compatible import (
     processor_digest,
     weights_digest,
 )
-from train.trained import run_title
+from train.trained import product_folder, run_title
 
 if TYPE_CHECKING:
     from train.retriever import Retriever
@@ -89,13 +89,13 @@ def embedders(
 
 
 def trained_embedder(folder: Path, preset: RetrieverConfig, precision: str) -> Embedder:
-    """The retriever of a run of train.contrastive.
+    """The retriever of a run of train.contrastive, or of an export.
 
     Raises:
         UserError: it is over another base than `preset` names, or saved by another pooling.
     """
     check_base(folder, preset.model)
-    saved = folder / "retriever"
+    saved = product_folder(folder, "retriever")
     if preset.late is None:
         check_pooling(saved)
 
