@@ -128,3 +128,8 @@ def test_weights_that_are_no_numbers(contrastive_settings, saved_base, tmp_path)
     with pytest.raises(UserError, match=r"the embedding of query \S+ is no number: a lower train"):
         contrastive.main.__wrapped__(settings, Run("run", folder))
     assert not (folder / "retriever").exists()
+
+
+def test_sharding_is_refused(contrastive_settings, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
+    refused(contrastive_settings, tmp_path / "run", "FSDP does not shard a retriever: .* leave")
