@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from data.frames import Frames
 from data.records import RetrievalQuery
 from data.retrieval.checks import check_training
 from data.store import Store
-from train import checkpoints, compatible, journal, loop, ranks, retriever, room
+from train import checkpoints, compatible, journal, loop, mini_batches, ranks, retriever, room
 from train.audit import audit_retriever
 from train.batches import Batch, Composed, batch_of
 from train.inputs import Inputs
@@ -69,10 +70,12 @@ def train_retriever(
     longest = retriever.longest_query(training, model.tokenizer)
     log.info(audit_retriever(model, cfg.retriever, longest, frames))
 
-    checkpoint = checkpoints.newest_checkpoint(run.folder)
-    inputs = Inputs(model, frames, cfg.retriever, cfg.train.precision)
     late = cfg.retriever.late is not None
     ranking = LateRankingLoss if late else RankingLoss
+    inputs = Inputs(model, frames, cfg.retriever, cfg.train.precision)
+    train = mini_batches.settle(cfg.train, run.folder, model, inputs, ranking, training)
+    cfg = replace(cfg, train=train)
+    checkpoint = checkpoints.newest_checkpoint(run.folder)
     negatives = HardNegatives(training, cfg.train, model, inputs, ranking, store, run.folder)
     trainer = (LateTrainer if late else RetrieverTrainer)(
         model=model,
