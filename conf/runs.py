@@ -76,8 +76,11 @@ def run_name(run: str | None, overrides: Sequence[str]) -> str:
 
 def run_below(run: str, folder: str) -> str:
     """The name of the run in `folder` that is given by its name or by its own folder."""
-    path = os.path.relpath(run, folder)
-    return os.path.normpath(run) if path.startswith("..") else path
+    return os.path.relpath(run, folder) if is_below(run, folder) else os.path.normpath(run)
+
+
+def is_below(path: str, folder: str) -> bool:
+    return not os.path.relpath(path, folder).startswith("..")
 
 
 def runs_of(checkpoints: str, product: str) -> str:

@@ -7,7 +7,7 @@ from datetime import date
 
 from omegaconf import MISSING
 
-from conf.runs import TRAINERS, is_name, run_below, runs_of
+from conf.runs import TRAINERS, is_below, is_name, run_below, runs_of
 from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.checks import is_url, too_small
 from conf.schema.models import RetrieverConfig, StudentConfig
@@ -183,12 +183,15 @@ class ExportModelCommand(CommandConfig):
             problems.append(f"product={self.product}: the options are student and retriever")
         if self.format not in EXPORTS:
             problems.append(f"format={self.format}: the options are bf16, fp32 and adapter")
+        for other in TRAINERS:
+            if other != self.product and is_below(self.run, runs_of(self.checkpoints, other)):
+                problems.append(f"run={self.run} trained a {other}: give product={other}")
+                return problems
         runs = runs_of(self.checkpoints, self.product)
         if not is_name(run_below(self.run, runs)):
             problems.append(
                 f"run={self.run} is no run below {runs}: name one that is there, and give "
-                "product=retriever for a run of train.contrastive, or checkpoints=FOLDER where "
-                "the runs are elsewhere"
+                "checkpoints=FOLDER where the runs are elsewhere"
             )
         return problems
 

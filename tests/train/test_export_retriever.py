@@ -100,7 +100,7 @@ def test_a_merged_weight_is_the_dequantised_one_and_its_adapters_product(
 
 
 def test_the_measured_difference_is_told_and_small(forms) -> None:
-    for format, most in (("fp32", 1e-4), ("bf16", 0.05)):
+    for format, most in (("fp32", 1e-4), ("bf16", 0.1)):
         measured, folder = forms[format]
         assert json.loads((folder / "export.json").read_text())["measured"] == measured
         assert 0 < measured["query_difference"] < most
@@ -125,7 +125,7 @@ if kind == "one":
 else:
     model = MultiVectorEncoder(folder, device="cpu", trust_remote_code=True)
 made = model.encode_query(given["queries"]), model.encode_document(given["frames"])
-assert not {"train", "conf", "peft", "bitsandbytes"} & set(sys.modules), sorted(sys.modules)
+assert not {"train", "conf", "data"} & set(sys.modules)
 torch.save([[torch.as_tensor(one) for one in some] for some in made], said)
 """
 
@@ -221,4 +221,5 @@ def test_a_student_is_no_retriever(settings, runs, tmp_path) -> None:
     cfg = ExportModelCommand(run="run", checkpoints=str(runs))
     with pytest.raises(UserError, match=r"run=.*sft/run is no run folder of a trained student"):
         export.main.__wrapped__(cfg, Run("run", tmp_path))
-    assert "product=retriever" in ExportModelCommand(run="checkpoints/contrastive/x").check()[0]
+    (problem,) = ExportModelCommand(run="checkpoints/contrastive/x").check()
+    assert problem == "run=checkpoints/contrastive/x trained a retriever: give product=retriever"

@@ -13,8 +13,8 @@ from conf.entry import Run
 from conf.schema import LateConfig
 from train import contrastive, memory
 from train.inputs import Inputs
-from train.late_loss import LateRankingLoss
 from train.journal import read_journal
+from train.late_loss import LateRankingLoss
 from train.mini_batches import MiniBatches, settle
 from train.ranking_loss import RankingLoss
 from train.retriever import corpus, load_retriever
