@@ -28,7 +28,7 @@ import conf.plugins  # noqa: F401  registers the launcher that run_folder.yaml n
 from conf.errors import SettingsError
 from conf.keys import dict_above, has_key, keys, keys_like, nearest
 
-OWN_NAMES = {"train.export": "export_student", "evaluation.study.export": "export_study"}
+OWN_NAMES = {"train.export": "export_model", "evaluation.study.export": "export_study"}
 """Commands that do not go by the last part of their name, because data.export does."""
 OVERLAYS = ("exp", "sweep")
 """Groups that any command takes, as `+exp=cot`."""

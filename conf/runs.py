@@ -24,6 +24,9 @@ from conf.errors import SettingsError, UserError
 ELSEWHERE = ("run", "store", "checkpoints", "workers", "host", "port", "public")
 """Keys that say where and how fast a run goes, not what comes out of it."""
 
+TRAINERS = {"student": "sft", "retriever": "contrastive"}
+"""The folders of runs below checkpoints/, by what they train."""
+
 PACKAGES = (
     "torch",
     "transformers",
@@ -73,8 +76,16 @@ def run_name(run: str | None, overrides: Sequence[str]) -> str:
 
 def run_below(run: str, folder: str) -> str:
     """The name of the run in `folder` that is given by its name or by its own folder."""
-    path = os.path.relpath(run, folder)
-    return os.path.normpath(run) if path.startswith("..") else path
+    return os.path.relpath(run, folder) if is_below(run, folder) else os.path.normpath(run)
+
+
+def is_below(path: str, folder: str) -> bool:
+    return not os.path.relpath(path, folder).startswith("..")
+
+
+def runs_of(checkpoints: str, product: str) -> str:
+    """The folder of the runs that train a product, student or retriever."""
+    return f"{checkpoints}/{TRAINERS.get(product, product)}"
 
 
 def is_name(run: str) -> bool:
@@ -90,6 +101,7 @@ def finished(run: Run) -> dict[str, float] | None:
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 OmegaConf.register_new_resolver("run_below", run_below, replace=True)
+OmegaConf.register_new_resolver("runs_of", runs_of, replace=True)
 
 
 def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[str]) -> None:

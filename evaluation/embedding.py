@@ -6,7 +6,6 @@ than ranking.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -16,15 +15,20 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from conf.errors import UserError
 from conf.schema import RetrieverConfig
 from data.frames import Frames
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
 from evaluation.cache import Embeddings
 from evaluation.tables import UNTRAINED
-from train.compatible import check_base, weights_digest
-from train.trained import run_title
+from train.compatible import (
+    check_base,
+    check_pooling,
+    check_widths,
+    processor_digest,
+    weights_digest,
+)
+from train.trained import product_folder, run_title
 
 if TYPE_CHECKING:
     from train.retriever import Retriever
@@ -33,7 +37,6 @@ EMBEDDINGS = "embeddings"
 """Folder of them in a store."""
 MAKERS = ("sentence-transformers", "transformers")
 """Packages that turn a prompt and pixels into a model's input."""
-POOLING = "lasttoken"
 
 Thing = TypeVar("Thing")
 
@@ -48,6 +51,8 @@ class Embedder:
     precision: str
     weights: str
     """Hash of the base's weights and the adapters'."""
+    processor: str
+    """Hash of the files that make its input."""
     load: Callable[[], Retriever]
 
     def about(self, store: Store) -> dict[str, Any]:
@@ -55,6 +60,7 @@ class Embedder:
         preset = self.preset
         return {
             "weights": self.weights,
+            "processor": self.processor,
             "revision": preset.revision,
             "quantization": preset.quantization,
             "precision": self.precision,
@@ -83,13 +89,13 @@ def embedders(
 
 
 def trained_embedder(folder: Path, preset: RetrieverConfig, precision: str) -> Embedder:
-    """The retriever of a run of train.contrastive.
+    """The retriever of a run of train.contrastive, or of an export.
 
     Raises:
         UserError: it is over another base than `preset` names, or saved by another pooling.
     """
     check_base(folder, preset.model)
-    saved = folder / "retriever"
+    saved = product_folder(folder, "retriever")
     if preset.late is None:
         check_pooling(saved)
 
@@ -101,8 +107,8 @@ def trained_embedder(folder: Path, preset: RetrieverConfig, precision: str) -> E
         keep_big_blocks()
         return load_trained(preset, precision, saved)
 
-    weights = weights_digest(preset.model, saved)
-    return Embedder(run_title(folder), preset, precision, weights, load)
+    digests = weights_digest(preset.model, saved), processor_digest(saved)
+    return Embedder(run_title(folder), preset, precision, *digests, load)
 
 
 def built_base(
@@ -129,28 +135,9 @@ def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Em
         keep_big_blocks()
         return load_retriever(preset, precision, [], run / "untrained")
 
-    weights = weights_digest(preset.model)
+    digests = weights_digest(preset.model), processor_digest(preset.model)
     name = f"{UNTRAINED} {preset.name}" + (", late" if preset.late is not None else "")
-    return Embedder(name, preset, precision, weights, load)
-
-
-def check_pooling(saved: Path) -> None:
-    """Raises UserError where a saved retriever does not pool the last token."""
-    try:
-        modules = json.loads((saved / "modules.json").read_text())
-        parts = [saved / m["path"] for m in modules if m["type"].endswith(".Pooling")]
-        modes = [json.loads((part / "config.json").read_text())["pooling_mode"] for part in parts]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{saved} is damaged: what it says of its modules cannot be read ({error}); delete the "
-            "run's folder and train again"
-        ) from error
-    if modes != [POOLING]:
-        told = f"with {' and '.join(map(str, modes))} pooling" if modes else "without pooling"
-        raise UserError(
-            f"{saved} was saved {told}, and a retriever here is read at its last token "
-            f"({POOLING}): give a run of train.contrastive, or train again"
-        )
+    return Embedder(name, preset, precision, *digests, load)
 
 
 def frame_name(frame: FrameRef) -> str:
@@ -221,13 +208,3 @@ def _embedded(
     if preset.late is None:
         check_widths(preset, kept.width)
     return kept
-
-
-def check_widths(preset: RetrieverConfig, entries: int) -> None:
-    """Raises UserError where the preset has a width that embeddings of so many entries lack."""
-    if preset.widths[0] > entries:
-        fitting = ",".join(str(w) for w in preset.widths if w <= entries) or entries
-        raise UserError(
-            f"retriever.widths asks for {preset.widths[0]}, and the embeddings of {preset.name} "
-            f"have {entries} entries: give retriever.widths=[{fitting}]"
-        )

@@ -36,12 +36,12 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.frames import Frames
+    from data.retrieval.checks import check_test
     from evaluation import embedding, figures, index, measures, ranking, tables
-    from evaluation.checks import check_retrieval
     from train.precision import settled
 
     queries, database = store.standard_test(), store.database("test")
-    check_retrieval(store, queries, database)
+    check_test(store, queries, database)
     frames = Frames(store, preset.image_size)
     ids = [q.query_id for q in queries]
     names = [embedding.frame_name(f) for f in database]

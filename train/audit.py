@@ -15,6 +15,7 @@ from conf.schema import RetrieverConfig, StudentConfig
 from data.frames import Frames
 from data.records import RetrievalQuery
 from train.collate import IGNORED, Collator
+from train.compatible import check_widths
 from train.conversation import Sample
 from train.late import scored_tokens
 from train.retriever import Retriever, frame_input, query_input
@@ -64,11 +65,8 @@ def audit_retriever(
     """
     towers = count_towers(model)
     check_towers(towers, cfg)
-    width = model.get_embedding_dimension()
-    if cfg.late is None and max(cfg.widths) > width:
-        raise UserError(
-            f"retriever.widths={cfg.widths} starts wider than the model's embeddings of {width}"
-        )
+    if cfg.late is None:
+        check_widths(cfg, model.get_embedding_dimension())
     processor = model[0].processor
     asked = model.preprocess([query_input(query, frames, cfg)], prompt=cfg.query_instruction)
     length = asked["input_ids"].shape[1]

@@ -126,12 +126,12 @@ def load_failure(group: str, model: str, error: Exception) -> UserError:
     )
 
 
-def damaged(folder: Path, error: Exception) -> UserError:
+def damaged(
+    folder: Path, error: Exception, mend: str = "delete the run's folder and train again"
+) -> UserError:
     """What to tell a user whose trained model cannot be read back."""
     first = next(iter(str(error).strip().splitlines()), type(error).__name__)
-    return UserError(
-        f"{folder} is damaged and cannot be read ({first}): delete the run's folder and train again"
-    )
+    return UserError(f"{folder} is damaged and cannot be read ({first}): {mend}")
 
 
 def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
@@ -234,6 +234,23 @@ def load_trained(
     return model.eval(), processor
 
 
+def merged(
+    base: PreTrainedModel, adapters: Path, quantization: str, precision: str
+) -> PreTrainedModel:
+    """A base as its 4-bit weights say it, with the adapters in a folder added in `precision`.
+
+    Merged into the 4-bit weights themselves, most of what was trained would be rounded away; over
+    the base as it was before it was quantised, the adapters would miss what they were trained to
+    make up for.
+    """
+    import peft
+
+    dtype = DTYPES[precision]
+    if quantization == "nf4":
+        base = base.dequantize(dtype)
+    return peft.PeftModel.from_pretrained(base.to(dtype), adapters).merge_and_unload()
+
+
 def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
     """A student merged into its base, as `train.export` wrote it: in the precision of its weights,
     and with nothing that the standard classes do not read themselves.
@@ -247,10 +264,7 @@ def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
             folder, dtype="auto", use_safetensors=True
         )
     except UNREADABLE as error:
-        first = next(iter(str(error).strip().splitlines()), type(error).__name__)
-        raise UserError(
-            f"{folder} is damaged and cannot be read ({first}): delete it and export again"
-        ) from error
+        raise damaged(folder, error, "delete it and export again") from error
     processor.tokenizer.padding_side = "left"
     return model.to("cuda" if torch.cuda.is_available() else "cpu").eval(), processor
 

@@ -38,10 +38,19 @@ class Batch:
 
     def query_names(self, first: int, last: int) -> list[str]:
         """Of the queries of a range of prefixes."""
-        return [f"query {q.query_id}" for group in self.groups(first, last) for q in group]
+        return [query_title(q) for group in self.groups(first, last) for q in group]
 
     def frame_names(self, first: int, last: int) -> list[str]:
-        return [f"frame {f.frame} of {f.scene_id}" for f in self.frames[first:last]]
+        return [frame_title(f) for f in self.frames[first:last]]
+
+
+def query_title(query: RetrievalQuery) -> str:
+    """What a query is called where something is wrong with it."""
+    return f"query {query.query_id}"
+
+
+def frame_title(frame: FrameRef) -> str:
+    return f"frame {frame.frame} of {frame.scene_id}"
 
 
 def batch_of(

@@ -1,4 +1,4 @@
-"""The model card of an exported student: what its training run wrote down, and nothing else."""
+"""The model card of an export: what its training run wrote down, and nothing else."""
 
 from __future__ import annotations
 
@@ -8,79 +8,99 @@ from pathlib import Path
 
 from huggingface_hub import ModelCardData
 
-from conf.schema import SftCommand
+from conf.schema import ContrastiveCommand, RetrieverConfig, SftCommand, StudentConfig
 from conf.sweep import AT_START
 from train.compatible import BASE
 from train.journal import BEST_STEP
 
-SHOWN_PACKAGES = ("torch", "transformers", "peft", "bitsandbytes")
+SHOWN_PACKAGES = ("torch", "transformers", "sentence-transformers", "peft", "bitsandbytes")
 WHAT = {
-    "bf16": "A student of DynaPix, merged into its base; weights in bf16.",
-    "fp32": "A student of DynaPix, merged into its base; weights in fp32.",
-    "adapter": "A student of DynaPix: the LoRA adapters, to be laid over their base.",
+    "bf16": "merged into its base; weights in bf16.",
+    "fp32": "merged into its base; weights in fp32.",
+    "adapter": "the LoRA adapters, to be laid over their base.",
 }
+MEASURED = {
+    "student": "On the items of training scenes that it was not trained on, {count} at most, "
+    "before the first step and {kept}. A letter is chosen by the letters' logits, with what stands "
+    "before it given.",
+    "retriever": "On the queries of training scenes that it was not trained on, {count} at most, "
+    "over the frames of these scenes, before the first step and {kept}.",
+}
+APART = {
+    "student": "The merged weights against the adapters over their base as they were trained, on "
+    "some of these items (differences of logits as a share of their size):",
+    "retriever": "The merged weights against the adapters over their base as they were trained, on "
+    "some of these queries (differences of embeddings and scores as a share of their size):",
+}
+PIPELINES = {"student": "image-text-to-text", "retriever": "sentence-similarity"}
+
+Settings = SftCommand | ContrastiveCommand
 
 
 def text(
-    name: str, settings: SftCommand, folder: Path, format: str, measured: dict[str, float]
+    name: str, settings: Settings, folder: Path, format: str, measured: dict[str, float]
 ) -> str:
     """README.md of an export of the run in `folder`.
 
-    `measured` is how far the exported weights are from the trained student.
+    `measured` is how far the exported weights are from the trained student or retriever.
     """
+    product = product_of(settings)
     metrics = json.loads((folder / "metrics.json").read_text())
-    kept = _kept(settings, metrics)
+    train = settings.train
+    count = train.validation_items if product == "student" else train.validation_queries
     sections = [
         f"---\n{front_matter(settings, format)}\n---",
         f"# {name}",
-        WHAT[format],
+        f"A {product} of DynaPix: {WHAT[format]}",
         "## How it was trained",
         _table(("", ""), _training(settings, folder)),
         "## How it was measured",
-        f"On the items of training scenes that it was not trained on, "
-        f"{settings.train.validation_items} at most, before the first step and {kept}. "
-        "A letter is chosen by the letters' logits, with what stands before it given.",
+        MEASURED[product].format(count=count, kept=_kept(settings, metrics)),
         _table(("", "start", "end"), _curve(metrics)),
     ]
     if measured:
         told = [(key.replace("_", " "), _figure(value)) for key, value in measured.items()]
-        sections += [
-            "The merged weights against the adapters over their base as they were trained, on some "
-            "of these items (differences of logits as a share of their size):",
-            _table(("", ""), told),
-        ]
+        sections += [APART[product], _table(("", ""), told)]
     return "\n\n".join(sections) + "\n"
 
 
-def front_matter(settings: SftCommand, format: str) -> str:
+def product_of(settings: Settings) -> str:
+    return "student" if isinstance(settings, SftCommand) else "retriever"
+
+
+def preset_of(settings: Settings) -> StudentConfig | RetrieverConfig:
+    return getattr(settings, product_of(settings))
+
+
+def front_matter(settings: Settings, format: str) -> str:
     """The card's metadata as YAML. A base in a folder is none that a hub could link to."""
-    model = settings.student.model
+    model = preset_of(settings).model
+    student = isinstance(settings, SftCommand)
+    merged = "transformers" if student else "sentence-transformers"
     return ModelCardData(
         base_model=None if Path(model).is_dir() else model,
-        library_name="peft" if format == "adapter" else "transformers",
-        pipeline_tag="image-text-to-text",
-        tags=["dynapix", settings.train.regime],
+        library_name="peft" if format == "adapter" else merged,
+        pipeline_tag=PIPELINES[product_of(settings)],
+        tags=["dynapix", settings.train.regime if student else "retriever"],
     ).to_yaml()
 
 
-def _training(settings: SftCommand, folder: Path) -> Iterable[tuple[str, str]]:
-    student, train, benchmark = settings.student, settings.train, settings.benchmark
+def _training(settings: Settings, folder: Path) -> Iterable[tuple[str, str]]:
+    preset, train, benchmark = preset_of(settings), settings.train, settings.benchmark
+    student = isinstance(settings, SftCommand)
     record = json.loads((folder / "run.json").read_text())
-    yield "base", f"{student.model}{f' at {student.revision}' if student.revision else ''}"
+    yield "base", f"{preset.model}{f' at {preset.revision}' if preset.revision else ''}"
     if (folder / BASE).exists():
         yield "hash of the base's weights", json.loads((folder / BASE).read_text())
-    yield "quantisation of the base", student.quantization
-    lora = student.lora
+    yield "quantisation of the base", preset.quantization
+    lora = preset.lora
     yield "adapters", f"LoRA of rank {lora.rank}, alpha {lora.alpha}, dropout {lora.dropout}"
-    yield "regime", train.regime
     scenes = f"{benchmark.scenes} scenes by " if benchmark.simulator == "bullet" else ""
     yield "benchmark", f"{benchmark.name}, {scenes}{benchmark.simulator}, seed {benchmark.seed}"
-    if train.regime not in ("answer_only", "describe"):
-        teacher = settings.teacher
-        yield "teacher", f"{teacher.name}{f' ({teacher.model})' if teacher.model else ''}"
-    yield "frames", f"{student.frames} a prefix, {student.image_size} x {student.image_size} px"
+    yield from _of_student(settings) if student else _of_retriever(settings)
+    yield "frames", f"{preset.frames} a prefix, {preset.image_size} x {preset.image_size} px"
     length = f"{train.epochs:g} epochs" if train.max_steps == -1 else f"{train.max_steps} steps"
-    yield "length", f"{length} of {train.batch} samples a step"
+    yield "length", f"{length} of {train.batch} {'samples' if student else 'queries'} a step"
     yield "learning rate", f"{train.lr:g}, {train.schedule}"
     yield "precision", train.precision
     yield "seed", str(settings.seed)
@@ -92,8 +112,28 @@ def _training(settings: SftCommand, folder: Path) -> Iterable[tuple[str, str]]:
     yield "versions", ", ".join(f"{p} {versions[p]}" for p in SHOWN_PACKAGES if p in versions)
 
 
-def _kept(settings: SftCommand, metrics: dict[str, float]) -> str:
-    """Of which step the exported student is."""
+def _of_student(settings: SftCommand) -> Iterable[tuple[str, str]]:
+    yield "regime", settings.train.regime
+    if settings.train.regime not in ("answer_only", "describe"):
+        teacher = settings.teacher
+        yield "teacher", f"{teacher.name}{f' ({teacher.model})' if teacher.model else ''}"
+
+
+def _of_retriever(settings: ContrastiveCommand) -> Iterable[tuple[str, str]]:
+    preset, train = settings.retriever, settings.train
+    if preset.late is None:
+        yield "widths", ", ".join(map(str, preset.widths))
+    else:
+        yield "vectors", f"one a token, {preset.late.width} wide, for late interaction"
+    yield "instruction of queries", preset.query_instruction
+    yield "instruction of frames", preset.frame_instruction
+    mined = f", mined every {train.mine_every} steps" if train.mine_every else ""
+    yield "hard negatives", f"{train.hard_negatives} a query{mined}"
+    yield "scale of scores", f"{train.scale:g}"
+
+
+def _kept(settings: Settings, metrics: dict[str, float]) -> str:
+    """Of which step the exported weights are."""
     if (step := metrics.get(BEST_STEP)) is None:
         return "after the last"
     return f"after step {step:g}, the best by {settings.train.best}"

@@ -1,5 +1,5 @@
 """Holds against each other what is put together to be trained or measured: a base, its processor,
-adapters, and the run that they belong to."""
+adapters, pooling and widths, and the run that they belong to."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from safetensors import safe_open
 
 from conf.errors import UserError
 from conf.runs import write_json
-from conf.schema import StudentConfig
+from conf.schema import RetrieverConfig, StudentConfig
 
 if TYPE_CHECKING:
     from torch import nn
@@ -22,6 +22,19 @@ BASE = "base.json"
 PEFT = "base_model.model."
 """What peft puts before the names of the modules that it adapts."""
 MEBIBYTE = 1 << 20
+PROCESSOR = (
+    "*processor_config.json",
+    "*token*.json",
+    "chat_template*",
+    "additional_chat_templates/*",
+    "merges.txt",
+    "sentence_bert_config.json",
+    "tokenizer.model",
+    "vocab.*",
+)
+"""Files, beside the weights, that say how text and pixels become a model's input."""
+POOLING = "lasttoken"
+"""How the library calls what makes a retriever's one vector."""
 
 
 def check_tower(group: str, model: str, config: PreTrainedConfig) -> None:
@@ -102,6 +115,36 @@ def check_adapters(folder: Path, base: nn.Module, cfg: StudentConfig) -> None:
             )
 
 
+def check_pooling(saved: Path) -> None:
+    """Raises UserError where a saved retriever does not pool the last token."""
+    try:
+        modules = json.loads((saved / "modules.json").read_text())
+        parts = [saved / m["path"] for m in modules if m["type"].endswith(".Pooling")]
+        modes = [json.loads((part / "config.json").read_text())["pooling_mode"] for part in parts]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{saved} is damaged: what it says of its modules cannot be read ({error}); delete "
+            "what wrote it and train or fetch it again"
+        ) from error
+    if modes != [POOLING]:
+        told = f"with {' and '.join(map(str, modes))} pooling" if modes else "without pooling"
+        raise UserError(
+            f"{saved} was saved {told}, and a retriever here is read at its last token "
+            f"({POOLING}): give one that is, such as a run of train.contrastive or a "
+            "Qwen3-VL-Embedding"
+        )
+
+
+def check_widths(cfg: RetrieverConfig, entries: int) -> None:
+    """Raises UserError where a retriever has a width that embeddings of so many entries lack."""
+    if cfg.widths[0] > entries:
+        fitting = ",".join(str(w) for w in cfg.widths if w <= entries) or entries
+        raise UserError(
+            f"retriever.widths asks for {cfg.widths[0]}, and the embeddings of {cfg.name} "
+            f"have {entries} entries: give retriever.widths=[{fitting}]"
+        )
+
+
 def weights_digest(*models: str | Path | None) -> str:
     """A short hash of the safetensors of models in folders, by each file's name, size and last
     mebibyte, which training changes, wherever the folder is; a hub's name stands for itself."""
@@ -114,6 +157,19 @@ def weights_digest(*models: str | Path | None) -> str:
             with open(path, "rb") as file:
                 file.seek(max(0, size - MEBIBYTE))
                 whole.update(f"{path.name} {size}".encode() + file.read())
+    return whole.hexdigest()[:16]
+
+
+def processor_digest(model: str | Path | None) -> str:
+    """A short hash of what makes a model's input in a folder: the files of its tokenizer, its
+    processor and its chat template; a hub's name stands for itself."""
+    whole = hashlib.sha256()
+    if model is None or not Path(model).is_dir():
+        whole.update(f"{model}".encode())
+        return whole.hexdigest()[:16]
+    for path in sorted({p for pattern in PROCESSOR for p in Path(model).rglob(pattern)}):
+        whole.update(f"{path.relative_to(model)} {path.stat().st_size} ".encode())
+        whole.update(path.read_bytes())
     return whole.hexdigest()[:16]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,9 @@ from conf.runs import rank
 from conf.schema import ContrastiveCommand, ContrastiveTrainConfig
 from data.frames import Frames
 from data.records import RetrievalQuery
+from data.retrieval.checks import check_training
 from data.store import Store
-from train import checkpoints, compatible, journal, loop, ranks, retriever, room
+from train import checkpoints, compatible, journal, loop, mini_batches, ranks, retriever, room
 from train.audit import audit_retriever
 from train.batches import Batch, Composed, batch_of
 from train.inputs import Inputs
@@ -68,10 +70,13 @@ def train_retriever(
     longest = retriever.longest_query(training, model.tokenizer)
     log.info(audit_retriever(model, cfg.retriever, longest, frames))
 
-    checkpoint = checkpoints.newest_checkpoint(run.folder)
-    inputs = Inputs(model, frames, cfg.retriever, cfg.train.precision)
-    negatives = HardNegatives(training, cfg.train, model, inputs, store, run.folder)
     late = cfg.retriever.late is not None
+    ranking = LateRankingLoss if late else RankingLoss
+    inputs = Inputs(model, frames, cfg.retriever, cfg.train.precision)
+    train = mini_batches.settle(cfg.train, run.folder, model, inputs, ranking, training)
+    cfg = replace(cfg, train=train)
+    checkpoint = checkpoints.newest_checkpoint(run.folder)
+    negatives = HardNegatives(training, cfg.train, model, inputs, ranking, store, run.folder)
     trainer = (LateTrainer if late else RetrieverTrainer)(
         model=model,
         args=arguments(cfg, run, checkpoint, share),
@@ -108,7 +113,7 @@ def split(
     """The queries trained on, and some of held-out scenes.
 
     Raises:
-        UserError: there are none, or too few for a batch.
+        UserError: there are none, or too few for a batch; or what `check_training` raises.
     """
     queries = store.retrieval("train")
     held_out = held_out_scenes(store)
@@ -116,6 +121,7 @@ def split(
     # Queries stand builder by builder: a shuffled slice measures all of them.
     validation = shuffled([q for q in queries if q.scene_id in held_out], cfg.seed)
     validation = validation[: cfg.train.validation_queries]
+    check_training(store, queries, cfg.train.hard_negatives)
     loop.check_not_empty(len(training), "training queries")
     loop.check_not_empty(len(validation), "queries of held-out training scenes")
     if len(training) < cfg.train.batch:
@@ -193,6 +199,10 @@ class NamedBatches:
         self._sampler = sampler
         self._batch_of = batch_of
         super().__init__(*args, **settings)
+
+    def add_model_card_callback(self, *_: Any) -> None:
+        """Rows name queries by number: there is no text of theirs that a model card could show, nor
+        a bar for looking for it."""
 
     def get_batch_sampler(self, *_: Any, **__: Any) -> Composed:
         return self._sampler

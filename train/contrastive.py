@@ -28,6 +28,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
 
     from train import ranks
 
+    ranks.check_unsharded()
     share = ranks.share(cfg.train.batch)
     store = ranks.from_main(partial(prepared, cfg))
 

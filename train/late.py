@@ -52,9 +52,7 @@ def late_modules(backbone: Transformer, late: LateConfig) -> list[Module]:
 def load_late(folder: Path, **options: Any) -> MultiVectorEncoder:
     """A saved multi-vector retriever. Its token mask is this project's, as in the library's own
     checkpoints: no code that stands in `folder` runs."""
-    model = MultiVectorEncoder._load_with_module_classes(str(folder), SAVED_AS, **options)
-    keep_projection_exact(model)
-    return model
+    return MultiVectorEncoder._load_with_module_classes(str(folder), SAVED_AS, **options)
 
 
 def keep_projection_exact(model: MultiVectorEncoder) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from sentence_transformers import MultiVectorEncoder
 from sentence_transformers.util.similarity import maxsim
 from torch.nn.functional import pad
 
@@ -20,8 +21,11 @@ class LateRankingLoss(RankingLoss):
     vectors of zeros, which the library's `maxsim` leaves out.
     """
 
-    def embed(self, given: dict[str, Any], task: str) -> torch.Tensor:
-        made = self.model(given, task=task)
+    similarity = staticmethod(maxsim)
+
+    @staticmethod
+    def embed(model: MultiVectorEncoder, given: dict[str, Any], task: str) -> torch.Tensor:
+        made = model(given, task=task)
         scored = made["attention_mask"].bool()
         vectors = made["token_embeddings"].masked_fill(~scored[..., None], 0)
         return vectors[:, scored.any(dim=0)]
@@ -31,6 +35,3 @@ class LateRankingLoss(RankingLoss):
         if ranks() > 1:
             torch.distributed.all_reduce(longest, op=torch.distributed.ReduceOp.MAX)
         return torch.cat([pad(part, (0, 0, 0, int(longest) - part.shape[1])) for part in parts])
-
-    def similarity(self, queries: torch.Tensor, frames: torch.Tensor) -> torch.Tensor:
-        return maxsim(queries, frames)

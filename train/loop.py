@@ -38,6 +38,8 @@ log = logging.getLogger(__name__)
 
 PROJECT = "dynapix"
 """Under which trackers file a run."""
+TOLD = f"{UserError.__module__}.{UserError.__qualname__}: "
+"""Stands in a traceback before what a user can mend."""
 SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
 
 
@@ -169,6 +171,9 @@ def explained(trainer: Trainer, folder: Path, lower: str) -> Iterator[None]:
     except RuntimeError as error:
         if is_unwritten(error):
             raise unwritten(folder, "a file was cut short; the disk may be full") from error
+        if TOLD in str(error):
+            # Of another rank, which the library tells with its traceback.
+            raise UserError(sentence(error)) from error
         if not is_out_of_memory(error):
             raise
         raise UserError(
@@ -179,10 +184,9 @@ def explained(trainer: Trainer, folder: Path, lower: str) -> Iterator[None]:
         raise UserError(sentence(error)) from error
 
 
-def sentence(error: UserError) -> str:
+def sentence(error: Exception) -> str:
     """An error's own words: torch puts a worker's traceback before them, all in one text."""
-    name = f"{UserError.__module__}.{UserError.__qualname__}: "
-    return str(error).rpartition(name)[2].strip()
+    return str(error).rpartition(TOLD)[2].strip()
 
 
 def is_last(checkpoint: Path) -> bool:

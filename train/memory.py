@@ -1,5 +1,5 @@
-"""How a step's samples are split, and whether activations are recomputed: what the settings leave
-to the trainer (`auto`) is tried on the run's longest samples and noted in the run's folder.
+"""How a step's samples or queries are split, and whether activations are recomputed: what the
+settings leave to the trainer (`auto`) is tried on the run's longest and noted in the run's folder.
 
 Neither changes what is learnt. Keeping activations is faster than recomputing them, so they are
 kept wherever that fits; the micro-batch then grows as long as it fits and makes a step faster.
@@ -11,7 +11,7 @@ import json
 import logging
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -45,8 +45,11 @@ MOMENTS = 8
 
 @dataclass(frozen=True)
 class Choice:
-    micro_batch: int
-    gradient_checkpointing: bool
+    """How many samples or queries pass at once, and whether activations are recomputed; of what is
+    asked for, either may be auto."""
+
+    micro_batch: int | str
+    gradient_checkpointing: bool | str
 
 
 class Trial(Protocol):
@@ -70,33 +73,52 @@ def settle(
 ) -> SftTrainConfig:
     """The settings with a number for `micro_batch` and a truth for `gradient_checkpointing`: what
     was given, what a run's folder notes, or what a probe of the samples leads to."""
-    if "auto" not in (train.micro_batch, train.gradient_checkpointing):
-        return train
+
+    def trial(share: int) -> Trial:
+        return Passes(model, collator, training, lengths, train, share)
+
+    asked = Choice(train.micro_batch, train.gradient_checkpointing)
+    return replace(train, **asdict(decide(asked, train.batch, folder, model, trial, "micro-batch")))
+
+
+def decide(
+    asked: Choice,
+    batch: int,
+    folder: Path,
+    model: nn.Module,
+    trial: Callable[[int], Trial],
+    named: str,
+) -> Choice:
+    """What was asked for, with a number and a truth in the place of auto; `trial` tries what a rank
+    takes of a step of `batch` samples, and `named` is how its parts are called."""
+    if "auto" not in (asked.micro_batch, asked.gradient_checkpointing):
+        return asked
     state = PartialState(cpu=not torch.cuda.is_available())
-    share = train.batch // state.num_processes
-    if (noted := read_note(folder)) and share % noted.micro_batch == 0:
-        return replace(train, **asdict(noted))
+    share = batch // state.num_processes
+    noted = read_note(folder)
+    if noted and (asked.micro_batch == noted.micro_batch or share % noted.micro_batch == 0):
+        return noted
     model.to(state.device)
     # Ranks on CPUs share one memory.
     sharing = state.num_processes if state.device.type == "cpu" else 1
     limit = int(SHARE * available(state.device) / sharing) - optimizer_bytes(model)
     with probing(model):
-        trial = Passes(model, collator, training, lengths, train, share)
-        choice, needed = choose(trial, train, share, limit)
+        choice, needed = choose(trial(share), asked, share, limit)
     # All ranks have to make the same steps.
     choice = least(gather_object([choice]))
     if state.is_main_process:
         log.info(
-            "micro-batch %d of %d samples, activations %s: %s",
+            "%s %d of %d, activations %s: %s",
+            named,
             choice.micro_batch,
-            train.batch,
+            batch,
             "recomputed" if choice.gradient_checkpointing else "kept",
             f"more than the {gib(limit)} that are free"
             if needed is None
             else f"{gib(needed)} of {gib(limit)}",
         )
         write_json(folder / NOTE, asdict(choice))
-    return replace(train, **asdict(choice))
+    return choice
 
 
 def read_note(folder: Path) -> Choice | None:
@@ -114,14 +136,12 @@ def least(choices: Sequence[Choice]) -> Choice:
     )
 
 
-def choose(
-    trial: Trial, train: SftTrainConfig, share: int, limit: int
-) -> tuple[Choice, int | None]:
+def choose(trial: Trial, asked: Choice, share: int, limit: int) -> tuple[Choice, int | None]:
     """What of a rank's `share` samples a step fits into `limit` bytes, and the bytes that it takes;
     the least that there is, and None, where nothing fits."""
-    given, asked = train.micro_batch, train.gradient_checkpointing
+    given, mode = asked.micro_batch, asked.gradient_checkpointing
     candidates = sizes(share) if given == "auto" else [1]
-    modes = (False, True) if asked == "auto" else (bool(asked),)
+    modes = (False, True) if mode == "auto" else (bool(mode),)
     for recompute in modes:
         if (best := climb(trial, recompute, candidates, limit)) is not None:
             tried, held = best

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from sentence_transformers import SentenceTransformer
 from sentence_transformers.util import semantic_search
+from torch.nn.utils.rnn import pad_sequence
 from tqdm import tqdm
 from transformers import TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
@@ -22,13 +23,19 @@ from data.geometry import displacements
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
 from train.batches import Batch, batch_of
+from train.finite import check_finite
 from train.inputs import Inputs
+from train.ranking_loss import RankingLoss
 from train.ranks import from_main
+from train.retriever import Retriever
 
 log = logging.getLogger(__name__)
 
 Mined = dict[str, list[FrameRef]]
 """The hard negatives of queries, by their ids."""
+KINDS = {"query": "queries", "document": "frames"}
+AT_ONCE = 4096
+"""Frames that queries are held against at once."""
 SPARE = 64
 """How many more frames than are wanted are looked at: those near the target are no negatives."""
 
@@ -46,15 +53,17 @@ class HardNegatives(TrainerCallback):
         self,
         queries: Sequence[RetrievalQuery],
         train: ContrastiveTrainConfig,
-        model: SentenceTransformer,
+        model: Retriever,
         inputs: Inputs,
+        ranking: type[RankingLoss],
         store: Store,
         folder: Path,
     ) -> None:
+        """`ranking` says how the model embeds and how embeddings are held against each other."""
         self._queries = queries
         self._every, self._margin = train.mine_every, train.mine_margin
         self._count, self._mini_batch = train.hard_negatives, train.mini_batch
-        self._model, self._inputs = model, inputs
+        self._model, self._inputs, self._ranking = model, inputs, ranking
         self._store, self._folder = store, folder
         self._mined: Mined = {}
 
@@ -78,10 +87,13 @@ class HardNegatives(TrainerCallback):
         batch = batch_of(self._queries, self._count, distinct=True, shared=True)
         was_training = self._model.training
         self._model.eval()
-        asked = self._embedded("queries", self._inputs.of_prefixes, batch, len(batch.prefixes))
-        shown = self._embedded("frames", self._inputs.of_frames, batch, len(batch.frames))
+        asked = self._embedded(batch, "query", len(batch.prefixes))
+        shown = self._embedded(batch, "document", len(batch.frames))
         self._model.train(was_training)
-        found = semantic_search(asked, shown, top_k=min(self._count + SPARE, len(shown)))
+        top = min(self._count + SPARE, len(shown))
+        found = semantic_search(
+            asked, shown, corpus_chunk_size=AT_ONCE, top_k=top, score_function=self._scores
+        )
         ranked = [[batch.frames[hit["corpus_id"]] for hit in hits] for hits in found]
         return {
             query.query_id: wrong(query, frames, self._store, self._margin, self._count)
@@ -89,17 +101,25 @@ class HardNegatives(TrainerCallback):
         }
 
     @torch.no_grad()
-    def _embedded(
-        self, what: str, make: Callable[[Batch, int, int], dict[str, Any]], batch: Batch, rows: int
-    ) -> torch.Tensor:
-        """(rows, width) fp32 embeddings, on the CPU."""
-        parts = []
+    def _embedded(self, batch: Batch, task: str, rows: int) -> torch.Tensor:
+        """(queries or frames, ...) fp32 embeddings of so many prefixes or frames, on the CPU; what
+        has fewer vectors than others is filled up with zeros."""
+        query = task == "query"
+        make = self._inputs.of_prefixes if query else self._inputs.of_frames
+        names = batch.query_names if query else batch.frame_names
+        made: list[torch.Tensor] = []
         starts = range(0, rows, self._mini_batch)
-        for start in tqdm(starts, desc=f"mining: {what}", unit="batch", leave=False):
-            inputs = make(batch, start, min(start + self._mini_batch, rows))
-            given = self._inputs.on_device(inputs)
-            parts.append(self._model(given)["sentence_embedding"].float().cpu())
-        return torch.cat(parts)
+        for start in tqdm(starts, desc=f"mining: {KINDS[task]}", unit="batch", leave=False):
+            some = start, min(start + self._mini_batch, rows)
+            given = self._inputs.on_device(make(batch, *some))
+            embedded = self._ranking.embed(self._model, given, task).float().cpu()
+            check_finite(embedded, partial(names, *some))
+            made += embedded
+        return pad_sequence(made, batch_first=True)
+
+    def _scores(self, queries: torch.Tensor, frames: torch.Tensor) -> torch.Tensor:
+        device = self._model.device
+        return self._ranking.similarity(queries.to(device), frames.to(device))
 
     def _path(self, step: int) -> Path:
         return self._folder / "mined" / f"{step}.json"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import torch
 from sentence_transformers.multi_vector_encoder.evaluation import (
     MultiVectorInformationRetrievalEvaluator,
 )
@@ -9,9 +12,12 @@ from sentence_transformers.sentence_transformer.evaluation import InformationRet
 from sentence_transformers.util import cos_sim
 from sentence_transformers.util.similarity import maxsim
 
+from conf.runs import ranks
 from conf.schema import RetrieverConfig
 from data.frames import Frames
 from data.records import FRAMES, FrameRef, RetrievalQuery
+from train.batches import frame_title, query_title
+from train.finite import check_finite
 from train.retriever import Retriever, frame_input, query_input
 
 STEP = 6
@@ -21,19 +27,23 @@ RECALLS = (1, 10, 50)
 
 class Slice:
     """What an evaluator of the library's needs to rank a slice of queries; recall and reciprocal
-    rank at the full width, under the names that the evaluation command uses."""
+    rank at the full width, under the names that the evaluation command uses.
+
+    It holds names. Pixels are read a mini-batch a rank at a time, which the library deals out.
+    """
 
     score = staticmethod(cos_sim)
 
     def __init__(
         self, queries: list[RetrievalQuery], frames: Frames, cfg: RetrieverConfig, batch: int
     ) -> None:
+        self._frames, self._cfg = frames, cfg
         database = {q.target for q in queries}
         database |= {FrameRef(q.scene_id, f) for q in queries for f in range(0, FRAMES, STEP)}
         ordered = sorted(database, key=lambda f: (f.scene_id, f.frame))
         super().__init__(
-            queries={q.query_id: query_input(q, frames, cfg) for q in queries},
-            corpus={_name(f): frame_input(f, frames) for f in ordered},
+            queries={q.query_id: q for q in queries},
+            corpus={_name(f): f for f in ordered},
             relevant_docs={q.query_id: {_name(q.target)} for q in queries},
             accuracy_at_k=list(RECALLS),
             precision_recall_at_k=[1],
@@ -55,15 +65,43 @@ class Slice:
         results = {f"recall@{k}": scores["accuracy@k"][k] for k in RECALLS}
         return {**results, "mrr": next(iter(scores["mrr@k"].values()))}
 
+    def embed_inputs(
+        self, model: Retriever, named: list, encode_fn_name: str, **settings: Any
+    ) -> Any:
+        """The embeddings of queries (`encode_fn_name` is query) or of frames (document).
+
+        Raises:
+            UserError: one is no number.
+        """
+        title = query_title if encode_fn_name == "query" else frame_title
+        at_once = self.batch_size * ranks()
+        rows: list[torch.Tensor] = []
+        for start in range(0, len(named), at_once):
+            some = named[start : start + at_once]
+            inputs = [self._input(one) for one in some]
+            made = super().embed_inputs(model, inputs, encode_fn_name, **settings)
+            for one, row in zip(some, made, strict=True):
+                check_finite(row[None], lambda one=one: [title(one)])
+            rows += made
+        return self.joined(rows)
+
+    def _input(self, one: RetrievalQuery | FrameRef) -> Any:
+        if isinstance(one, FrameRef):
+            return frame_input(one, self._frames)
+        return query_input(one, self._frames, self._cfg)
+
 
 class HeldOutRanking(Slice, InformationRetrievalEvaluator):
     """Of a retriever with one vector."""
+
+    joined = staticmethod(torch.stack)
 
 
 class LateHeldOutRanking(Slice, MultiVectorInformationRetrievalEvaluator):
     """Of a retriever with many."""
 
     score = staticmethod(maxsim)
+    joined = staticmethod(list)
 
 
 def _name(frame: FrameRef) -> str:

@@ -22,9 +22,9 @@ from sentence_transformers.sentence_transformer.losses import CachedMultipleNega
 from sentence_transformers.util import all_gather_with_grad, cos_sim
 from torch.nn.functional import cross_entropy
 
-from conf.errors import UserError
 from conf.runs import rank, ranks
 from train.batches import Batch
+from train.finite import check_finite
 from train.inputs import Inputs
 from train.negatives import Weighing
 
@@ -118,31 +118,22 @@ class RankingLoss(CachedMultipleNegativesRankingLoss):
                     given = self._inputs.seen(given)
                     kept[ranges[k]] = {name: on_cpu(value) for name, value in given.items()}
                 with torch.set_grad_enabled(with_grad):
-                    embedded = self.embed(given, sentence_feature["task"])
-            if not with_grad and not torch.isfinite(embedded).all():
-                raise self._lost(embedded, sentence_feature["name"](*ranges[k]))
+                    embedded = self.embed(self.model, given, sentence_feature["task"])
+            if not with_grad:
+                check_finite(embedded, partial(sentence_feature["name"], *ranges[k]))
             yield embedded, state
 
-    def embed(self, given: dict[str, Any], task: str) -> torch.Tensor:
+    @staticmethod
+    def embed(model: SentenceTransformer, given: dict[str, Any], task: str) -> torch.Tensor:
         """(rows, width) of a mini-batch of queries (`task` is query) or of frames (document)."""
-        return self.model(given)["sentence_embedding"]
+        return model(given)["sentence_embedding"]
 
     def joined(self, parts: list[torch.Tensor]) -> torch.Tensor:
         """What was embedded a mini-batch at a time."""
         return torch.cat(parts)
 
-    def similarity(self, queries: torch.Tensor, frames: torch.Tensor) -> torch.Tensor:
-        """(queries, frames) before they are scaled."""
-        return cos_sim(queries, frames)
-
-    @staticmethod
-    def _lost(embedded: torch.Tensor, names: Sequence[str]) -> UserError:
-        """What to tell a user whose model gives no numbers any more."""
-        first = (~torch.isfinite(embedded.flatten(1)).all(dim=1)).nonzero()[0].item()
-        return UserError(
-            f"the embedding of {names[first]} is no number: a lower train.lr or "
-            "train.precision=fp32 may help; what was trained up to the last checkpoint is kept"
-        )
+    similarity = staticmethod(cos_sim)
+    """(queries, frames) of embeddings, before it is scaled."""
 
     def calculate_loss(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from datetime import timedelta
 from typing import TypeVar
@@ -61,3 +62,12 @@ def share(batch: int) -> int:
             f"{ranks()}, or start another number of ranks"
         )
     return batch // ranks()
+
+
+def check_unsharded() -> None:
+    """Raises UserError where a launcher was told to shard what it cannot: a retriever."""
+    if os.environ.get("ACCELERATE_USE_FSDP") == "true":
+        raise UserError(
+            "FSDP does not shard a retriever: sentence-transformers reads each checkpoint as a "
+            "whole model; leave --use_fsdp away (and give --multi_gpu, on CPUs too)"
+        )

@@ -32,10 +32,11 @@ from train.backbone import (
     nothing_adapted,
     pin_sizes,
 )
-from train.compatible import check_processor, check_tower
+from train.compatible import check_pooling, check_processor, check_tower
 from train.late import keep_projection_exact, late_modules, load_late
 from train.ranks import from_main
 from train.tiny import build_model, build_processor
+from train.trained import EXPORT
 
 Retriever = SentenceTransformer | MultiVectorEncoder
 """With one vector, or with many."""
@@ -56,12 +57,14 @@ def load_retriever(
 
     Raises:
         UserError: the model is not on this machine and cannot be fetched; it has no vision tower,
-            or a processor of another model.
+            or a processor of another model; it was saved by another pooling.
     """
     source = cfg.model
     if cfg.architecture is not None:
         source = from_main(partial(built, cfg, corpus, folder))
     check_reachable("retriever", source)
+    if cfg.late is None and (Path(source) / "modules.json").exists():
+        check_pooling(Path(source))
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     try:
         config = AutoConfig.from_pretrained(source, **origin)
@@ -140,6 +143,8 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
     Raises:
         UserError: `folder` holds no whole retriever, or its base is not on this machine.
     """
+    if (folder / EXPORT).exists() and not (folder / "adapter_config.json").exists():
+        return load_merged(folder, cfg)
     options = {
         "model_kwargs": weight_options(cfg, precision),
         "trust_remote_code": cfg.trust_remote_code,
@@ -148,12 +153,29 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
     try:
         if cfg.late is not None:
             model = load_late(folder, **options)
+            keep_projection_exact(model)
         else:
             model = SentenceTransformer(str(folder), **options)
     except UNREADABLE as error:
         raise damaged(folder, error) from error
     choose_attention(model[0].model, precision, cfg.max_length, masks=True)
     return model
+
+
+def load_merged(folder: Path, cfg: RetrieverConfig) -> Retriever:
+    """A retriever merged into its base, as `train.export` wrote it: in the precision of its
+    weights, and with nothing that the library does not read itself.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    options = {"model_kwargs": {"dtype": "auto", "use_safetensors": True}, "local_files_only": True}
+    try:
+        if cfg.late is not None:
+            return load_late(folder, **options)
+        return SentenceTransformer(str(folder), **options)
+    except UNREADABLE as error:
+        raise damaged(folder, error, "delete it and export again") from error
 
 
 def weight_options(cfg: RetrieverConfig, precision: str) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from datetime import date
 
 from omegaconf import MISSING
 
-from conf.runs import is_name, run_below
+from conf.runs import TRAINERS, is_below, is_name, run_below, runs_of
 from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.checks import is_url, too_small
 from conf.schema.models import RetrieverConfig, StudentConfig
@@ -168,18 +168,26 @@ class SftCommand(CommandConfig):
 
 
 @dataclass
-class ExportStudentCommand(CommandConfig):
+class ExportModelCommand(CommandConfig):
+    product: str = "student"
+    """What is exported: a student of train.sft or a retriever of train.contrastive."""
     run: str = "default"
-    """The run of train.sft that is exported: its name or its folder."""
+    """The run that trained it: its name or its folder."""
     format: str = "bf16"
     """bf16 or fp32 merges the adapters into the dequantised base, whose weights are then written in
     that precision; adapter writes the adapters alone."""
 
     def check(self) -> list[str]:
         problems = super().check()
+        if self.product not in TRAINERS:
+            problems.append(f"product={self.product}: the options are student and retriever")
         if self.format not in EXPORTS:
             problems.append(f"format={self.format}: the options are bf16, fp32 and adapter")
-        runs = f"{self.checkpoints}/sft"
+        for other in TRAINERS:
+            if other != self.product and is_below(self.run, runs_of(self.checkpoints, other)):
+                problems.append(f"run={self.run} trained a {other}: give product={other}")
+                return problems
+        runs = runs_of(self.checkpoints, self.product)
         if not is_name(run_below(self.run, runs)):
             problems.append(
                 f"run={self.run} is no run below {runs}: name one that is there, and give "
@@ -213,11 +221,6 @@ class ContrastiveCommand(CommandConfig):
             problems.append(
                 "train.width_weights with retriever.late: its vectors have one width, leave the "
                 "weights null"
-            )
-        if self.train.mine_every and self.retriever.late is not None:
-            problems.append(
-                f"train.mine_every={self.train.mine_every} with retriever.late: hard negatives are "
-                "mined by one vector a frame, leave train.mine_every=0"
             )
         if self.train.reuse_features and not self.retriever.lora.rank:
             problems.append(

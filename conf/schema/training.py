@@ -28,8 +28,9 @@ class TrainConfig:
     precision: str = "auto"
     """bf16 or fp32: what the passes compute in; adapters and optimizer stay fp32. auto is bf16 on a
     GPU or CPU that has instructions for it, and else fp32, which is then several times as fast."""
-    gradient_checkpointing: bool = True
-    """Whether activations are computed again in the backward pass: less memory, more time."""
+    gradient_checkpointing: bool | str = "auto"
+    """Whether activations are computed again in the backward pass: less memory, more time. auto
+    does so only where they do not fit."""
     evaluations: int = 10
     """Evaluations, evenly spread over the run, each followed by a checkpoint."""
     keep: int = 2
@@ -58,6 +59,11 @@ class TrainConfig:
                 "workers": 0,
             },
         )
+        if self.gradient_checkpointing not in (True, False, "auto"):
+            problems.append(
+                f"train.gradient_checkpointing={self.gradient_checkpointing}: the options are "
+                "auto, true and false"
+            )
         if self.lr <= 0:
             problems.append(f"train.lr={self.lr} must be above 0")
         if not 0 <= self.adam_beta2 < 1:
@@ -89,9 +95,6 @@ class SftTrainConfig(TrainConfig):
     micro_batch: int | str = 1
     """Samples that pass a rank's model at once; moves memory and time, not what is learnt. auto
     takes the fastest number that fits, by trying the longest samples."""
-    gradient_checkpointing: bool | str = "auto"
-    """Whether activations are computed again in the backward pass: less memory, more time. auto
-    does so only where they do not fit."""
     reuse_features: bool = False
     """Whether what the frozen vision tower makes of a frame is kept in memory and used wherever
     the frame is shown again; about 3 MB a frame of an 8B model, in half of the free memory."""
@@ -122,11 +125,6 @@ class SftTrainConfig(TrainConfig):
             )
         if self.packing.lower() not in ("auto", "true", "false"):
             problems.append(f"train.packing={self.packing}: the options are auto, true and false")
-        if self.gradient_checkpointing not in (True, False, "auto"):
-            problems.append(
-                f"train.gradient_checkpointing={self.gradient_checkpointing}: the options are "
-                "auto, true and false"
-            )
         if self.regime not in REGIMES:
             problems.append(f"train.regime={self.regime}: the options are {', '.join(REGIMES)}")
         if self.packing.lower() == "true" and self.regime == "describe":
@@ -152,8 +150,9 @@ class ContrastiveTrainConfig(TrainConfig):
     that it has many frames of one scene; or spread, with as few of a scene as can be."""
     scene_queries: int = 4
     """Queries of a scene that stand together in train.batches=scenes."""
-    mini_batch: int = 8
-    """Prefixes or frames that pass the model at once; moves memory, not the gradient."""
+    mini_batch: int | str = 8
+    """Prefixes or frames that pass the model at once; moves memory and time, not the gradient. auto
+    takes the fastest number that fits, by trying the longest prefixes."""
     mini_batch_tokens: int | None = None
     """Tokens that pass the model at once, in place of train.mini_batch."""
     hard_negatives: int = 1
@@ -212,12 +211,24 @@ class ContrastiveTrainConfig(TrainConfig):
                 f"train.batch={self.batch} with train.hard_negatives=0 leaves no negatives: give a "
                 "batch of 2 or more, or hard negatives"
             )
+        if self.batches == "scenes" and self.scene_queries > self.batch:
+            problems.append(
+                f"train.scene_queries={self.scene_queries} must be at most train.batch={self.batch}"
+            )
         if self.mine_every and not self.hard_negatives:
             problems.append(
                 f"train.mine_every={self.mine_every} with train.hard_negatives=0 mines nothing: "
                 "give hard negatives, or leave train.mine_every=0"
             )
-        if not 1 <= self.mini_batch <= self.batch:
+        if self.mini_batch == "auto":
+            if self.mini_batch_tokens is not None:
+                problems.append(
+                    f"train.mini_batch=auto with train.mini_batch_tokens={self.mini_batch_tokens}: "
+                    "give one of them"
+                )
+        elif isinstance(self.mini_batch, str):
+            problems.append(f"train.mini_batch={self.mini_batch}: give a number or auto")
+        elif not 1 <= self.mini_batch <= self.batch:
             problems.append(
                 f"train.mini_batch={self.mini_batch} must lie between 1 and "
                 f"train.batch={self.batch}"

@@ -19,7 +19,7 @@ SCHEMAS = {
     "teacher.serve": schema.ServeCommand,
     "train.sft": schema.SftCommand,
     "train.contrastive": schema.ContrastiveCommand,
-    "train.export": schema.ExportStudentCommand,
+    "train.export": schema.ExportModelCommand,
     "evaluation.select": schema.SelectCommand,
     "evaluation.retrieve": schema.RetrieveCommand,
     "evaluation.report": schema.ReportCommand,

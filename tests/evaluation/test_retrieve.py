@@ -228,3 +228,29 @@ def test_a_kept_embedding_depends_on_what_is_shown(micro_store, saved, tmp_path)
     # Neither the number of a query's frames nor its instruction changes a frame's embedding.
     asked = replace(embedder, preset=replace(CFG, frames=6, query_instruction="Find."))
     assert embed_frames(asked, database, store, Frames(store, 96), 2).folder in folders
+
+
+@pytest.mark.parametrize(
+    ("name", "another"),
+    [
+        ("config.json", False),
+        ("tokenizer.json", True),
+        ("tokenizer_config.json", True),
+        ("processor_config.json", True),
+        ("chat_template.jinja", True),
+    ],
+)
+def test_one_with_an_edited_processor_is_another(
+    micro_store, saved, tmp_path, name, another
+) -> None:
+    def keys() -> list[str]:
+        pair = embedders(tmp_path / "run", CFG, "fp32", micro_store, tmp_path)
+        return [json.dumps(embedder.about(micro_store)) for embedder in pair]
+
+    shutil.copytree(saved, tmp_path / "run")
+    before = keys()
+    for part in ("retriever", "untrained"):
+        path = tmp_path / "run" / part / name
+        path.write_text(path.read_text() + "\n")
+    changed = [now != then for now, then in zip(keys(), before, strict=True)]
+    assert changed == [another, another]

@@ -22,7 +22,7 @@ from conf.entry import Run
 from conf.errors import UserError
 from conf.runs import is_name, open_run, run_below
 from conf.schema import (
-    ExportStudentCommand,
+    ExportModelCommand,
     SelectCommand,
     SftCommand,
     SftTrainConfig,
@@ -30,7 +30,7 @@ from conf.schema import (
     TeacherConfig,
 )
 from evaluation import select
-from train import backbone, compatible, export
+from train import backbone, compatible, export, merged_student
 from train.collate import encode
 from train.conversation import selection_sample
 from train.trained import run_title, settings_of
@@ -71,7 +71,7 @@ def runs(settings, tmp_path_factory) -> Path:
 
 
 def exported(settings: SftCommand, runs: Path, format: str, into: Path) -> tuple[dict, Path]:
-    cfg = ExportStudentCommand(
+    cfg = ExportModelCommand(
         run="run", format=format, store=settings.store, checkpoints=str(runs), workers=1
     )
     into.mkdir(parents=True, exist_ok=True)
@@ -214,7 +214,7 @@ def test_an_export_that_answers_otherwise_is_not_kept(
 ) -> None:
     """The adapters left out stand for anything that goes wrong in merging."""
     monkeypatch.setattr(
-        export, "merge", lambda *_: backbone.load_base(replace_nf4(settings), "fp32", list)
+        merged_student, "merge", lambda *_: backbone.load_base(replace_nf4(settings), "fp32", list)
     )
     with pytest.raises(UserError, match=r"differ by .* of their size .* nothing was exported"):
         exported(settings, runs, "fp32", tmp_path)
@@ -274,19 +274,19 @@ def test_a_card_says_what_the_run_says(settings, runs, forms) -> None:
 
 
 def test_differences_are_shares_of_the_logits_size() -> None:
-    def outputs(*values: float, letter: int | None = 0) -> export.Outputs:
-        return export.Outputs(torch.tensor([values]), letter)
+    def outputs(*values: float, letter: int | None = 0) -> merged_student.Outputs:
+        return merged_student.Outputs(torch.tensor([values]), letter)
 
     before = {"answer": [outputs(3.0, 0.0), outputs(0.0, 4.0)]}
     after = {"answer": [outputs(3.0, 1.0), outputs(0.0, 4.0, letter=2)]}
-    assert export.compare(before, after) == pytest.approx(
+    assert merged_student.compare(before, after) == pytest.approx(
         {"answer_logit_difference": 0.2, "answer_letter_agreement": 0.5}
     )
-    assert set(export.compare(before, before).values()) == {0.0, 1.0}
+    assert set(merged_student.compare(before, before).values()) == {0.0, 1.0}
     silent = {"describe": [outputs(3.0, letter=None)]}
-    assert export.compare(silent, silent) == {"describe_logit_difference": 0.0}
+    assert merged_student.compare(silent, silent) == {"describe_logit_difference": 0.0}
     broken = {"answer": [outputs(math.nan, 0.0), outputs(0.0, 4.0)]}
-    assert math.isnan(export.compare(before, broken)["answer_logit_difference"])
+    assert math.isnan(merged_student.compare(before, broken)["answer_logit_difference"])
 
 
 @pytest.mark.parametrize(
@@ -340,4 +340,4 @@ def test_a_run_goes_by_its_name_or_its_folder(tmp_path, monkeypatch) -> None:
     assert is_name("lrs/0")
     for given in ("/elsewhere/sft/exp-cot", "../sft/exp-cot", "checkpoints/sft", "."):
         assert not is_name(run_below(given, "checkpoints/sft"))
-        assert ExportStudentCommand(run=given).check()
+        assert ExportModelCommand(run=given).check()

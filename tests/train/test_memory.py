@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from conf.entry import Run
-from conf.schema import SftCommand, SftTrainConfig
+from conf.schema import SftCommand
 from train import journal, memory, room, sft
 from train.backbone import load_student
 from train.collate import Collator
@@ -19,7 +19,7 @@ from train.memory import Choice, choose, settle, sizes
 from train.planned import Samples
 from train.samples import splits
 
-AUTO = SftTrainConfig(micro_batch="auto", gradient_checkpointing="auto")
+AUTO = Choice("auto", "auto")
 
 
 @dataclass

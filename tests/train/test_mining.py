@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from conf.entry import Run
+from conf.schema import LateConfig
 from data.geometry import displacements
 from data.records import FrameRef
 from train import contrastive
@@ -39,13 +40,15 @@ def test_the_benchmarks_own_fill_what_is_lacking(micro_store) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("late", [None, LateConfig(width=24)])
 def test_a_run_mines_what_ranks_highest_and_goes_on_with_it(
-    contrastive_settings, micro_store, frames, tmp_path
+    contrastive_settings, micro_store, frames, tmp_path, late
 ) -> None:
     train = replace(
         contrastive_settings.train, mine_every=1, mine_margin=MARGIN, evaluations=4, keep=4
     )
-    settings = replace(contrastive_settings, train=train)
+    cfg = replace(contrastive_settings.retriever, late=late)
+    settings = replace(contrastive_settings, retriever=cfg, train=train)
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
         folder.mkdir()
@@ -69,17 +72,17 @@ def test_a_run_mines_what_ranks_highest_and_goes_on_with_it(
     queries = [q for q in micro_store.retrieval("train") if q.scene_id not in held_out]
     assert mined.keys() == {q.query_id for q in queries}
     # The checkpoint of the third step is the retriever that mined.
-    cfg = settings.retriever
     shutil.copytree(whole / "retriever", tmp_path / "third")
-    weights = whole / "checkpoint-3" / "model.safetensors"
-    shutil.copy(weights, tmp_path / "third" / "model.safetensors")
+    for weights in (whole / "checkpoint-3").rglob("model.safetensors"):
+        shutil.copy(weights, tmp_path / "third" / weights.relative_to(whole / "checkpoint-3"))
     model = load_trained(cfg, "fp32", tmp_path / "third")
     pool = list(dict.fromkeys(f for q in queries for f in (q.target, *q.hard_negatives[:1])))
-    shown = model.encode([frame_input(f, frames) for f in pool], prompt=cfg.frame_instruction)
+    shown = model.encode_document([frame_input(f, frames) for f in pool])
     for query in queries[:5]:
-        asked = model.encode([query_input(query, frames, cfg)], prompt=cfg.query_instruction)[0]
-        ranked = [pool[k] for k in np.argsort(-(shown @ asked), kind="stable")]
-        scores = dict(zip(pool, shown @ asked, strict=True))
+        asked = model.encode_query([query_input(query, frames, cfg)])
+        found = model.similarity(asked, shown)[0].cpu().numpy()
+        ranked = [pool[k] for k in np.argsort(-found, kind="stable")]
+        scores = dict(zip(pool, found, strict=True))
         best = wrong(query, ranked, micro_store, MARGIN, 1)[0]
         assert scores[mined[query.query_id][0]] == pytest.approx(scores[best], abs=1e-5)
     assert json.loads((whole / "mined" / "1.json").read_text())

@@ -10,11 +10,12 @@ import torch
 from sentence_transformers import SentenceTransformer
 
 from conf.errors import UserError
-from conf.schema import LoraConfig
-from data.records import FPS, shown_frames
+from conf.schema import LateConfig, LoraConfig
+from data.records import FPS, FrameRef, shown_frames
 from train import retriever
 from train.audit import audit_retriever
 from train.backbone import keep_differentiable
+from train.ranking import HeldOutRanking, LateHeldOutRanking
 from train.retriever import frame_input, query_input
 from train.towers import count_towers
 
@@ -117,3 +118,34 @@ def test_adapters_are_trained_in_fp32_over_a_bf16_base(
     assert next(model[0].parameters()).dtype == torch.bfloat16
     query = [query_input(micro_store.retrieval("train")[0], frames, cfg)]
     assert np.isfinite(model.encode(query, prompt_name="query")).all()
+
+
+@pytest.mark.parametrize("late", [None, LateConfig(width=24)])
+def test_a_held_out_ranking_is_that_of_all_pixels_at_once(
+    micro_store, frames, retriever_cfg, tmp_path, monkeypatch, late
+) -> None:
+    """It reads them a mini-batch at a time, and a frame that is no number has its name."""
+    cfg = replace(retriever_cfg, late=late)
+    model = load(micro_store, cfg, tmp_path).eval()
+    queries = micro_store.retrieval("train")[:7]
+    kind = LateHeldOutRanking if late else HeldOutRanking
+    evaluator = kind(queries, frames, cfg, 2)
+    assert all(isinstance(one, FrameRef) for one in evaluator.corpus)
+    asked = model.encode_query([query_input(q, frames, cfg) for q in queries])
+    shown = model.encode_document([frame_input(f, frames) for f in evaluator.corpus])
+    scores = model.similarity(asked, shown).cpu().numpy()
+    gold = np.array([evaluator.corpus.index(q.target) for q in queries])
+    found = evaluator(model)
+    own = scores[np.arange(len(queries)), gold][:, None]
+    assert found["mrr"] == pytest.approx((1 / (1 + (scores > own).sum(1))).mean(), abs=0.02)
+    assert found["recall@10"] == pytest.approx(((scores > own).sum(1) < 10).mean(), abs=0.2)
+
+    embed, first = model.encode_document, evaluator.corpus[0]
+
+    def torn(*inputs, **settings):
+        made = list(embed(*inputs, **settings))
+        return [made[0] * float("nan"), *made[1:]]
+
+    monkeypatch.setattr(model, "encode_document", torn)
+    with pytest.raises(UserError, match=f"frame {first.frame} of {first.scene_id} is no number"):
+        evaluator(model)

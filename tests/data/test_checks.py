@@ -1,4 +1,4 @@
-"""A test that cannot measure anything is refused, and what is wrong with it named."""
+"""Queries that prove nothing are refused, and what is wrong with them named."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import pytest
 
 from conf.errors import UserError
 from data.records import FrameRef
-from evaluation.checks import check_retrieval
+from data.retrieval.checks import check_test, check_training
 
 
 def test_a_built_benchmark_passes(micro_store) -> None:
-    check_retrieval(micro_store, micro_store.standard_test(), micro_store.database())
+    check_test(micro_store, micro_store.standard_test(), micro_store.database())
+    check_training(micro_store, micro_store.retrieval("train"), 2)
 
 
 def test_bad_tests_are_named(micro_store) -> None:
@@ -45,4 +46,27 @@ def test_bad_tests_are_named(micro_store) -> None:
         ),
     ):
         with pytest.raises(UserError, match=said):
-            check_retrieval(micro_store, asked, frames)
+            check_test(micro_store, asked, frames)
+
+
+def test_bad_training_queries_are_named(micro_store) -> None:
+    queries = micro_store.retrieval("train")
+    tested = micro_store.scene_ids("test")[0]
+    first, second, *_ = queries
+    poor = replace(second, hard_negatives=second.hard_negatives[:1])
+    for asked, said in (
+        ([*queries, first, second], rf"has query {first.query_id} more than once \(1 more such\)"),
+        (
+            [replace(first, scene_id=tested)],
+            f"training query {first.query_id} is about scene {tested}, which is in the test split",
+        ),
+        ([replace(first, target=FrameRef(tested, 3))], "in the test split"),
+        (
+            [first, poor],
+            rf"train\.hard_negatives=2 is more than the 1 that query {second.query_id} .* "
+            r"give train\.hard_negatives=1",
+        ),
+    ):
+        with pytest.raises(UserError, match=said):
+            check_training(micro_store, asked, 2)
+    check_training(micro_store, [first, poor], 1)
