@@ -13,13 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from transformers import (
-    MODEL_FOR_ZERO_SHOT_IMAGE_CLASSIFICATION_MAPPING,
-    AutoConfig,
-    AutoModelForZeroShotImageClassification,
-    AutoProcessor,
-    PreTrainedModel,
-)
+from transformers import AutoConfig, AutoModel, AutoProcessor, PreTrainedModel
 
 from conf.errors import UserError
 from conf.schema import RetrieverConfig
@@ -30,6 +24,8 @@ from train.backbone import DTYPES, UNREADABLE, check_reachable, load_failure
 
 Clips = Callable[[list[np.ndarray]], np.ndarray]
 
+DUAL = ("clip", "metaclip_2", "siglip", "siglip2")
+"""Types of models that are read here, as transformers names them."""
 IMAGES = 64
 """Images that pass a tower at once."""
 
@@ -75,10 +71,10 @@ class DualEncoder:
             truncation=True,
             return_tensors="pt",
         )
-        given = {"input_ids": inputs["input_ids"].to(self.language.device)}
+        given = {name: value.to(self.language.device) for name, value in inputs.items()}
         # SigLIP was trained to look at its padding.
-        if "attention_mask" in inputs and self.language.config.model_type == "clip":
-            given["attention_mask"] = inputs["attention_mask"].to(self.language.device)
+        if self.language.config.model_type.startswith("siglip"):
+            given = {"input_ids": given["input_ids"]}
         with torch.inference_mode():
             return unit(as_array(self.language.get_text_features(**given).pooler_output))
 
@@ -103,10 +99,9 @@ class DualEncoder:
 
 def pixel_values(image_processor: Any, pixels: np.ndarray) -> dict[str, torch.Tensor]:
     """What a tower takes of (images, S, S, 3) uint8, which have its size already."""
-    sizes = {"do_resize": False, "do_center_crop": False}
-    if "max_num_patches" in image_processor.valid_kwargs.__annotations__:
-        # Frames of any size, as so many patches: only its own resizing makes these.
-        sizes = {}
+    # A tower that takes any size has it cut into patches by its processor's own resizing.
+    any_size = hasattr(image_processor, "max_num_patches")
+    sizes = {} if any_size else {"do_resize": False, "do_center_crop": False}
     return dict(image_processor(list(pixels), return_tensors="pt", **sizes))
 
 
@@ -134,7 +129,7 @@ def as_array(found: torch.Tensor) -> np.ndarray:
 
 
 def load_dual(preset: RetrieverConfig, precision: str) -> DualEncoder:
-    """A model of text and images of the kinds that transformers knows, such as CLIP and SigLIP 2.
+    """A model of one of the types in `DUAL`.
 
     Raises:
         UserError: it is not on this machine and cannot be fetched, is no such model, lacks a part,
@@ -144,16 +139,14 @@ def load_dual(preset: RetrieverConfig, precision: str) -> DualEncoder:
     origin = {"revision": preset.revision, "trust_remote_code": preset.trust_remote_code}
     try:
         config = AutoConfig.from_pretrained(preset.model, **origin)
-        if type(config) not in MODEL_FOR_ZERO_SHOT_IMAGE_CLASSIFICATION_MAPPING:
+        if config.model_type not in DUAL:
             raise UserError(
-                f"retriever.model={preset.model} ({config.model_type}) does not embed images and "
-                "texts in one space: give a model such as CLIP or SigLIP 2, or another "
+                f"retriever.model={preset.model} ({config.model_type}) is no CLIP and no SigLIP, "
+                "which embed frames and texts apart in one space: give one of these, or another "
                 "retriever.encoder"
             )
         processor = AutoProcessor.from_pretrained(preset.model, **origin)
-        model = whole(
-            AutoModelForZeroShotImageClassification, preset.model, precision, "model", **origin
-        )
+        model = whole(AutoModel, preset.model, precision, "model", **origin)
     except UNREADABLE as error:
         raise load_failure("retriever", preset.model, error) from error
     for part in ("tokenizer", "image_processor"):
