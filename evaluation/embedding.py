@@ -1,4 +1,4 @@
-"""Embed the queries and the frames of a benchmark with a retriever, once.
+"""Embed the queries, items and frames of a benchmark with a retriever, once.
 
 What loads a model is imported only where something has to be embedded: importing it takes longer
 than ranking.
@@ -6,7 +6,7 @@ than ranking.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
@@ -17,7 +17,7 @@ import numpy as np
 
 from conf.schema import RetrieverConfig
 from data.frames import Frames
-from data.records import FrameRef, RetrievalQuery
+from data.records import FrameRef, SelectionItem
 from data.store import Store
 from evaluation.cache import Embeddings
 from evaluation.tables import UNTRAINED
@@ -31,7 +31,7 @@ from train.compatible import (
 from train.trained import product_folder, run_title
 
 if TYPE_CHECKING:
-    from train.retriever import Retriever
+    from evaluation.encoders import Encoder, Query
 
 EMBEDDINGS = "embeddings"
 """Folder of them in a store."""
@@ -53,12 +53,13 @@ class Embedder:
     """Hash of the base's weights and the adapters'."""
     processor: str
     """Hash of the files that make its input."""
-    load: Callable[[], Retriever]
+    load: Callable[[], Encoder]
 
     def about(self, store: Store) -> dict[str, Any]:
         """Everything that an embedding depends on, besides what is shown and how it is asked."""
         preset = self.preset
         return {
+            "encoder": preset.encoder,
             "weights": self.weights,
             "processor": self.processor,
             "revision": preset.revision,
@@ -100,12 +101,10 @@ def trained_embedder(folder: Path, preset: RetrieverConfig, precision: str) -> E
         check_pooling(saved)
 
     @cache
-    def load() -> Retriever:
-        from train.retriever import load_trained
-        from train.room import keep_big_blocks
+    def load() -> Encoder:
+        from evaluation.encoders import trained_encoder
 
-        keep_big_blocks()
-        return load_trained(preset, precision, saved)
+        return trained_encoder(preset, precision, saved)
 
     digests = weights_digest(preset.model, saved), processor_digest(saved)
     return Embedder(run_title(folder), preset, precision, *digests, load)
@@ -125,60 +124,57 @@ def built_base(
 
 
 def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Embedder:
-    """The preset's base."""
+    """The preset's base, or another model as it was released."""
 
     @cache
-    def load() -> Retriever:
-        from train.retriever import load_retriever
-        from train.room import keep_big_blocks
+    def load() -> Encoder:
+        from evaluation.encoders import released_encoder
 
-        keep_big_blocks()
-        return load_retriever(preset, precision, [], run / "untrained")
+        return released_encoder(preset, precision, run / "untrained")
 
-    digests = weights_digest(preset.model), processor_digest(preset.model)
-    name = f"{UNTRAINED} {preset.name}" + (", late" if preset.late is not None else "")
-    return Embedder(name, preset, precision, *digests, load)
+    weights = weights_digest(preset.model, preset.image_model)
+    name = f"{UNTRAINED} {preset.name}" if preset.encoder == "qwen3_vl" else preset.name
+    name += ", late" if preset.late is not None else ""
+    return Embedder(name, preset, precision, weights, processor_digest(preset.model), load)
 
 
 def frame_name(frame: FrameRef) -> str:
     return f"{frame.scene_id}/{frame.frame}"
 
 
+def query_name(query: Query) -> str:
+    return query.item_id if isinstance(query, SelectionItem) else query.query_id
+
+
 def embed_queries(
-    embedder: Embedder, queries: Sequence[RetrievalQuery], store: Store, frames: Frames, batch: int
+    embedder: Embedder, queries: Sequence[Query], store: Store, frames: Frames, batch: int
 ) -> Embeddings:
-    """The embeddings of queries, by their ids; pixels are read a batch at a time.
+    """The embeddings of prefixes with their questions, by `query_name`; pixels are read a batch at
+    a time.
 
     Raises:
         UserError: what `Embeddings.complete` and `check_widths` raise.
     """
     preset = embedder.preset
-
-    def inputs(some: list[RetrievalQuery]) -> list:
-        from train.retriever import query_input
-
-        return [query_input(q, frames, preset) for q in some]
-
     about = {"instruction": preset.query_instruction, "frames": preset.frames}
     # Scene by scene, so that a scene's frames are decoded once.
-    things = {q.query_id: q for q in sorted(queries, key=lambda q: (q.scene_id, q.query_id))}
-    return _embedded(embedder, "query", about, things, inputs, store, batch)
+    ordered = sorted(queries, key=lambda q: (q.scene_id, query_name(q)))
+    things = {query_name(q): q for q in ordered}
+    return _embedded(
+        embedder, "query", about, things, lambda e, some: e.queries(some, frames), store, batch
+    )
 
 
 def embed_frames(
-    embedder: Embedder, database: Sequence[FrameRef], store: Store, frames: Frames, batch: int
+    embedder: Embedder, database: Iterable[FrameRef], store: Store, frames: Frames, batch: int
 ) -> Embeddings:
     """The embeddings of frames, by `frame_name`. Errors are those of `embed_queries`."""
-
-    def inputs(some: list[FrameRef]) -> list:
-        from train.retriever import frame_input
-
-        return [frame_input(f, frames) for f in some]
-
     about = {"instruction": embedder.preset.frame_instruction}
     ordered = sorted(database, key=lambda f: (f.scene_id, f.frame))
     things = {frame_name(f): f for f in ordered}
-    return _embedded(embedder, "frame", about, things, inputs, store, batch)
+    return _embedded(
+        embedder, "frame", about, things, lambda e, some: e.frames(some, frames), store, batch
+    )
 
 
 def _embedded(
@@ -186,22 +182,17 @@ def _embedded(
     kind: str,
     about: dict[str, Any],
     things: Mapping[str, Thing],
-    inputs: Callable[[list[Thing]], list],
+    encode: Callable[[Encoder, list[Thing]], np.ndarray],
     store: Store,
     batch: int,
 ) -> Embeddings:
     preset = embedder.preset
 
     def embed(some: list[Thing]) -> np.ndarray:
-        model = embedder.load()
-        shown, prompt = inputs(some), about["instruction"]
-        if preset.late is not None:
-            from evaluation.late import embedded_rows
-
-            return embedded_rows(model, shown, prompt, kind)
-        check_widths(preset, model.get_embedding_dimension())
-        embedded = model.encode(shown, prompt=prompt, batch_size=batch, show_progress_bar=False)
-        return np.asarray(embedded, dtype=np.float32)
+        rows = encode(embedder.load(), some)
+        if preset.late is None:
+            check_widths(preset, rows.shape[1])
+        return rows
 
     kept = Embeddings(store.folder / EMBEDDINGS, kind, embedder.about(store) | about)
     kept.complete(things, embed, batch)

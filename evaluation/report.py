@@ -25,8 +25,8 @@ Row = TypeVar("Row", "SelectionRow", "RetrievalRow")
 def main(cfg: ReportCommand, run: Run) -> None:
     root = Path(cfg.checkpoints)
     selected, retrieved = _finished(root, "select"), _finished(root, "retrieve")
-    studies = _finished(root, "export_study")
-    if not selected and not retrieved and not studies:
+    nearest, studies = _finished(root, "similarity"), _finished(root, "export_study")
+    if not selected and not nearest and not retrieved and not studies:
         raise UserError(
             f"nothing is measured below {root}: run python -m evaluation.select "
             "model=checkpoints/sft/RUN or python -m evaluation.retrieve "
@@ -48,9 +48,11 @@ def main(cfg: ReportCommand, run: Run) -> None:
     if selected:
         pictures.insert(0, selected[-1] / "item.png")
     # Measured on another benchmark is measured on other items: never in one table.
-    choices = [r for f in selected for r in _rows(f, SelectionRow)]
+    choices = [r for f in [*selected, *nearest] for r in _rows(f, SelectionRow)]
     for benchmark in dict.fromkeys(r.benchmark for r in choices):
-        rows = [r for r in choices if r.benchmark == benchmark]
+        of_it = [r for r in choices if r.benchmark == benchmark]
+        # A released model's row stands in the reports of several that were trained from it.
+        rows = [r for k, r in enumerate(of_it) if r not in of_it[:k]]
         parts.append(f"benchmark {benchmark}\n{selection_table(rows)}")
         pictures.insert(1, run.folder / f"selection-{benchmark.replace(', ', '-')}.png")
         selection_figure(rows, pictures[1])

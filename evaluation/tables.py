@@ -17,6 +17,9 @@ MEASURES = ("mrr", "median_rank", "tie_rate")
 UNTRAINED = "untrained"
 """What the names of rows begin with that a trained retriever is held against."""
 
+SIMILARITY = "similarity"
+"""The mode of a retriever that chooses the nearest candidate."""
+
 NAME_WIDTH = 40
 
 
@@ -104,9 +107,10 @@ def selection_table(rows: Sequence[SelectionRow]) -> str:
         name = _short(r.name, NAME_WIDTH - len(r.mode) - 3)
         own.append([f"{name} ({r.mode})", *map(_percent, shares), f"{r.n:,}"])
         own.append(["  95% interval", *map(_range, found), "", _range(r.micro), "", ""])
+    similar = paper.SELECTION_SIMILARITY if any(r.mode == SIMILARITY for r in rows) else ()
     reference = [
         [r.name, *map(_printed, (r.event, r.time, r.window, r.macro, r.micro, r.parse_rate)), ""]
-        for r in (paper.CHANCE, *paper.SELECTION_DISTILLED, paper.HUMAN_MAJORITY)
+        for r in (paper.CHANCE, *similar, *paper.SELECTION_DISTILLED, paper.HUMAN_MAJORITY)
     ]
     head = ["Selection accuracy, %", *(f.capitalize() for f in FAMILIES)]
     table = _table(
@@ -124,7 +128,8 @@ def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> str:
         found = [subtypes[mode][cell] for mode in modes]
         shares = [f"{_percent(i.value)} [{_range(i)}]" for i in found]
         rows.append([cell, *shares, str(found[0].n)])
-    return _table(["Accuracy by subtype, %", *modes, "Items"], {"": rows})
+    heads = [_short(mode, NAME_WIDTH) for mode in modes]
+    return _table(["Accuracy by subtype, %", *heads, "Items"], {"": rows})
 
 
 def retrieval_table(rows: Sequence[RetrievalRow]) -> str:

@@ -95,7 +95,7 @@ def nf4_config(compute: torch.dtype) -> BitsAndBytesConfig:
     )
 
 
-def check_reachable(group: str, model: str) -> None:
+def check_reachable(group: str, model: str, key: str = "model") -> None:
     """Ask once whether a model can be had, before libraries try again and again for minutes.
 
     Raises:
@@ -106,22 +106,24 @@ def check_reachable(group: str, model: str) -> None:
     if Path(model).is_dir():
         return
     try:
-        if not isinstance(try_to_load_from_cache(model, "config.json"), str):
+        # Adapters have no settings of a whole model beside them.
+        files = ("config.json", "adapter_config.json")
+        if not any(isinstance(try_to_load_from_cache(model, file), str) for file in files):
             model_info(model, timeout=10)
     except Exception as error:
         # The hub's client raises errors of whichever HTTP library it has; all mean the same here.
-        raise load_failure(group, model, error) from error
+        raise load_failure(group, model, error, key) from error
 
 
-def load_failure(group: str, model: str, error: Exception) -> UserError:
+def load_failure(group: str, model: str, error: Exception, key: str = "model") -> UserError:
     """What to tell a user whose model did not load."""
     first = next(iter(str(error).strip().splitlines()), type(error).__name__)
     if Path(model).is_dir():
-        return UserError(f"{group}.model={model} cannot be loaded from that folder: {first}")
+        return UserError(f"{group}.{key}={model} cannot be loaded from that folder: {first}")
     return UserError(
-        f"{group}.model={model} is not on this machine and cannot be fetched: there is no "
+        f"{group}.{key}={model} is not on this machine and cannot be fetched: there is no "
         f"folder of that name, and the hub's cache does not hold it. Point at a local copy with "
-        f"{group}.model=FOLDER (config.json, *.safetensors, tokenizer and processor files), or "
+        f"{group}.{key}=FOLDER (config.json, *.safetensors, tokenizer and processor files), or "
         f"fetch it where there is a network with: hf download {model}"
     )
 

@@ -25,6 +25,7 @@ from conf.schema.commands import (
     SelectCommand,
     ServeCommand,
     SftCommand,
+    SimilarityCommand,
     StatisticsCommand,
 )
 from conf.schema.models import (
@@ -63,6 +64,7 @@ __all__ = [
     "ServeCommand",
     "SftCommand",
     "SftTrainConfig",
+    "SimilarityCommand",
     "StatisticsCommand",
     "StudentConfig",
     "StudyCommand",

@@ -18,6 +18,7 @@ EXPORTS = ("bf16", "fp32", "adapter")
 FRAMES_AHEAD = ("named", "all", "none")
 ENGINES = ("loky", "ray")
 INDEXES = ("exact", "faiss")
+SUITES = (None, "matched_anchor")
 DTYPES = ("auto", "bfloat16", "float16", "float32")
 
 
@@ -211,6 +212,11 @@ class ContrastiveCommand(CommandConfig):
                 f"train.hard_negatives={self.train.hard_negatives} is more than "
                 f"benchmark.retrieval.hard_negatives={self.benchmark.retrieval.hard_negatives}"
             )
+        if self.retriever.encoder != "qwen3_vl":
+            problems.append(
+                f"retriever.encoder={self.retriever.encoder} is measured, not trained: choose "
+                "retriever=qwen3_vl_emb_8b or another one of Qwen3-VL's kind"
+            )
         weights, widths = self.train.width_weights, self.retriever.widths
         if weights is not None and (len(weights) != len(widths) or min(weights, default=0) < 0):
             problems.append(
@@ -257,7 +263,7 @@ class SelectCommand(CommandConfig):
 
     def check(self) -> list[str]:
         problems = super().check() + too_small(self, "", {"batch": 1, "limit": 1})
-        if self.suite not in (None, "matched_anchor"):
+        if self.suite not in SUITES:
             problems.append(f"suite={self.suite}: the options are matched_anchor and null")
         if self.control not in (None, "candidate_only", "shuffled_prefix"):
             problems.append(
@@ -294,6 +300,32 @@ class RetrieveCommand(CommandConfig):
         problems = super().check() + too_small(self, "", {"batch": 1, "probes": 1})
         if self.index not in INDEXES:
             problems.append(f"index={self.index}: the options are exact and faiss")
+        return problems
+
+
+@dataclass
+class SimilarityCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    retriever: RetrieverConfig = MISSING
+    train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
+    """The preset's recipe; a measurement takes its precision alone."""
+    model: str | None = None
+    """A run folder of train.contrastive, with its own retriever and recipe; null takes the
+    preset's model as it was released."""
+    batch: int = 64
+    """Prefixes or frames that pass the model at once."""
+    limit: int | None = None
+    """Test items at most, spread over the families; null takes all."""
+    seed: int = 0
+    """Of the items that `limit` leaves."""
+    suite: str | None = None
+    """matched_anchor for the pairs that differ in their anchor alone; null takes the benchmark's
+    own items."""
+
+    def check(self) -> list[str]:
+        problems = super().check() + too_small(self, "", {"batch": 1, "limit": 1})
+        if self.suite not in SUITES:
+            problems.append(f"suite={self.suite}: the options are matched_anchor and null")
         return problems
 
 

@@ -67,6 +67,9 @@ class StudentConfig:
         )
 
 
+ENCODERS = ("qwen3_vl", "vlm2vec", "dual", "languagebind")
+
+
 @dataclass
 class LateConfig:
     """A retriever of many vectors: one a token of the frame, or of the query's clip and question. A
@@ -82,7 +85,13 @@ class LateConfig:
 @dataclass
 class RetrieverConfig:
     name: str = MISSING
+    encoder: str = "qwen3_vl"
+    """qwen3_vl and vlm2vec read a prefix and its question together; dual (CLIP, SigLIP 2) and
+    languagebind embed them apart and add them up. qwen3_vl alone is trained here, the others are
+    measured as they were released."""
     model: str | None = None
+    image_model: str | None = None
+    """Of languagebind: what embeds frames, where `model` embeds prefixes and questions."""
     revision: str | None = None
     trust_remote_code: bool = False
     architecture: ArchitectureConfig | None = None
@@ -108,6 +117,28 @@ class RetrieverConfig:
             )
         if self.late is not None:
             problems += too_small(self.late, "retriever.late.", {"width": 1, "pool": 1})
+        return problems + self._encoder_problems()
+
+    def _encoder_problems(self) -> list[str]:
+        if self.encoder not in ENCODERS:
+            return [f"retriever.encoder={self.encoder}: the options are {', '.join(ENCODERS)}"]
+        problems = []
+        if self.encoder != "qwen3_vl" and (
+            self.quantization != "none"
+            or self.lora.rank
+            or self.late is not None
+            or self.architecture is not None
+        ):
+            problems.append(
+                f"retriever.encoder={self.encoder} is measured as it was released: give "
+                "retriever.quantization=none and retriever.lora.rank=0, and leave retriever.late "
+                "and retriever.architecture null"
+            )
+        if (self.encoder == "languagebind") != (self.image_model is not None):
+            problems.append(
+                f"retriever.image_model={self.image_model} with retriever.encoder={self.encoder}: "
+                "languagebind, and it alone, has a model of its own for frames"
+            )
         return problems
 
 

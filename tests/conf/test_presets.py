@@ -22,6 +22,7 @@ SCHEMAS = {
     "train.export": schema.ExportModelCommand,
     "evaluation.select": schema.SelectCommand,
     "evaluation.retrieve": schema.RetrieveCommand,
+    "evaluation.similarity": schema.SimilarityCommand,
     "evaluation.report": schema.ReportCommand,
     "evaluation.study": schema.StudyCommand,
     "evaluation.study.export": schema.ExportStudyCommand,

@@ -1,0 +1,90 @@
+"""One interface for whatever embeds queries, frames and texts, and the encoders that read a prefix
+and its question together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from conf.schema import RetrieverConfig
+from data.frames import Frames
+from data.records import FrameRef, RetrievalQuery, SelectionItem
+from evaluation.late import embedded_rows
+from train.retriever import frame_input, load_retriever, load_trained, query_input
+from train.room import keep_big_blocks
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from train.retriever import Retriever
+
+Query = RetrievalQuery | SelectionItem
+
+
+class Encoder(Protocol):
+    """Gives (things, entries) fp32 embeddings; pixels come from `frames` at the preset's size."""
+
+    def queries(self, asked: list[Query], frames: Frames) -> np.ndarray:
+        """Of prefixes with their questions."""
+
+    def frames(self, shown: list[FrameRef], frames: Frames) -> np.ndarray: ...
+
+    def texts(self, texts: list[str]) -> np.ndarray:
+        """Of texts that stand for a query by themselves."""
+
+
+class JointEncoder:
+    """A retriever of sentence-transformers: a prefix and its question are one input, after an
+    instruction of their own."""
+
+    def __init__(self, model: Retriever, preset: RetrieverConfig) -> None:
+        self._model, self._preset = model, preset
+
+    def queries(self, asked: list[Query], frames: Frames) -> np.ndarray:
+        shown = [query_input(query, frames, self._preset) for query in asked]
+        return self._embedded(shown, self._preset.query_instruction, "query")
+
+    def frames(self, shown: list[FrameRef], frames: Frames) -> np.ndarray:
+        images = [frame_input(frame, frames) for frame in shown]
+        return self._embedded(images, self._preset.frame_instruction, "frame")
+
+    def texts(self, texts: list[str]) -> np.ndarray:
+        return self._embedded(texts, self._preset.query_instruction, "query")
+
+    def _embedded(self, inputs: list[Any], prompt: str, kind: str) -> np.ndarray:
+        if self._preset.late is not None:
+            return embedded_rows(self._model, inputs, prompt, kind)
+        found = self._model.encode(
+            inputs, prompt=prompt, batch_size=len(inputs), show_progress_bar=False
+        )
+        return np.asarray(found, dtype=np.float32)
+
+
+def trained_encoder(preset: RetrieverConfig, precision: str, saved: Path) -> Encoder:
+    """What `train.contrastive` saved. Errors are those of `load_trained`."""
+    keep_big_blocks()
+    return JointEncoder(load_trained(preset, precision, saved), preset)
+
+
+def released_encoder(preset: RetrieverConfig, precision: str, folder: Path) -> Encoder:
+    """What a preset names, as it was released; a base that is built from a seed stands in `folder`.
+
+    Raises:
+        UserError: a model is not on this machine and cannot be fetched, is not whole, or is none of
+            the preset's kind.
+    """
+    keep_big_blocks()
+    if preset.encoder == "vlm2vec":
+        from evaluation.vlm2vec import load_vlm2vec
+
+        return JointEncoder(load_vlm2vec(preset, precision), preset)
+    if preset.encoder == "dual":
+        from evaluation.dual import load_dual
+
+        return load_dual(preset, precision)
+    if preset.encoder == "languagebind":
+        from evaluation.languagebind import load_languagebind
+
+        return load_languagebind(preset, precision)
+    return JointEncoder(load_retriever(preset, precision, [], folder), preset)

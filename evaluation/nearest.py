@@ -1,0 +1,43 @@
+"""Which of an item's candidates is nearest to its query, and what that choice is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from conf.schema import RetrieverConfig
+from data.records import SelectionItem
+from evaluation.cache import Embeddings
+from evaluation.embedding import frame_name, query_name
+from evaluation.metrics import expected_hits, ranks_of
+from evaluation.ranking import Cut, pair_scores
+
+
+def candidate_scores(
+    items: Sequence[SelectionItem], asked: Embeddings, shown: Embeddings, preset: RetrieverConfig
+) -> np.ndarray:
+    """(items, candidates) fp32 scores at the widest width, the ones that retrieval ranks by: equal
+    embeddings tie to the last bit."""
+    queries = asked.rows([query_name(item) for item in items])
+    per_item = len(items[0].candidates)
+    columns = []
+    for k in range(per_item):
+        frames = shown.rows([frame_name(item.candidates[k]) for item in items])
+        if preset.late is not None:
+            from evaluation import late
+
+            found = late.pair_scores(queries, frames, preset.late.width)
+            columns.append(np.concatenate(list(found)))
+        else:
+            widest = preset.widths[:1]
+            (found,) = pair_scores(Cut(queries, widest), Cut(frames, widest))
+            columns.append(found)
+    return np.stack(columns, axis=1)
+
+
+def credits(scores: np.ndarray, answers: Sequence[int]) -> np.ndarray:
+    """(items,) 1 where the right candidate scores highest, 1/m where it is one of m that do, else
+    0."""
+    greater, tied = ranks_of(scores, np.asarray(answers))
+    return expected_hits(greater, tied, np.ones(len(scores), bool), 1)

@@ -1,0 +1,139 @@
+"""Tiny models of every kind that is measured as released: the real architectures, with random
+weights, and their tokenizers and processors, saved as their authors' folders are."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import peft
+import torch
+from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
+from transformers import (
+    CLIPConfig,
+    CLIPImageProcessor,
+    CLIPModel,
+    CLIPProcessor,
+    CLIPTokenizer,
+    PreTrainedTokenizerFast,
+    Qwen2VLConfig,
+    Qwen2VLForConditionalGeneration,
+    Qwen2VLImageProcessor,
+    Qwen2VLProcessor,
+    Qwen2VLVideoProcessor,
+    Siglip2Tokenizer,
+    SiglipConfig,
+    SiglipImageProcessor,
+    SiglipModel,
+    SiglipProcessor,
+)
+
+from evaluation.languagebind import LanguageBindVideo
+from train.tiny import CHAT_TEMPLATE, SPECIAL_TOKENS
+
+SIZE, TIMES = 56, 4
+TOWER = {
+    "hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2,
+}  # fmt: skip
+VISION = {**TOWER, "image_size": SIZE, "patch_size": 14}
+LETTERS = sorted(pre_tokenizers.ByteLevel.alphabet())
+
+
+def clip(folder: Path) -> Path:
+    torch.manual_seed(0)
+    tokenizer = clip_tokenizer()
+    CLIPModel(clip_config(tokenizer)).save_pretrained(folder)
+    size = {"height": SIZE, "width": SIZE}
+    images = CLIPImageProcessor(size={"shortest_edge": SIZE}, crop_size=size)
+    CLIPProcessor(images, tokenizer).save_pretrained(folder)
+    return folder
+
+
+def clip_tokenizer() -> CLIPTokenizer:
+    tokens = [*LETTERS, *(f"{letter}</w>" for letter in LETTERS)]
+    tokens += ["<|startoftext|>", "<|endoftext|>"]
+    return CLIPTokenizer(vocab={token: k for k, token in enumerate(tokens)}, merges=[])
+
+
+def clip_config(tokenizer: CLIPTokenizer, **of_vision: object) -> CLIPConfig:
+    text = {
+        **TOWER, "vocab_size": len(tokenizer), "max_position_embeddings": 77,
+        "bos_token_id": tokenizer.bos_token_id, "eos_token_id": tokenizer.eos_token_id,
+    }  # fmt: skip
+    return CLIPConfig(text_config=text, vision_config={**VISION, **of_vision}, projection_dim=24)
+
+
+def siglip2(folder: Path) -> Path:
+    torch.manual_seed(0)
+    tokens = ["<pad>", "<eos>", "<bos>", "<unk>", "<mask>", "▁", *map(chr, range(33, 127))]
+    tokens += [f"<0x{byte:02X}>" for byte in range(256)]
+    tokenizer = Siglip2Tokenizer(vocab={token: k for k, token in enumerate(tokens)}, merges=[])
+    text = {**TOWER, "vocab_size": len(tokenizer), "max_position_embeddings": 64}
+    SiglipModel(SiglipConfig(text_config=text, vision_config=VISION)).save_pretrained(folder)
+    images = SiglipImageProcessor(size={"height": SIZE, "width": SIZE})
+    SiglipProcessor(images, tokenizer).save_pretrained(folder)
+    return folder
+
+
+def languagebind(videos: Path, images: Path) -> tuple[Path, Path]:
+    """Its settings name a type of their own, and no processor stands beside the weights."""
+    torch.manual_seed(0)
+    tokenizer = clip_tokenizer()
+    config = clip_config(tokenizer, add_time_attn=True, num_frames=TIMES)
+    video = LanguageBindVideo(config)
+    for layer in video.vision_model.encoder.layers:
+        torch.nn.init.normal_(layer.temporal_embedding)
+    for model, folder, kind in (
+        (video, videos, "LanguageBindVideo"),
+        (CLIPModel(clip_config(tokenizer)), images, "LanguageBindImage"),
+    ):
+        model.save_pretrained(folder)
+        tokenizer.save_pretrained(folder)
+        told = json.loads((folder / "config.json").read_text())
+        (folder / "config.json").write_text(json.dumps(told | {"model_type": kind}))
+    return videos, images
+
+
+def vlm2vec(base: Path, adapters: Path) -> Path:
+    """Adapters over a Qwen2-VL; the processor stands beside them."""
+    torch.manual_seed(0)
+    tokenizer = Tokenizer(models.BPE())
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    tokenizer.decoder = decoders.ByteLevel()
+    trainer = trainers.BpeTrainer(
+        vocab_size=len(SPECIAL_TOKENS) + len(LETTERS), special_tokens=list(SPECIAL_TOKENS),
+        initial_alphabet=LETTERS, show_progress=False,
+    )  # fmt: skip
+    tokenizer.train_from_iterator([], trainer)
+    fast = PreTrainedTokenizerFast(
+        tokenizer_object=tokenizer, eos_token="<|im_end|>", pad_token="<|endoftext|>",
+        extra_special_tokens=list(SPECIAL_TOKENS[1:]),
+    )  # fmt: skip
+    ids = {token: k for k, token in enumerate(SPECIAL_TOKENS)}
+    config = Qwen2VLConfig(
+        text_config={
+            **TOWER, "vocab_size": len(fast), "num_key_value_heads": 2, "tie_word_embeddings": True,
+            "rope_parameters": {
+                "rope_type": "default", "rope_theta": 1e6, "mrope_section": [2, 3, 3],
+            },
+        },
+        vision_config={
+            "depth": 2, "embed_dim": 32, "hidden_size": 32, "num_heads": 2, "patch_size": 14,
+            "mlp_ratio": 2,
+        },
+        image_token_id=ids["<|image_pad|>"], video_token_id=ids["<|video_pad|>"],
+        vision_start_token_id=ids["<|vision_start|>"], vision_end_token_id=ids["<|vision_end|>"],
+    )  # fmt: skip
+    model = Qwen2VLForConditionalGeneration(config)
+    model.save_pretrained(base)
+    low_rank = peft.LoraConfig(
+        r=2, target_modules=r".*language_model.*\.q_proj", init_lora_weights=False
+    )
+    peft.get_peft_model(model, low_rank).save_pretrained(adapters)
+    settings = adapters / "adapter_config.json"
+    told = json.loads(settings.read_text()) | {"base_model_name_or_path": str(base)}
+    settings.write_text(json.dumps(told))
+    Qwen2VLProcessor(
+        Qwen2VLImageProcessor(), fast, Qwen2VLVideoProcessor(), chat_template=CHAT_TEMPLATE
+    ).save_pretrained(adapters)
+    return adapters
