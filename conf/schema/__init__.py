@@ -34,6 +34,7 @@ from conf.schema.models import (
     RetrieverConfig,
     StudentConfig,
 )
+from conf.schema.servers import ServerConfig, ServersConfig
 from conf.schema.teacher import TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainConfig
 
@@ -59,6 +60,8 @@ __all__ = [
     "SelectCommand",
     "SelectionConfig",
     "ServeCommand",
+    "ServerConfig",
+    "ServersConfig",
     "SftCommand",
     "SftTrainConfig",
     "StatisticsCommand",
