@@ -1,31 +1,36 @@
-"""Ask a student for its answers, and keep every one: an append-only file that a killed evaluation
+"""Ask a model for its answers, and keep every one: an append-only file that a killed evaluation
 goes on from."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-from torch import nn
 from tqdm import tqdm
-from transformers import ProcessorMixin
 
 from conf.runs import write_text
-from conf.schema import StudentConfig
-from data.frames import Frames
 from data.records import SelectionItem
-from train.choice import parse
-from train.collate import Collator
-from train.conversation import selection_sample
-from train.generate import generate, new_tokens
+from evaluation.protocol import Record, parse, read_record
+from train.generate import Written
+
+Keep = Callable[[list[tuple[SelectionItem, Written]]], None]
+"""Takes what was said to some items as soon as it is there."""
+Say = Callable[[list[SelectionItem], Keep], None]
+"""Has a model answer items and keeps what it says."""
+
+RECORDS = ("record", "constrained")
+"""Modes in which the structured record is asked for."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a student said to one item in one mode. `letter` is None where no choice could be
-    read, and `reason` then says why."""
+    """What a model said to one item in one mode. `letter` is None where no choice could be read,
+    and `reason` then says why; `valid` is whether the structured record is as it was asked for,
+    None where none was; `cut` whether the model was stopped before its end."""
 
     item_id: str
     mode: str
@@ -33,78 +38,98 @@ class Answer:
     letter: str | None
     reason: str | None
     right: bool
+    valid: bool | None
+    cut: bool
+
+    @property
+    def record(self) -> Record | None:
+        """The structured record, where it is valid."""
+        return read_record(self.text) if self.valid else None
 
 
 class AnswerLog:
-    """The answers in a file, one JSON line each, below a line that says what was `measured`.
+    """The answers in a file, one JSON line each, by what they are answers to.
 
-    Answers of other weights or to other items are no answers to these: the file begins anew. Only
-    what was said is taken from it; what is right is judged again.
+    `asked` says it of each mode, in plain values: the model's revision, the items, the prompt, how
+    tokens are drawn, the seed. A line of its own tells it once, under a key that the answers bear.
+    Answers under other keys stay in the file and are no answers to these. Only what was said is
+    taken from a line; what it says and whether that is right is judged again.
     """
 
-    def __init__(self, path: Path, measured: str, items: Sequence[SelectionItem]) -> None:
+    def __init__(
+        self, path: Path, asked: dict[str, dict[str, Any]], items: Sequence[SelectionItem]
+    ) -> None:
         self._path = path
+        self._keys = {mode: _key(mode, what) for mode, what in asked.items()}
         self.answers: dict[tuple[str, str], Answer] = {}
         item_of = {item.item_id: item for item in items}
-        text = path.read_text(errors="replace") if path.exists() else ""
-        head, *lines = text.splitlines() or [""]
-        top = json.dumps({"measured": measured})
-        for line in lines if head == top else []:
+        lines = path.read_bytes().splitlines() if path.exists() else []
+        whole, told = [], set()
+        for line in lines:
             try:
                 row = json.loads(line)
-                answer = judge(item_of[row["item_id"]], row["mode"], row["text"])
-            except (ValueError, TypeError, KeyError):
+                if "asked" in row:
+                    told.add(row["key"])
+                elif (item := item_of.get(row["item_id"])) and self._bears_key(row):
+                    answer = judge(item, row["mode"], Written(row["text"], row["cut"]))
+                    self.answers[answer.item_id, answer.mode] = answer
+            except (ValueError, TypeError, KeyError, AttributeError):
                 # Torn by a kill: that item is asked again.
                 continue
-            self.answers[answer.item_id, answer.mode] = answer
-        write_text(path, "".join([f"{top}\n", *map(_line, self.answers.values())]))
+            whole.append(line.decode())
+        whole += [
+            json.dumps({"key": key, "mode": mode, "asked": asked[mode]})
+            for mode, key in self._keys.items()
+            if key not in told
+        ]
+        write_text(path, "".join(f"{line}\n" for line in whole))
+
+    def _bears_key(self, row: dict[str, Any]) -> bool:
+        return row["mode"] in self._keys and row["key"] == self._keys[row["mode"]]
 
     def append(self, answers: list[Answer]) -> None:
         with open(self._path, "a") as file:
-            file.writelines(map(_line, answers))
+            file.writelines(
+                json.dumps({**asdict(a), "key": self._keys[a.mode]}) + "\n" for a in answers
+            )
         self.answers |= {(a.item_id, a.mode): a for a in answers}
 
 
-def _line(answer: Answer) -> str:
-    return json.dumps(asdict(answer)) + "\n"
+def _key(mode: str, asked: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps([mode, asked], sort_keys=True).encode()).hexdigest()[:16]
 
 
-def ask_all(
-    model: nn.Module,
-    processor: ProcessorMixin,
-    items: list[SelectionItem],
-    mode: str,
-    regime: str,
-    frames: Frames,
-    cfg: StudentConfig,
-    precision: str,
-    batch: int,
-    log: AnswerLog,
-    control: str | None = None,
-) -> list[Answer]:
-    """Every item's answer in `mode`, as a student of `regime` is asked, its prefix shown as a
-    `control` asks, greedily decoded; items that the log holds are not asked."""
+def ask_all(items: list[SelectionItem], mode: str, say: Say, log: AnswerLog) -> list[Answer]:
+    """Every item's answer in `mode`; items that the log holds are not asked."""
     waiting = [i for i in items if (i.item_id, mode) not in log.answers]
-    limit = new_tokens(mode, cfg)
-    collator = Collator(processor, cfg.max_length)
     with tqdm(total=len(items), initial=len(items) - len(waiting), desc=mode, unit="item") as bar:
-        for group in _groups(waiting, batch):
-            inputs = collator(
-                [selection_sample(i, mode, regime, frames, cfg, control=control) for i in group]
-            )
-            texts = generate(model, processor, inputs, limit, precision)
-            log.append([judge(i, mode, t) for i, t in zip(group, texts, strict=True)])
-            bar.update(len(group))
+
+        def keep(said: list[tuple[SelectionItem, Written]]) -> None:
+            log.append([judge(item, mode, written) for item, written in said])
+            bar.update(len(said))
+
+        if waiting:
+            say(waiting, keep)
     return [log.answers[i.item_id, mode] for i in items]
 
 
-def judge(item: SelectionItem, mode: str, text: str) -> Answer:
+def judge(item: SelectionItem, mode: str, written: Written) -> Answer:
     """What a text says to an item, and whether that is right."""
-    choice = parse(text)
-    reason = str(choice.reason) if choice.letter is None and choice.reason else None
-    return Answer(item.item_id, mode, text, choice.letter, reason, choice.letter == item.letter)
+    choice = parse(written.text, cut=written.cut)
+    valid = read_record(written.text) is not None if mode in RECORDS else None
+    return Answer(
+        item.item_id,
+        mode,
+        written.text,
+        choice.letter,
+        str(choice.reason) if choice.letter is None and choice.reason else None,
+        choice.letter == item.letter,
+        valid,
+        written.cut,
+    )
 
 
-def _groups(items: list[SelectionItem], size: int) -> Iterator[list[SelectionItem]]:
-    for start in range(0, len(items), size):
-        yield items[start : start + size]
+def seed_of(seed: int, item: SelectionItem, mode: str) -> int:
+    """The seed (32 bits) of the answer that is drawn for an item in a mode."""
+    digest = hashlib.sha256(f"{seed} {mode} {item.item_id}".encode()).digest()
+    return int.from_bytes(digest[:4], "big")

@@ -1,9 +1,12 @@
-"""Measure a student on the selection track's test items, in reasoning and in answer mode."""
+"""Measure a model on the selection track's test items: a student in reasoning and in answer mode, a
+base by the structured record; loaded here, or asked at servers."""
 
 from __future__ import annotations
 
 import json
 import logging
+from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
 
 from conf.entry import Run, command
@@ -16,12 +19,12 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.select", SelectCommand)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
-    from train.trained import product_folder, run_title, settings_of
+    from train.trained import run_title, settings_of
 
     folder = Path(cfg.model) if cfg.model is not None else None
     trained = settings_of(folder, SftCommand, "student") if folder else cfg
     student, regime = trained.student, trained.train.regime
-    modes = cfg.modes or (["answer"] if regime == "answer_only" else ["reasoning", "answer"])
+    modes = cfg.modes or default_modes(cfg, regime)
     if folder is not None and regime == "answer_only" and "reasoning" in modes:
         raise UserError(
             f"model={folder} was trained in answer mode alone (train.regime=answer_only): give "
@@ -33,65 +36,85 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.frames import Frames
-    from evaluation import answers, figures, tables
+    from evaluation import answers, asked, figures, tables
+    from evaluation.confidence import calibration, positions
     from evaluation.metrics import accuracy_by, accuracy_table
-    from train import backbone, compatible, room
     from train.precision import settled
 
     items = spread(store.selection("test", cfg.suite), cfg.limit, cfg.seed)
     if not items:
         suite = cfg.suite or store.suite
         raise UserError(f"{store.folder} has no test items of the {suite} suite to measure on")
-    room.keep_big_blocks()
-    precision = settled(trained.train.precision)
-    if folder is not None:
-        compatible.check_base(folder, student.model)
-        weights = product_folder(folder, "student")
-        model, processor = backbone.load_trained(student, precision, weights)
-    else:
-        weights = None
-        model, processor = backbone.load_base(student, precision, list)
-    name = run_title(folder) if folder else f"{student.name} base"
-    asked = ", ".join(filter(None, (store.name, cfg.suite, cfg.control)))
     frames = Frames(store, student.image_size)
-    digest = compatible.weights_digest(student.model, weights)
-    measured = f"{digest} on {store.identity}, {asked}"
-    journal = answers.AnswerLog(run.folder / "answers.jsonl", measured, items)
-    rows, subtypes, metrics = [], {}, {}
+    if cfg.server.url is not None:
+        model = asked.model_served(cfg, folder, student, regime, frames)
+    else:
+        precision = settled(trained.train.precision)
+        model = asked.model_here(cfg, folder, student, precision, regime, frames)
+    name = run_title(folder) if folder else f"{student.name} base"
+    measured = ", ".join(filter(None, (store.name, cfg.suite, cfg.control)))
+    known = {
+        mode: asked.known_by(
+            mode, regime, student, cfg.seed, model.revision, store.identity, cfg.control
+        )
+        for mode in modes
+    }
+    journal = answers.AnswerLog(run.folder / "answers.jsonl", known, items)
+    rows, metrics = [], {}
+    subtypes, letters, confidences, reasons = {}, {}, {}, {}
     for mode in modes:
         log.info("asking %s in %s mode", name, mode)
-        given = answers.ask_all(
-            model,
-            processor,
-            items,
-            mode,
-            regime,
-            frames,
-            student,
-            precision,
-            cfg.batch,
-            journal,
-            cfg.control,
-        )
+        given = answers.ask_all(items, mode, model.say(mode), journal)
         right = [float(a.right) for a in given]
         accuracy = accuracy_table([i.family for i in items], right)
         parsed = sum(a.letter is not None for a in given) / len(given)
-        rows.append(tables.SelectionRow.of(asked, name, mode, accuracy, parsed))
+        rows.append(tables.SelectionRow.of(measured, name, mode, accuracy, parsed))
         subtypes[mode] = accuracy_by([f"{i.family}/{i.subtype}" for i in items], right)
+        letters[mode] = positions([a.letter for a in given], [i.letter for i in items])
+        reasons[mode] = readings(given)
+        sure = [(a.record.confidence, a.right) for a in given if a.valid]
+        confidences[mode] = calibration(*zip(*sure, strict=True)) if sure else None
         metrics |= {f"{mode}_{f}": found.value for f, found in accuracy.families.items()}
         metrics |= {f"{mode}_macro": accuracy.macro, f"{mode}_micro": accuracy.micro.value}
         metrics[f"{mode}_parse_rate"] = parsed
 
     table = tables.selection_table(rows)
     log.info("%s", table)
-    write_text(run.folder / "report.txt", f"{table}\n\n{tables.subtype_table(subtypes)}\n")
+    told = {mode: found for mode, found in confidences.items() if found}
+    parts = [table, tables.subtype_table(subtypes), tables.reading_table(reasons)]
+    parts += [tables.position_table(letters)]
+    parts += [tables.calibration_table(mode, found) for mode, found in told.items()]
+    write_text(run.folder / "report.txt", "\n\n".join(parts) + "\n")
     cells = {mode: {c: vars(found) for c, found in by.items()} for mode, by in subtypes.items()}
-    report = {"rows": [r.to_dict() for r in rows], "subtypes": cells}
+    report = {
+        "rows": [r.to_dict() for r in rows],
+        "subtypes": cells,
+        "readings": reasons,
+        "positions": {mode: asdict(found) for mode, found in letters.items()},
+        "calibration": {mode: asdict(found) for mode, found in told.items()},
+    }
     write_text(run.folder / "report.json", json.dumps(report, indent=1))
     figures.selection_figure(rows, run.folder / "selection.png")
     answer = journal.answers[items[0].item_id, modes[0]]
     draw_item(items[0], answer.letter, Frames(store), run.folder / "item.png")
     return metrics
+
+
+def default_modes(cfg: SelectCommand, regime: str) -> list[str]:
+    """The modes that a student was trained in; of a base, the record."""
+    if cfg.model is not None:
+        return ["answer"] if regime == "answer_only" else ["reasoning", "answer"]
+    return ["record"] if cfg.server.url is None else ["record", "constrained"]
+
+
+def readings(given: list) -> dict[str, int]:
+    """How many answers could be read, how many of them are or hold a valid record where one was
+    asked for, and why the others could not."""
+    counts = {"with a letter": sum(a.letter is not None for a in given)}
+    if given[0].valid is not None:
+        counts["  in a valid record"] = sum(a.valid for a in given)
+    reasons = Counter(f"without: {a.reason}" for a in given if a.letter is None)
+    return counts | dict(reasons.most_common())
 
 
 def draw_item(item, chosen, frames, path: Path) -> None:

@@ -6,8 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from data.records import FAMILIES
+from data.records import FAMILIES, LETTERS
 from evaluation import paper
+from evaluation.confidence import Calibration, Positions
 from evaluation.metrics import Accuracy, Interval
 
 RECALLS = (1, 10, 50)
@@ -130,6 +131,55 @@ def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> str:
         rows.append([cell, *shares, str(found[0].n)])
     heads = [_short(mode, NAME_WIDTH) for mode in modes]
     return _table(["Accuracy by subtype, %", *heads, "Items"], {"": rows})
+
+
+def position_table(found: dict[str, Positions]) -> str:
+    """Of each mode: which letters were chosen, which were right, and how often the model was right
+    where each was."""
+    cells = []
+    for mode, of in found.items():
+        total = sum(of.right.values())
+        for name, counts, wholes in (
+            ("chosen", of.chosen, dict.fromkeys(LETTERS, sum(of.chosen.values()))),
+            ("right", of.right, dict.fromkeys(LETTERS, total)),
+            ("accuracy", of.hits, of.right),
+        ):
+            shares = [_percent(counts[x] / wholes[x] if wholes[x] else None) for x in LETTERS]
+            cells.append([f"{mode}: {name}", *shares, f"{sum(counts.values()):,}"])
+        if of.p is not None:
+            told = f"  chi-square {of.chi_square:.1f}, p = {of.p:.2g}"
+            cells.append([told, *[""] * (len(LETTERS) + 1)])
+    return _table(["Letters, %", *LETTERS, "Answers"], {"": cells})
+
+
+def calibration_table(mode: str, found: Calibration) -> str:
+    """How often answers of each reported confidence are right, and what that comes to."""
+    cells = [
+        [
+            f"{b.low:.1f} to {b.high:.1f}",
+            f"{100 * b.confidence:.1f}",
+            _percent(b.accuracy.value),
+            _range(b.accuracy),
+            f"{b.accuracy.n:,}",
+        ]
+        for b in found.bins
+    ]
+    head = [f"Confidence reported ({mode}), %", "Mean", "Right", "95%", "Answers"]
+    table = _table(head, {"": cells})
+    return (
+        f"{table}\nExpected calibration error {found.ece:.3f}, Brier score {found.brier:.3f}, of "
+        f"{found.n:,} valid records."
+    )
+
+
+def reading_table(reasons: dict[str, dict[str, int]]) -> str:
+    """How the answers of each mode could be read: counts by reason."""
+    names = list(dict.fromkeys(name for counts in reasons.values() for name in counts))
+    cells = [
+        [name, *(f"{counts[name]:,}" if name in counts else "-" for counts in reasons.values())]
+        for name in names
+    ]
+    return _table(["Answers", *reasons], {"": cells})
 
 
 def retrieval_table(rows: Sequence[RetrievalRow]) -> str:

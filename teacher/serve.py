@@ -34,6 +34,7 @@ else:
     import torch
     print(json.dumps([version, torch.cuda.device_count()]))
 """
+STRICT_JSON = '{"backend": "xgrammar", "disable_any_whitespace": true}'
 
 
 @dataclass(frozen=True)
@@ -158,6 +159,13 @@ def vllm_arguments(
     arguments += ["--max-model-len", str(context), "--dtype", cfg.dtype]
     # Every prompt begins with the same instructions.
     arguments += ["--enable-prefix-caching", "--disable-uvicorn-access-log"]
+    if cfg.frames:
+        # Without the second, a model that is held to a JSON schema may write spaces without end.
+        arguments += ["--trust-request-mm-kwargs", "--structured-outputs-config", STRICT_JSON]
+    if cfg.adapter is not None:
+        rank = adapter_rank(cfg.adapter)
+        arguments += ["--enable-lora", "--max-lora-rank", str(rank)]
+        arguments += ["--lora-modules", f"adapter={Path(cfg.adapter).absolute()}"]
     if not machine.cards:
         cache = round(cfg.cache_gb * 2**30)
         return [*arguments, "--enforce-eager", "--kv-cache-memory-bytes", str(cache)]
@@ -167,6 +175,17 @@ def vllm_arguments(
     cards = cfg.cards or 1 << (machine.cards.bit_length() - 1)
     arguments += ["--tensor-parallel-size", str(cards)]
     return [*arguments, "--gpu-memory-utilization", str(cfg.memory)]
+
+
+def adapter_rank(folder: str) -> int:
+    """The rank of a student's adapters. Raises UserError where a folder has none."""
+    try:
+        return int(json.loads((Path(folder) / "adapter_config.json").read_text())["r"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"adapter={folder} holds no adapters: give the student's folder of a run of train.sft, "
+            "or what train.export format=adapter wrote"
+        ) from error
 
 
 @contextmanager

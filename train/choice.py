@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import re
 import unicodedata
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from data.records import LETTERS
@@ -26,10 +26,12 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True)
 class Choice:
-    """The chosen letter, upper case, or None; and what was wrong, None where nothing was."""
+    """The chosen letter, upper case, or None; and what was wrong, None where nothing was. `record`
+    is the text of the one record that was read, where there was one that is JSON."""
 
     letter: str | None
     reason: Reason | None = None
+    record: str | None = field(default=None, compare=False)
 
 
 _TOKEN = re.compile(
@@ -44,7 +46,7 @@ _VALUE_ENDS = re.compile(r"""\s*(?:[,}\]"']|$)""")
 
 _ANSWER = re.compile(
     r"(?:^|[.!?;]\s)[ \t*_#>`\-]*(?:(?:so|thus|hence|therefore),?\s+)?(?:(?:the|my)\s+)?"
-    r"(?:(?:final|correct|best|forced)[\s_]+)*(?:answer|choice)[*_`]*"
+    r"(?:(?:final|correct|best|forced)[ \t_]+)*(?:answer|choice)[*_`]*"
     r"\s*(?:\bis\b\s*:?|[:=])(?P<value>\s*[^\n]*)",
     re.IGNORECASE | re.MULTILINE,
 )
@@ -78,7 +80,7 @@ def parse_choice(raw: str) -> str | None:
     return parse(raw).letter
 
 
-def parse(raw: str, letters: str = LETTERS) -> Choice:
+def parse(raw: str, letters: str = LETTERS, cut: bool = False) -> Choice:
     """Reads an output: a structured record, prose that ends in "Answer: B", or a lone letter.
 
     Only what follows the last `</think>` counts. Where a chat template opens `<think>` itself, put
@@ -89,17 +91,31 @@ def parse(raw: str, letters: str = LETTERS) -> Choice:
     Args:
         raw: the whole output.
         letters: the letters on offer, upper case.
+        cut: whether the model was stopped before its output's end, so that the last word may be a
+            part of one.
     """
     text = unicodedata.normalize("NFKC", raw)
     text = text.rpartition("</think>")[2]
     if "<think>" in text:
         return Choice(None, Reason.CUT_OFF)
-    found, prose, flag = _records(text)
+    found, prose, flag, whole = _records(text)
     if found:
         choice = _agree([_read(value, letters) for value in found])
-        return Choice(choice.letter, flag) if choice.letter else choice
+        record = whole[0] if len(whole) == 1 and flag is None else None
+        return replace(choice, reason=choice.reason or flag, record=record)
     if flag is Reason.CUT_OFF:
         return Choice(None, flag)
+    choice = _told(prose, letters, cut)
+    if choice.reason is Reason.NO_ANSWER and cut:
+        return Choice(None, Reason.CUT_OFF)
+    return choice
+
+
+def _told(prose: str, letters: str, cut: bool) -> Choice:
+    """What a text without a record chooses."""
+    if cut:
+        # The last word goes on as one that says nothing.
+        prose += "xx"
     lines = [m["value"] for m in _ANSWER.finditer(prose)]
     if not lines:
         return _lone(prose, letters)
@@ -109,9 +125,10 @@ def parse(raw: str, letters: str = LETTERS) -> Choice:
     return choice
 
 
-def _records(text: str) -> tuple[list[str], str, Reason | None]:
-    """The choices of all records, the text outside them, and what is wrong with a record."""
-    values, prose, flag, at = [], [], None, 0
+def _records(text: str) -> tuple[list[str], str, Reason | None, list[str]]:
+    """The choices of all records, the text outside them, what is wrong with a record, and the
+    records that hold a choice."""
+    values, prose, flag, whole, at = [], [], None, [], 0
     while match := _RECORD.search(text, at):
         found, end = _choices(text, match.start())
         values += found
@@ -119,9 +136,10 @@ def _records(text: str) -> tuple[list[str], str, Reason | None]:
         at = len(text) if end is None else end
         if end is None:
             flag = Reason.CUT_OFF
-        elif found and not _is_json(text[match.start() : end]):
-            flag = flag or Reason.MALFORMED
-    return values, "\n".join([*prose, text[at:]]), flag
+        elif found:
+            whole.append(text[match.start() : end])
+            flag = flag or (None if _is_json(whole[-1]) else Reason.MALFORMED)
+    return values, "\n".join([*prose, text[at:]]), flag, whole
 
 
 def _choices(text: str, start: int) -> tuple[list[str], int | None]:
@@ -129,16 +147,17 @@ def _choices(text: str, start: int) -> tuple[list[str], int | None]:
     does not). A choice counts only in the record's outermost level, but one further in can
     contradict it: what looks like a nested record may follow one that was broken off."""
     found: list[tuple[int, str]] = []
-    depth, key, awaits = 0, "", False
+    depth, key, awaits, told = 0, "", False, start
     for token in _TOKEN.finditer(text, start):
         kind = token.lastgroup
         if kind == "cut":
             break
         if kind == "colon":
-            awaits, key = _is_choice(key), ""
+            # Within a value no key begins; to read on from each would take quadratic time.
+            awaits, key = token.start() >= told and _is_choice(key), ""
             continue
         if awaits:
-            value = _value(text, token)
+            value, told = _value(text, token)
             if value is None:
                 break
             found.append((depth, value))
@@ -158,17 +177,19 @@ def _outermost(found: list[tuple[int, str]]) -> list[str]:
     return [value for _, value in found] if any(depth == 1 for depth, _ in found) else []
 
 
-def _value(text: str, token: re.Match[str]) -> str | None:
-    """The value that begins at a token; None where the text breaks off inside it."""
+def _value(text: str, token: re.Match[str]) -> tuple[str | None, int]:
+    """The value that begins at a token, and where it ends; None where the text breaks off inside
+    it."""
     if token.lastgroup == "string":
-        return _unquote(token[0]) if _VALUE_ENDS.match(text, token.end()) else ""
+        whole = _VALUE_ENDS.match(text, token.end())
+        return (_unquote(token[0]) if whole else ""), token.end()
     if token.lastgroup == "bare":
         match = _BARE_VALUE.match(text, token.start())
     else:
         match = _LIST.match(text, token.start())
         if match is None and token[0] != "[":
-            return ""
-    return match[0] if match else None
+            return "", token.end()
+    return (match[0], match.end()) if match else (None, token.end())
 
 
 def _is_choice(key: str) -> bool:

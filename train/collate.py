@@ -34,15 +34,23 @@ class Encoded:
     media: dict[str, torch.Tensor]
 
 
-def encode(sample: Sample, processor: ProcessorMixin, max_length: int) -> Encoded:
-    """Token ids and pixels of a conversation; without a response, of its prompt alone.
+def encode(
+    sample: Sample, processor: ProcessorMixin, max_length: int, thinking: bool = False
+) -> Encoded:
+    """Token ids and pixels of a conversation; without a response, of its prompt alone. `thinking`
+    is told to chat templates that know of it.
 
     Raises:
         UserError: it is longer than `max_length` tokens. It is never cut, since a cut could fall
             within a frame.
     """
+    # What a template does not know of would be taken for the processor's.
+    known = "enable_thinking" in str(processor.chat_template)
     text = processor.apply_chat_template(
-        [{"role": "user", "content": sample.content}], tokenize=False, add_generation_prompt=True
+        [{"role": "user", "content": sample.content}],
+        tokenize=False,
+        add_generation_prompt=True,
+        **({"enable_thinking": thinking} if known else {}),
     )
     prompt = processor(
         text=[text],
@@ -80,12 +88,13 @@ class Collator:
     logits predict label j + 1.
     """
 
-    def __init__(self, processor: ProcessorMixin, max_length: int) -> None:
+    def __init__(self, processor: ProcessorMixin, max_length: int, thinking: bool = False) -> None:
         self._processor = processor
         self._max_length = max_length
+        self._thinking = thinking
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
-        encoded = [encode(s, self._processor, self._max_length) for s in samples]
+        encoded = [encode(s, self._processor, self._max_length, self._thinking) for s in samples]
         batch = pad(encoded, self._processor.tokenizer.pad_token_id)
         labels = batch.pop("labels")
         if (labels == IGNORED).all():

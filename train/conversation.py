@@ -131,6 +131,20 @@ def selection_sample(
 ) -> Sample:
     """A selection item asked in `mode` ("reasoning" or "answer") as a student of `regime` is, its
     prefix shown as a `control` asks (see `data.controls`)."""
+    asked = instruction(mode, regime)
+    return asked_sample(item, mode, asked, frames, cfg, response, control)
+
+
+def asked_sample(
+    item: SelectionItem,
+    mode: str,
+    asked: str,
+    frames: Frames,
+    cfg: StudentConfig,
+    response: str | None = None,
+    control: str | None = None,
+) -> Sample:
+    """A selection item with what is `asked` about it, as `selection_sample` shows it."""
     shown = observed(item, cfg.frames, control)
     scene = frames.scene(item.scene_id)
     parts: list[str | np.ndarray] = [item.question]
@@ -139,8 +153,7 @@ def selection_sample(
     clip = None
     if shown:
         clip = Clip(frames.stack(item.scene_id, shown), sorted(shown), scene.fps, scene.frames)
-    asked = f"\n{instruction(mode, regime)}"
-    return conversation(f"{item.item_id} ({mode})", [*parts, asked], response, clip)
+    return conversation(f"{item.item_id} ({mode})", [*parts, f"\n{asked}"], response, clip)
 
 
 def conversation(

@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import indent
 from typing import Any
 
 import torch
 from torch import nn
-from transformers import ProcessorMixin
+from transformers import LogitsProcessorList, ProcessorMixin
 
 from conf.errors import UserError
 from conf.schema import StudentConfig
@@ -27,25 +27,55 @@ log = logging.getLogger(__name__)
 
 ANSWER_TOKENS = 16
 """New tokens at most in answer mode: the one line, and room to miss it."""
+THOUGHT, OPENING = "<think>", 8
+"""What opens a thought, and how many tokens at a prompt's end are looked at for it."""
 
 
 def new_tokens(mode: str, cfg: StudentConfig) -> int:
     """How many tokens a student may write in a mode."""
-    return ANSWER_TOKENS if mode == "answer" else cfg.max_new_tokens
+    return ANSWER_TOKENS if mode == "answer" and not cfg.thinking else cfg.max_new_tokens
+
+
+@dataclass(frozen=True)
+class Written:
+    """What a model wrote; whether it was stopped before its end."""
+
+    text: str
+    cut: bool = False
 
 
 def generate(
-    model: nn.Module, processor: ProcessorMixin, inputs: dict, limit: int, precision: str
-) -> list[str]:
-    """The texts that a model writes after left-padded prompts, greedily, `limit` tokens at most."""
+    model: nn.Module,
+    processor: ProcessorMixin,
+    inputs: dict,
+    limit: int,
+    precision: str,
+    steps: LogitsProcessorList | None = None,
+) -> list[Written]:
+    """What a model writes after left-padded prompts, `limit` tokens at most: greedily, after the
+    logits have passed the `steps`. A thought that the prompt opens is opened in the text."""
     device = next(model.parameters()).device
     inputs = {name: value.to(device) for name, value in inputs.items() if name != "labels"}
     autocast = torch.autocast(device.type, DTYPES[precision], enabled=precision == "bf16")
     # No inference mode: what it leaves in a model could not be trained on.
     with torch.no_grad(), autocast:
-        ids = model.generate(**inputs, max_new_tokens=limit, do_sample=False, use_cache=True)
-    new = ids[:, inputs["input_ids"].shape[1] :]
-    return processor.tokenizer.batch_decode(new, skip_special_tokens=True)
+        ids = model.generate(
+            **inputs,
+            max_new_tokens=limit,
+            do_sample=False,
+            use_cache=True,
+            logits_processor=steps,
+        )
+    prompt, new = ids[:, : inputs["input_ids"].shape[1]], ids[:, inputs["input_ids"].shape[1] :]
+    tokenizer = processor.tokenizer
+    opened = tokenizer.decode(prompt[0, -OPENING:]).rstrip().endswith(THOUGHT)
+    texts = tokenizer.batch_decode(new, skip_special_tokens=True)
+    ends = torch.tensor([tokenizer.eos_token_id, tokenizer.pad_token_id], device=new.device)
+    ended = torch.isin(new, ends).any(dim=1) | (new.shape[1] < limit)
+    return [
+        Written(f"{THOUGHT * opened}{text}", not end)
+        for text, end in zip(texts, ended.tolist(), strict=True)
+    ]
 
 
 class HeldOutAnswers:
@@ -88,8 +118,8 @@ class HeldOutAnswers:
                 "(run=NAME)"
             ) from error
         rows = [
-            _row(step, mode, sample.sample_id, text, sample.response)
-            for sample, text in zip(asked, texts, strict=True)
+            _row(step, mode, sample.sample_id, written, sample.response)
+            for sample, written in zip(asked, texts, strict=True)
         ]
         if keep:
             self._keep(rows)
@@ -111,15 +141,15 @@ class HeldOutAnswers:
         log.info("step %d, %s%s:\n%s", shown["step"], shown["sample"], told, text)
 
 
-def _row(step: int, mode: str, sample: str, text: str, response: str) -> dict[str, Any]:
+def _row(step: int, mode: str, sample: str, written: Written, response: str) -> dict[str, Any]:
     """One line of samples.jsonl; `answer` is the right letter, as it stands in the response that
     is held out, and null where none is asked for."""
-    choice = parse(text)
+    choice = parse(written.text, cut=written.cut)
     return {
         "step": step,
         "mode": mode,
         "sample": sample,
-        "text": text,
+        "text": written.text,
         "letter": choice.letter,
         "reason": None if choice.letter else choice.reason and str(choice.reason),
         "answer": parse(response).letter,

@@ -35,6 +35,7 @@ from conf.schema.models import (
     RetrieverConfig,
     StudentConfig,
 )
+from conf.schema.servers import ServerConfig, ServersConfig
 from conf.schema.study import ExportStudyCommand, StudyCommand
 from conf.schema.teacher import TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainConfig
@@ -62,6 +63,8 @@ __all__ = [
     "SelectCommand",
     "SelectionConfig",
     "ServeCommand",
+    "ServerConfig",
+    "ServersConfig",
     "SftCommand",
     "SftTrainConfig",
     "SimilarityCommand",

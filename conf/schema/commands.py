@@ -11,10 +11,12 @@ from conf.runs import TRAINERS, is_below, is_name, run_below, runs_of
 from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.checks import is_url, too_small
 from conf.schema.models import RetrieverConfig, StudentConfig
+from conf.schema.servers import ServerConfig
 from conf.schema.teacher import TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
 
 EXPORTS = ("bf16", "fp32", "adapter")
+ASKED = ("reasoning", "answer", "record", "constrained")
 FRAMES_AHEAD = ("named", "all", "none")
 ENGINES = ("loky", "ray")
 INDEXES = ("exact", "faiss")
@@ -140,6 +142,11 @@ class ServeCommand(CommandConfig):
     """Share of each GPU's memory."""
     cache_gb: float = 4.0
     """GiB of the key-value cache of a server without a GPU."""
+    frames: bool = False
+    """Whether it is asked with frames, as evaluation.select asks, which says with each request how
+    they are to be read: serve only clients that you trust."""
+    adapter: str | None = None
+    """Folder of a student's adapters over the model; they are asked by the name `adapter`."""
 
     def check(self) -> list[str]:
         least = {"prompt_tokens": 1, "cards": 1}
@@ -240,20 +247,22 @@ class ContrastiveCommand(CommandConfig):
 class SelectCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     student: StudentConfig = MISSING
+    server: ServerConfig = field(default_factory=ServerConfig)
     train: SftTrainConfig = field(default_factory=SftTrainConfig)
     """The preset's recipe; a measurement of a base takes its precision and its regime's prompt."""
     model: str | None = None
     """A run folder of train.sft or what train.export wrote, with its own student and recipe; null
     takes the student's base."""
     modes: list[str] | None = None
-    """reasoning (rationale, then answer) and answer (at once), each measured by itself; null takes
-    those that the student was trained in."""
+    """reasoning (rationale, then answer), answer (at once), record (the structured record) and
+    constrained (the record, held to its JSON schema by a server), each measured by itself; null
+    takes those that the student was trained in, and the record of a base."""
     batch: int = 16
     """Items that pass the model at once."""
     limit: int | None = None
     """Test items at most, spread over the cells; null takes all."""
     seed: int = 0
-    """Of the items that `limit` leaves."""
+    """Of the items that `limit` leaves, and of answers that are drawn."""
     suite: str | None = None
     """matched_anchor for the pairs that differ in their anchor alone; null takes the benchmark's
     own items."""
@@ -269,9 +278,18 @@ class SelectCommand(CommandConfig):
             problems.append(
                 f"control={self.control}: the options are candidate_only, shuffled_prefix and null"
             )
-        given = sorted(self.modes or ["answer"])
-        if given not in (["answer"], ["reasoning"], ["answer", "reasoning"]):
-            problems.append(f"modes={self.modes}: give reasoning, answer or both, each once")
+        given = ["record"] if self.modes is None else self.modes
+        if not given or len(set(given)) < len(given) or set(given) - set(ASKED):
+            problems.append(
+                f"modes={self.modes}: give one or more of {', '.join(ASKED)}, each once"
+            )
+        if "constrained" in given and self.server.url is None:
+            problems.append(
+                "modes: constrained needs a server, which holds a model to the record's JSON "
+                "schema; give server.url=http://HOST:PORT/v1"
+            )
+        if self.server.model is not None and self.server.url is None:
+            problems.append(f"server.model={self.server.model} needs server.url=...")
         return problems
 
 

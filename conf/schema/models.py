@@ -60,11 +60,22 @@ class StudentConfig:
     max_length: int = 3072
     """Tokens a sample; a longer one is refused, never cut."""
     max_new_tokens: int = 512
+    """Tokens of an answer, those of a thought included."""
+    thinking: bool = False
+    """Whether the model thinks before it answers. What it thinks is no answer."""
+    temperature: float = 0.0
+    """At which evaluation.select draws tokens; 0 takes the likeliest one each time."""
+    top_p: float = 1.0
+    """Share of the likeliest tokens that are drawn from."""
+    top_k: int = 0
+    """How many of the likeliest tokens are drawn from; 0 sets no bound."""
 
     def check(self) -> list[str]:
-        return _backbone_problems("student", self) + too_small(
-            self, "student.", {"max_new_tokens": 1}
-        )
+        least = {"max_new_tokens": 1, "temperature": 0, "top_k": 0}
+        problems = _backbone_problems("student", self) + too_small(self, "student.", least)
+        if not 0 < self.top_p <= 1:
+            problems.append(f"student.top_p={self.top_p} must be above 0 and at most 1")
+        return problems
 
 
 ENCODERS = ("qwen3_vl", "vlm2vec", "dual", "languagebind")

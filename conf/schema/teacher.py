@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 from omegaconf import MISSING
 
-from conf.schema.checks import is_url, too_small
+from conf.schema.checks import too_small
+from conf.schema.servers import ServersConfig
 
 
 @dataclass
-class TeacherConfig:
+class TeacherConfig(ServersConfig):
+    """Without a server it is the built-in narrator."""
+
+    GROUP: ClassVar[str] = "teacher"
+
     name: str = MISSING
     """Recorded with every rationale."""
-    url: Any = None
-    """An OpenAI-compatible server, such as http://127.0.0.1:8000/v1, or a list of several that
-    serve the same model; null for the built-in narrator."""
-    model: str | None = None
-    """The model's name at the server."""
     seed: int = 0
     """Of the built-in narrator's phrasings; with a server, a label of one narration."""
     min_words: int = 80
@@ -35,35 +35,10 @@ class TeacherConfig:
     max_tokens: int = 640
     grammar: bool = False
     """Whether the server may write only what has a rationale's form."""
-    concurrency: int = 128
-    """Requests in flight, over all servers; 128 keep one busy."""
-    timeout: float = 120.0
-    """Seconds that one request may take."""
-    patience: float = 600.0
-    """Seconds to wait while no server can be asked before giving up."""
-
-    @property
-    def urls(self) -> list[str]:
-        """The servers' addresses; none for the built-in narrator."""
-        if self.url is None:
-            return []
-        return list(self.url) if isinstance(self.url, list) else [self.url]
 
     def check(self) -> list[str]:
-        problems = too_small(
-            self,
-            "teacher.",
-            {
-                "seed": 0,
-                "attempts": 1,
-                "samples": 1,
-                "temperature": 0,
-                "max_tokens": 1,
-                "concurrency": 1,
-                "timeout": 1,
-                "patience": 0,
-            },
-        )
+        least = {"seed": 0, "attempts": 1, "samples": 1, "temperature": 0, "max_tokens": 1}
+        problems = super().check() + too_small(self, "teacher.", least)
         if (self.url is None) != (self.model is None):
             problems.append("teacher.url and teacher.model go together: set both or neither")
         if not 0 < self.min_words <= self.max_words:
@@ -71,13 +46,6 @@ class TeacherConfig:
                 f"teacher.min_words={self.min_words} and teacher.max_words={self.max_words}: "
                 "need 0 < min <= max"
             )
-        if self.url == []:
-            problems.append("teacher.url=[] names no server: give one, or null for none")
-        for url in self.urls:
-            if not isinstance(url, str) or not is_url(url):
-                problems.append(
-                    f"teacher.url={url} is no address of a server, such as http://127.0.0.1:8000/v1"
-                )
         if self.grammar and self.url is None:
             problems.append("teacher.grammar=true needs a server: give teacher.url=...")
         if self.fallback and self.url is None:

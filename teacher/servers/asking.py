@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,9 @@ from teacher.predicates import Predicates, predicates_of
 from teacher.progress import Progress
 from teacher.prompts import messages
 from teacher.servers.client import Client, UnansweredError
+from teacher.servers.lanes import in_lanes
 from teacher.servers.replies import Reply
+from teacher.servers.server import Request
 
 if TYPE_CHECKING:
     from data.store import Store
@@ -39,29 +41,18 @@ class Asking:
         # One thread judges and waits for the disk, so that answers are written one after another
         # while the loop goes on asking.
         with ThreadPoolExecutor(1) as self.desk:
-            async with Client(self.cfg, _constraint(self.cfg)) as self.client:
-                await self._ask_all(jobs)
+            async with Client(self.cfg, request_of(self.cfg)) as self.client:
+                await in_lanes(jobs, self.cfg.concurrency, self._ask)
         return self.too_short
 
-    async def _ask_all(self, jobs: list[Job]) -> None:
-        waiting = iter(jobs)
-        lanes = min(self.cfg.concurrency, len(jobs))
-        tasks = [asyncio.create_task(self._ask_in_turn(waiting)) for _ in range(lanes)]
-        try:
-            await asyncio.gather(*tasks)
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-
-    async def _ask_in_turn(self, waiting: Iterable[Job]) -> None:
-        for item, first in waiting:
-            predicates = predicates_of(item, self.store.scene(item.scene_id), self.store.scene)
-            if predicates is None:
-                self.too_short += 1
-            else:
-                await self._settle(item, predicates, first)
-            self.progress.settle()
+    async def _ask(self, job: Job) -> None:
+        item, first = job
+        predicates = predicates_of(item, self.store.scene(item.scene_id), self.store.scene)
+        if predicates is None:
+            self.too_short += 1
+        else:
+            await self._settle(item, predicates, first)
+        self.progress.settle()
 
     async def _settle(self, item: SelectionItem, predicates: Predicates, attempt: int) -> None:
         """Ask for an item until an answer is accepted or no attempt is left."""
@@ -92,9 +83,17 @@ class Asking:
         return answers
 
 
-def _constraint(cfg: TeacherConfig) -> dict[str, str] | None:
-    if not cfg.grammar:
-        return None
-    from teacher.grammar import grammar
+def request_of(cfg: TeacherConfig) -> Request:
+    """What goes with every chat with a teacher."""
+    # No seed: one a request crashed vLLM on a CPU at 32 in flight.
+    extra = {"top_k": cfg.top_k, "chat_template_kwargs": {"enable_thinking": False}}
+    if cfg.grammar:
+        from teacher.grammar import grammar
 
-    return {"grammar": grammar(cfg)}
+        extra["structured_outputs"] = {"grammar": grammar(cfg)}
+    return {
+        "temperature": cfg.temperature,
+        "top_p": cfg.top_p,
+        "max_tokens": cfg.max_tokens,
+        "extra_body": extra,
+    }

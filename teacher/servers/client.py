@@ -7,16 +7,16 @@ import logging
 import math
 import random
 import time
-from typing import Any
 
 from conf.errors import UserError
-from conf.schema import TeacherConfig
+from conf.schema import ServersConfig
 from teacher.servers.server import (
     Chat,
     MalformedReplyError,
     RateLimitedError,
     RefusedError,
     Reply,
+    Request,
     RequestError,
     Server,
 )
@@ -67,13 +67,13 @@ class Place:
 class Client:
     """Asks `cfg.model` at `cfg.urls`, each time at the least busy server that is up.
 
-    `constraint` is what a server may write, as vLLM's structured_outputs. Use it inside one event
-    loop, as a context.
+    `request` goes with every chat. `canary` is what any server can answer that serves such chats.
+    Use it inside one event loop, as a context.
     """
 
-    def __init__(self, cfg: TeacherConfig, constraint: dict[str, Any] | None = None) -> None:
-        self.cfg = cfg
-        self.places = [Place(Server(url, cfg, constraint)) for url in dict.fromkeys(cfg.urls)]
+    def __init__(self, cfg: ServersConfig, request: Request, canary: Chat = CANARY) -> None:
+        self.cfg, self.request, self.canary = cfg, request, canary
+        self.places = [Place(Server(url, cfg)) for url in dict.fromkeys(cfg.urls)]
         self.stuck_since: float | None = None
         """When no server could be asked, with no answer since."""
 
@@ -88,8 +88,9 @@ class Client:
         await asyncio.gather(*watches, return_exceptions=True)
         await asyncio.gather(*(place.server.close() for place in self.places))
 
-    async def ask(self, chat: Chat, n: int = 1) -> list[Reply]:
-        """Up to `n` answers to a chat, however often servers have to be waited for.
+    async def ask(self, chat: Chat, n: int = 1, **own: object) -> list[Reply]:
+        """Up to `n` answers to a chat, however often servers have to be waited for; `own` are
+        fields of this request alone.
 
         Raises:
             UnansweredError: servers that are up fail at this chat again and again, or refuse it.
@@ -100,7 +101,7 @@ class Client:
         while True:
             place = await self._free_place()
             try:
-                return await self._ask(place, chat, n, self.cfg.max_tokens)
+                return await self._ask(place, chat, n, self.request | own)
             except RateLimitedError as limit:
                 place.rest(limit)
                 continue
@@ -114,10 +115,10 @@ class Client:
                     faults = 0
             await asyncio.sleep(jitter(faults))
 
-    async def _ask(self, place: Place, chat: Chat, n: int, max_tokens: int) -> list[Reply]:
+    async def _ask(self, place: Place, chat: Chat, n: int, request: Request) -> list[Reply]:
         place.in_flight += 1
         try:
-            replies = await place.server.ask(chat, n, max_tokens)
+            replies = await place.server.ask(chat, n, request)
         finally:
             place.in_flight -= 1
         place.limited, self.stuck_since = 0, None
@@ -184,7 +185,7 @@ class Client:
     async def _canary(self, place: Place) -> str | None:
         """What is wrong with a server's answer to any chat, None for an answer."""
         try:
-            await self._ask(place, CANARY, 1, 1)
+            await self._ask(place, self.canary, 1, self.request | {"max_tokens": 1})
         except (MalformedReplyError, RefusedError):
             raise
         except RequestError as fault:
@@ -197,7 +198,7 @@ class Client:
             for place in self.places
         )
         return UserError(
-            "no server of teacher.url could be asked for teacher.patience="
+            f"no server of {self.cfg.GROUP}.url could be asked for {self.cfg.GROUP}.patience="
             f"{self.cfg.patience:g} seconds ({problems}); start one and run this again, it goes on "
             "with what is answered"
         )

@@ -6,16 +6,21 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+CUT_OFF = "cut off"
+"""The flaw of an answer that has as many tokens as it may have."""
+
 
 @dataclass(frozen=True)
 class Reply:
-    """A server's answer. `flaw` says why its text is none, whatever it reads."""
+    """A server's answer. `flaw` says why its text is none, whatever it reads; `thought` is what a
+    server's reasoning parser has taken out of the text."""
 
     text: str
     flaw: str | None = None
     prompt_tokens: int | None = None
     completion_tokens: int | None = None
     finished: float | None = None
+    thought: str = ""
 
 
 def replies(completion: Any, n: int) -> list[Reply]:
@@ -28,9 +33,9 @@ def replies(completion: Any, n: int) -> list[Reply]:
     for k, choice in enumerate(choices):
         share = None if written is None else (written + k) // len(choices)
         prompt = None if read is None else read * (k == 0)
-        # A teacher may answer with half of a surrogate pair, which no file can hold.
-        text = (choice.message.content or "").encode("utf-8", "replace").decode().strip()
-        given.append(Reply(text, _flaw(text, choice), prompt, share, time.time()))
+        text, thought = _clean(choice.message.content), _clean(_thought(choice))
+        flaw = _flaw(text, thought, choice)
+        given.append(Reply(text, flaw, prompt, share, time.time(), thought))
     return given
 
 
@@ -39,12 +44,19 @@ def _usage(completion: Any) -> tuple[int | None, int | None]:
     return (usage.prompt_tokens, usage.completion_tokens) if usage else (None, None)
 
 
-def _flaw(text: str, choice: Any) -> str | None:
+def _thought(choice: Any) -> str | None:
+    message = choice.message
+    return getattr(message, "reasoning_content", None) or getattr(message, "reasoning", None)
+
+
+def _clean(text: str | None) -> str:
+    # A model may answer with half of a surrogate pair, which no file can hold.
+    return (text or "").encode("utf-8", "replace").decode().strip()
+
+
+def _flaw(text: str, thought: str, choice: Any) -> str | None:
     if choice.finish_reason == "length":
-        return "cut off"
-    thought = getattr(choice.message, "reasoning_content", None) or getattr(
-        choice.message, "reasoning", None
-    )
+        return CUT_OFF
     if thought or "<think>" in text or "</think>" in text:
         return "thinking"
     return None if text else "empty"

@@ -10,11 +10,13 @@ from typing import Any
 import openai
 
 from conf.errors import UserError
-from conf.schema import TeacherConfig
+from conf.schema import ServersConfig
 from teacher.servers.health import health_problem
 from teacher.servers.replies import Reply, replies
 
-Chat = list[dict[str, str]]
+Chat = list[dict[str, Any]]
+Request = dict[str, Any]
+"""Fields of a chat completion's request, those outside the API's own in `extra_body`."""
 
 NO_REPLY = (AttributeError, IndexError, TypeError, ValueError)
 """What the client raises at a reply that is not of the API's form."""
@@ -47,21 +49,14 @@ class RateLimitedError(RequestError):
 class Server:
     """Asks `cfg.model` at `url`. Use it inside one event loop."""
 
-    def __init__(self, url: str, cfg: TeacherConfig, constraint: dict[str, Any] | None) -> None:
+    def __init__(self, url: str, cfg: ServersConfig) -> None:
         self.url = url
         self.cfg = cfg
         self.client = openai.AsyncOpenAI(
             base_url=url, api_key="none", max_retries=0, timeout=cfg.timeout
         )
-        # No seed: one a request crashed vLLM on a CPU at 32 in flight.
-        self.extra: dict[str, Any] = {
-            "top_k": cfg.top_k,
-            "chat_template_kwargs": {"enable_thinking": False},
-        }
-        if constraint:
-            self.extra["structured_outputs"] = constraint
 
-    async def ask(self, chat: Chat, n: int, max_tokens: int) -> list[Reply]:
+    async def ask(self, chat: Chat, n: int, request: Request) -> list[Reply]:
         """`n` answers to a chat.
 
         Raises:
@@ -73,13 +68,7 @@ class Server:
             # The client's own timeout starts again with every byte that comes.
             async with asyncio.timeout(cfg.timeout):
                 completion = await self.client.chat.completions.create(
-                    model=cfg.model,
-                    messages=chat,
-                    n=n,
-                    temperature=cfg.temperature,
-                    top_p=cfg.top_p,
-                    max_tokens=max_tokens,
-                    extra_body=self.extra,
+                    model=cfg.model, messages=chat, n=n, **request
                 )
             return replies(completion, n)
         except openai.NotFoundError as error:
@@ -94,7 +83,7 @@ class Server:
             raise RefusedError(error.message) from error
         except (openai.APITimeoutError, TimeoutError) as error:
             raise RequestError(
-                f"no answer within teacher.timeout={cfg.timeout:g} seconds"
+                f"no answer within {cfg.GROUP}.timeout={cfg.timeout:g} seconds"
             ) from error
         except openai.APIConnectionError as error:
             raise RequestError(str(error.__cause__ or error)) from error
@@ -114,8 +103,8 @@ class Server:
         except (openai.OpenAIError, *NO_REPLY):
             served = "an unknown set"
         return UserError(
-            f"{self.url} does not serve teacher.model={self.cfg.model}; it has {served}. Is "
-            "that the URL of an OpenAI-compatible server, ending in /v1?"
+            f"{self.url} does not serve {self.cfg.GROUP}.model={self.cfg.model}; it has {served}. "
+            "Is that the URL of an OpenAI-compatible server, ending in /v1?"
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -94,8 +95,9 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
     log = run.folder / "answers.jsonl"
     whole = log.read_text()
     log.write_text(whole[: len(whole) * 2 // 3])
-    measured = json.loads(whole.partition("\n")[0])["measured"]
-    assert 0 < len(AnswerLog(log, measured, micro_store.selection("test")).answers) < 16
+    heads = [json.loads(line) for line in whole.splitlines()[:2]]
+    known = {head["mode"]: head["asked"] for head in heads}
+    assert 0 < len(AnswerLog(log, known, micro_store.selection("test")).answers) < 16
     select.main.__wrapped__(asked, run)
     assert (run.folder / "report.json").read_text() == told
     assert sorted(log.read_text().splitlines()) == sorted(whole.splitlines())
@@ -104,13 +106,31 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
     items = micro_store.selection("test")
     edited = whole.replace('"right": false', '"right": true').splitlines()
     log.write_text("\n".join([*edited[:4], "{", *edited[5:]]) + "\n")
-    kept = AnswerLog(log, measured, items).answers
+    kept = AnswerLog(log, known, items).answers
     assert len(kept) == 15
     rights = {i.item_id: i.letter for i in items}
     assert all(a.right == (a.letter == rights[a.item_id]) for a in kept.values())
 
     # Answers of other weights are not taken for these.
-    assert not AnswerLog(log, "another", micro_store.selection("test")).answers
+    others = {mode: {**what, "model": "another"} for mode, what in known.items()}
+    assert not AnswerLog(log, others, items).answers
+
+    # A base is asked for the record; drawn answers are the same after a kill.
+    drawn = replace(
+        asked, model=None, modes=["record"], batch=3, seed=5,
+        student=replace(settings_of(runs / "sft" / "run", SftCommand, "student").student,
+                        model=str(runs / "sft" / "run" / "student"), architecture=None,
+                        temperature=1.0, top_k=50),
+    )  # fmt: skip
+    run = run_in(runs, "drawn")
+    assert set(select.main.__wrapped__(drawn, run)) >= {"record_micro", "record_parse_rate"}
+    log = run.folder / "answers.jsonl"
+    whole = log.read_text()
+    log.write_text(whole[: len(whole) * 2 // 3])
+    select.main.__wrapped__(replace(drawn, batch=2), run)
+    assert sorted(log.read_text().splitlines()) == sorted(whole.splitlines())
+    texts = {json.loads(line)["text"] for line in whole.splitlines()[1:]}
+    assert len(texts) == 8
 
     ranked = RetrieveCommand(
         benchmark=micro, retriever=RetrieverConfig(name="unused", model="unused"), store=store,

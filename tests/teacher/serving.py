@@ -27,8 +27,8 @@ def free_port() -> int:
 class Serving:
     """The command on a model in a folder; `url` stays the same when it is started again."""
 
-    def __init__(self, model: Path, folder: Path) -> None:
-        self.model, self.folder = model, folder
+    def __init__(self, model: Path, folder: Path, *settings: str) -> None:
+        self.model, self.folder, self.settings = model, folder, settings
         self.url = f"http://127.0.0.1:{free_port()}/v1"
         self.said = folder / "said.txt"
         self.command: subprocess.Popen[bytes] | None = None
@@ -37,7 +37,7 @@ class Serving:
         """Start it and wait until it is up."""
         with open(self.said, "ab") as said:
             self.command = subprocess.Popen(
-                serve_arguments(self.url, self.folder, f"model={self.model}"),
+                serve_arguments(self.url, self.folder, f"model={self.model}", *self.settings),
                 stdout=said,
                 stderr=said,
                 cwd=ROOT,

@@ -24,6 +24,7 @@ from teacher.journal import read_rationales
 from teacher.narrate import narrate_store
 from teacher.serve import Machine
 from teacher.servers import process
+from teacher.servers.asking import request_of
 from teacher.servers.client import Client
 from tests.teacher.made import corpus, made_store
 from tests.teacher.serving import ROOT, Serving, free_port
@@ -59,9 +60,11 @@ def server(model, tmp_path_factory):
 
 def ask(server, constraint=None, n=1, text="Where does the red cube go?"):
     cfg = TeacherConfig(name="tiny", url=server.url, model="tiny", max_tokens=8)
+    request = request_of(cfg)
+    request["extra_body"]["structured_outputs"] = constraint
 
     async def main():
-        async with Client(cfg, constraint) as client:
+        async with Client(cfg, request) as client:
             return await client.ask([{"role": "user", "content": text}], n)
 
     return asyncio.run(main())
@@ -76,6 +79,16 @@ def test_a_gpu_server_has_the_presets_flags():
     assert "--enable-prefix-caching" in told
     assert "--enforce-eager" not in told
     assert "--reasoning-parser" not in told
+
+
+def test_a_server_is_asked_with_frames_where_it_is_told_so(tmp_path):
+    assert "--trust-request-mm-kwargs" not in flags(command(), 1)
+    assert "--trust-request-mm-kwargs" in flags(command(frames=True), 1)
+    (tmp_path / "adapter_config.json").write_text('{"r": 16}')
+    told = " ".join(flags(command(adapter=str(tmp_path)), 1))
+    assert f"--max-lora-rank 16 --lora-modules adapter={tmp_path}" in told
+    with pytest.raises(UserError, match="holds no adapters"):
+        serve.adapter_rank(str(tmp_path / "none"))
 
 
 @pytest.mark.parametrize(("there", "used"), [(1, 1), (2, 2), (3, 2), (4, 4), (7, 4), (8, 8)])

@@ -10,7 +10,9 @@ import pytest
 
 from conf.errors import UserError
 from conf.schema import TeacherConfig
+from teacher.grammar import grammar
 from teacher.narrate import narrate_store
+from teacher.servers.asking import request_of
 from teacher.servers.client import Client, jitter
 from tests.teacher.odd import OddServer, completion
 
@@ -23,10 +25,10 @@ def config(*servers, **changes):
     return TeacherConfig(name="served", url=url, model="tiny", **settings)
 
 
-def ask(cfg, times=1, constraint=None):
+def ask(cfg, times=1, **own):
     async def main():
-        async with Client(cfg, constraint) as client:
-            return await asyncio.gather(*(client.ask(CHAT) for _ in range(times)))
+        async with Client(cfg, request_of(cfg)) as client:
+            return await asyncio.gather(*(client.ask(CHAT, **own) for _ in range(times)))
 
     return asyncio.run(main())
 
@@ -47,15 +49,22 @@ def test_no_more_requests_are_in_flight_than_asked_for(store, odd):
 
 def test_a_constraint_is_sent_as_vllm_takes_it(odd):
     server = odd()
-    ask(config(server), constraint={"choice": ["east", "west"]})
-    assert server.asked[0]["structured_outputs"] == {"choice": ["east", "west"]}
+    ask(config(server, grammar=True))
+    assert server.asked[0]["structured_outputs"] == {"grammar": grammar(config(server))}
+
+
+def test_a_request_may_have_fields_of_its_own(odd):
+    server = odd()
+    ask(config(server, temperature=0.3), seed=7, temperature=0.6)
+    asked = server.asked[0]
+    assert (asked["seed"], asked["temperature"], asked["top_p"]) == (7, 0.6, 0.8)
 
 
 def test_fewer_answers_than_asked_for_are_taken(odd):
     server = odd(json.dumps(completion("Hello.", "stop", 2)).encode())
 
     async def main():
-        async with Client(config(server)) as client:
+        async with Client(config(server), {}) as client:
             return await client.ask(CHAT, 4)
 
     assert len(asyncio.run(main())) == 2
@@ -102,7 +111,7 @@ def test_servers_share_the_work_by_how_busy_they_are(odd):
     slow.delay, fast.delay = 0.1, 0.005
 
     async def main():
-        async with Client(config(slow, fast)) as client:
+        async with Client(config(slow, fast), {}) as client:
 
             async def lane():
                 for _ in range(10):
@@ -158,7 +167,7 @@ def test_each_url_is_asked_once_for_its_name(odd):
     server = odd()
 
     async def main():
-        async with Client(config(server, server)) as client:
+        async with Client(config(server, server), {}) as client:
             return len(client.places)
 
     assert asyncio.run(main()) == 1

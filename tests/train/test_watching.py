@@ -7,6 +7,7 @@ import io
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,9 @@ from conf import trackers
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import SftCommand
+from evaluation import here
 from evaluation.answers import AnswerLog, ask_all
+from evaluation.asked import shown
 from train import backbone, sft
 from train.conversation import conversation
 from train.generate import HeldOutAnswers
@@ -85,10 +88,12 @@ def test_what_is_written_is_what_the_evaluation_reads(
         written = {r["sample"].removesuffix(f" ({mode})"): r for r in rows if r["mode"] == mode}
         assert len(written) == 2
         asked = [items[item_id] for item_id in written]
-        log = AnswerLog(tmp_path / f"{mode}.jsonl", "these", asked)
-        given = ask_all(
-            model, processor, asked, mode, "cot", frames, settings.student, "fp32", 2, log
+        log = AnswerLog(tmp_path / f"{mode}.jsonl", {mode: {}}, asked)
+        sample_of = partial(shown, mode, "cot", frames, settings.student, None)
+        answer = partial(
+            here.say, model, processor, settings.student, "fp32", 2, 0, mode, sample_of
         )
+        given = ask_all(asked, mode, answer, log)
         for answer in given:
             row = written[answer.item_id]
             assert row["text"] == answer.text

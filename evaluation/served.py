@@ -1,0 +1,190 @@
+"""A model that answers on servers, which are asked with its frames."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import io
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import openai
+from PIL import Image
+
+from conf.errors import UserError
+from conf.schema import ServerConfig, StudentConfig
+from data.records import SelectionItem
+from evaluation.answers import Keep, seed_of
+from evaluation.protocol import schema
+from teacher.servers.client import Client, UnansweredError
+from teacher.servers.lanes import in_lanes
+from teacher.servers.replies import CUT_OFF, Reply
+from teacher.servers.server import NO_REPLY, Chat, Request
+from train.conversation import Clip, Sample
+from train.generate import THOUGHT, Written, new_tokens
+
+ANY_SIZE = 1
+"""Pixels that an image has at least; none is enlarged."""
+BLANK = 64
+"""Edge in px of the frames of a canary."""
+
+
+def say(
+    server: ServerConfig,
+    cfg: StudentConfig,
+    seed: int,
+    mode: str,
+    sample_of: Callable[[SelectionItem], Sample],
+    items: list[SelectionItem],
+    keep: Keep,
+) -> None:
+    """Have a served model answer items in `mode`, as `sample_of` shows and asks them.
+
+    Raises:
+        UserError: no server can be asked, does not take a clip and images, or has no answer to an
+            item though it answers others.
+    """
+    asyncio.run(_say(server, cfg, seed, mode, sample_of, items, keep))
+
+
+async def _say(
+    server: ServerConfig,
+    cfg: StudentConfig,
+    seed: int,
+    mode: str,
+    sample_of: Callable[[SelectionItem], Sample],
+    items: list[SelectionItem],
+    keep: Keep,
+) -> None:
+    loop = asyncio.get_running_loop()
+    # Frames are kept in one cache, which takes one thread at a time.
+    with ThreadPoolExecutor(1) as desk:
+        first = await loop.run_in_executor(desk, sample_of, items[0])
+        request = request_of(cfg, mode, first.clip)
+        async with Client(server, request, chat_of(blank(first))) as client:
+
+            async def ask(item: SelectionItem) -> None:
+                chat, clip = await loop.run_in_executor(desk, _shown, sample_of, item)
+                own = request_of(cfg, mode, clip)
+                if cfg.temperature:
+                    own["seed"] = seed_of(seed, item, mode)
+                try:
+                    [reply] = await client.ask(chat, **own)
+                except UnansweredError as fault:
+                    raise UserError(
+                        f"{server.model} has no answer to item {item.item_id} ({fault}); once that "
+                        "is mended, run the same command again, it goes on with what is answered"
+                    ) from fault
+                keep([(item, written(reply, cfg.thinking))])
+
+            await in_lanes(items, server.concurrency, ask)
+
+
+def _shown(
+    sample_of: Callable[[SelectionItem], Sample], item: SelectionItem
+) -> tuple[Chat, Clip | None]:
+    sample = sample_of(item)
+    return chat_of(sample), sample.clip
+
+
+def chat_of(sample: Sample) -> Chat:
+    """A conversation in the API's form, its frames as PNGs within it. A clip is vLLM's sequence of
+    images, whose times go with the request."""
+    pictures = iter(sample.images)
+    parts: list[dict[str, Any]] = []
+    for part in sample.content:
+        if part["type"] == "text":
+            parts.append(part)
+        elif part["type"] == "image":
+            url = f"data:image/png;base64,{_png(next(pictures))}"
+            parts.append({"type": "image_url", "image_url": {"url": url}})
+        else:
+            frames = ",".join(map(_png, sample.clip.pixels))
+            url = f"data:video/jpeg;base64,{frames}"
+            parts.append({"type": "video_url", "video_url": {"url": url}})
+    return [{"role": "user", "content": parts}]
+
+
+def _png(pixels: np.ndarray) -> str:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG", compress_level=1)
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+def blank(sample: Sample) -> Sample:
+    """A sample of the same form that shows nothing."""
+    empty = np.zeros((BLANK, BLANK, 3), np.uint8)
+    clip = sample.clip and replace(sample.clip, pixels=np.stack([empty] * len(sample.clip.indices)))
+    return replace(sample, clip=clip, images=[empty] * len(sample.images))
+
+
+def request_of(cfg: StudentConfig, mode: str, clip: Clip | None) -> Request:
+    """What goes with a chat: how tokens are drawn, what may be written, and that frames are neither
+    sampled again nor shrunk, as where a model is loaded here."""
+    area = cfg.image_size**2
+    # Twice the pixels there are, as where a model is loaded here: no budget shrinks a frame.
+    images = {"size": {"shortest_edge": ANY_SIZE, "longest_edge": 2 * area}}
+    videos = {"size": {"shortest_edge": ANY_SIZE, "longest_edge": 2 * cfg.frames * area}}
+    extra: dict[str, Any] = {
+        "chat_template_kwargs": {"enable_thinking": cfg.thinking},
+        "mm_processor_kwargs": {
+            "images_kwargs": images,
+            "videos_kwargs": {**videos, "do_sample_frames": False},
+        },
+    }
+    if clip:
+        extra["media_io_kwargs"] = {"video": {"num_frames": -1, **clip.metadata}}
+    if cfg.top_k:
+        extra["top_k"] = cfg.top_k
+    request = {
+        "temperature": cfg.temperature,
+        "top_p": cfg.top_p,
+        "max_tokens": new_tokens(mode, cfg),
+        "extra_body": extra,
+    }
+    if mode == "constrained":
+        held = {"name": "record", "strict": True, "schema": schema()}
+        request["response_format"] = {"type": "json_schema", "json_schema": held}
+    return request
+
+
+def written(reply: Reply, thinking: bool) -> Written:
+    """What a server's model wrote, its thought within the text. A thought that the prompt opens,
+    or that the server has taken out, is opened again."""
+    text = reply.text
+    if reply.thought:
+        text = f"{THOUGHT}{reply.thought}" + (f"</think>{text}" if text else "")
+    elif thinking and THOUGHT not in text:
+        text = f"{THOUGHT}{text}"
+    return Written(text, reply.flaw == CUT_OFF)
+
+
+def revision(server: ServerConfig) -> dict[str, Any]:
+    """What the first server that answers tells of `server.model`: the `root` that it was loaded
+    from, and that of the `parent` that it is an adapter of.
+
+    Raises:
+        UserError: none answers, or that one does not serve the model.
+    """
+    problems = []
+    for url in server.urls:
+        try:
+            with openai.OpenAI(base_url=url, api_key="none", max_retries=0, timeout=10) as client:
+                models = {m.id: m.model_extra or {} for m in client.models.list()}
+        except (openai.OpenAIError, *NO_REPLY) as error:
+            problems.append(f"{url}: {error.__cause__ or error}")
+            continue
+        if server.model not in models:
+            raise UserError(
+                f"{url} does not serve server.model={server.model}; it has {', '.join(models)}"
+            )
+        own = models[server.model]
+        parent = models.get(own.get("parent"), {}).get("root")
+        return {"root": own.get("root"), "parent": parent}
+    raise UserError(
+        f"no server of server.url can be asked ({'; '.join(problems)}): start one, such as with "
+        "python -m teacher.serve frames=true, and run this again"
+    )

@@ -1,0 +1,293 @@
+"""A served model is asked with the frames and the times that a model here is shown."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from conf.entry import Run
+from conf.errors import UserError
+from conf.schema import SelectCommand, ServerConfig, StudentConfig
+from data.frames import Frames
+from evaluation import select
+from evaluation.answers import AnswerLog, ask_all, judge
+from evaluation.asked import known_by, model_served, shown
+from evaluation.protocol import instruction, schema
+from evaluation.served import revision, say, written
+from teacher.servers.replies import CUT_OFF, Reply
+from tests.evaluation.talking import TalkingServer
+from tests.evaluation.test_protocol import FULL
+
+STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
+THINKING = replace(STUDENT, thinking=True, temperature=0.6, top_p=0.95, top_k=20)
+
+
+@pytest.fixture
+def items(micro_store):
+    return micro_store.selection("test")[:8]
+
+
+@pytest.fixture
+def frames(micro_store):
+    return Frames(micro_store, STUDENT.image_size)
+
+
+@pytest.fixture
+def talking(monkeypatch):
+    monkeypatch.setattr("teacher.servers.client.PAUSE", 0.01)
+    monkeypatch.setattr("teacher.servers.client.LONGEST_PAUSE", 0.05)
+    servers = []
+
+    def start(says, port=0):
+        servers.append(TalkingServer(says, port))
+        return servers[-1]
+
+    yield start
+    for server in servers:
+        server.stop()
+
+
+def at(*servers, **changes) -> ServerConfig:
+    settings = {"concurrency": 3, "patience": 5.0, "timeout": 10.0, **changes}
+    return ServerConfig(url=[s.url for s in servers], model="served", **settings)
+
+
+def opened(tmp_path, items, **known) -> AnswerLog:
+    return AnswerLog(tmp_path / "answers.jsonl", {"record": known, "answer": known}, items)
+
+
+def asker(server, frames, cfg=STUDENT, mode="record", control=None, seed=0):
+    sample_of = partial(shown, mode, "cot", frames, cfg, control)
+    return partial(say, server, cfg, seed, mode, sample_of)
+
+
+def test_the_same_frames_and_times_are_sent(items, frames, talking, tmp_path) -> None:
+    server = talking(lambda _: FULL)
+    log = opened(tmp_path, items)
+    given = ask_all(items, "record", asker(at(server, concurrency=1), frames), log)
+    assert [a.letter for a in given] == ["C"] * 8
+    assert [a.right for a in given] == [i.letter == "C" for i in items]
+    assert {a.valid for a in given} == {True}
+    for item, asked in zip(items, server.asked, strict=True):
+        sample = shown("record", "cot", frames, STUDENT, None, item)
+        parts = asked["messages"][0]["content"]
+        video = parts[0]["video_url"]["url"].removeprefix("data:video/jpeg;base64,")
+        assert np.array_equal(np.stack([*map(pixels, video.split(","))]), sample.clip.pixels)
+        images = [p["image_url"]["url"].partition(",")[2] for p in parts if "image_url" in p]
+        for told, image in zip(images, sample.images, strict=True):
+            assert np.array_equal(pixels(told), image)
+        texts = [p["text"] for p in parts if p["type"] == "text"]
+        assert texts[0].startswith(item.question)
+        assert texts[-1] == f"\n{instruction()}"
+        clip = asked["media_io_kwargs"]["video"]
+        assert clip["frames_indices"] == sample.clip.indices
+        assert (clip["fps"], clip["total_num_frames"], clip["num_frames"]) == (25.0, 128, -1)
+        assert asked["mm_processor_kwargs"]["videos_kwargs"]["do_sample_frames"] is False
+        assert (asked["temperature"], asked["max_tokens"]) == (0, 40)
+        assert "seed" not in asked
+        assert "response_format" not in asked
+
+
+def pixels(png: str) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(png))))
+
+
+def test_a_model_is_held_to_the_schema_and_draws_by_seeds(items, frames, talking) -> None:
+    server = talking(lambda _: FULL)
+    for seed in (0, 0, 1):
+        held = asker(at(server), frames, THINKING, "constrained", seed=seed)
+        held(items[:2], lambda _: None)
+    format_ = server.asked[0]["response_format"]
+    assert format_["json_schema"]["schema"] == schema()
+    sampling = {key: server.asked[0][key] for key in ("temperature", "top_p", "top_k")}
+    assert sampling == {"temperature": 0.6, "top_p": 0.95, "top_k": 20}
+    assert server.asked[0]["chat_template_kwargs"] == {"enable_thinking": True}
+    seeds = [sorted(a["seed"] for a in server.asked[k : k + 2]) for k in (0, 2, 4)]
+    assert seeds[0] == seeds[1] != seeds[2]
+    assert len(set(seeds[0])) == 2
+
+
+def test_a_control_hides_the_clip(items, frames, talking) -> None:
+    server = talking(lambda _: "B")
+    asker(at(server), frames, control="candidate_only")(items[:1], lambda _: None)
+    kinds = [p["type"] for p in server.asked[0]["messages"][0]["content"]]
+    assert "video_url" not in kinds
+    assert kinds.count("image_url") == 4
+    assert "media_io_kwargs" not in server.asked[0]
+
+
+@pytest.mark.parametrize(
+    ("reply", "thinking", "text"),
+    [
+        (Reply("Answer: B"), False, "Answer: B"),
+        (Reply("B? Yes.</think>Answer: C"), True, "<think>B? Yes.</think>Answer: C"),
+        (Reply("<think>B?</think>C"), True, "<think>B?</think>C"),
+        (Reply("Answer: B", CUT_OFF), True, "<think>Answer: B"),
+        (Reply("C", "thinking", thought="B?"), False, "<think>B?</think>C"),
+        (Reply("", CUT_OFF, thought="Answer: B"), True, "<think>Answer: B"),
+    ],
+)
+def test_a_thought_is_no_answer(reply, thinking, text, items) -> None:
+    found = written(reply, thinking)
+    assert found.text == text
+    assert found.cut == (reply.flaw == CUT_OFF)
+    letter = judge(items[0], "answer", found).letter
+    assert letter == (None if "</think>" not in text and thinking else text[-1])
+
+
+def test_hostile_answers_are_kept_and_read(items, frames, talking, tmp_path) -> None:
+    hostile = iter(
+        [
+            "x" * 1_000_000,
+            "{" * 300_000,
+            "\ud800 Answer: B",
+            {"content": None},
+            {"content": "Answer: B", "finish_reason": "length"},
+            {"content": "", "reasoning": "Answer: C"},
+            'forced_choice": "A"\u2028\x85\x00',
+            FULL,
+        ]
+    )
+    server = talking(lambda _: next(hostile))
+    log = opened(tmp_path, items)
+    given = ask_all(items, "record", asker(at(server, concurrency=1), frames), log)
+    assert [a.letter for a in given] == [None, None, "B", None, None, None, None, "C"]
+    assert given[4].reason == "cut off"
+    again = opened(tmp_path, items).answers
+    assert [again[a.item_id, "record"] for a in given] == given
+
+
+def test_a_server_that_dies_costs_no_answer(items, frames, talking, tmp_path) -> None:
+    first = talking(lambda _: FULL if len(first.asked) < 4 else 500)
+    log = opened(tmp_path, items)
+    dying = asker(at(first, patience=0.2, concurrency=1), frames)
+    with pytest.raises(
+        UserError, match=r"no server of server\.url could be asked .* it goes on with"
+    ):
+        ask_all(items, "record", dying, log)
+    kept = (tmp_path / "answers.jsonl").read_text()
+    assert len(log.answers) == 3
+    second = talking(lambda _: FULL)
+    log = opened(tmp_path, items)
+    assert len(ask_all(items, "record", asker(at(second), frames), log)) == 8
+    assert len(second.asked) == 5
+    assert (tmp_path / "answers.jsonl").read_text().startswith(kept)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "served is not a multimodal model",
+        "At most 0 video(s) may be provided in one prompt.",
+        "Per-request media_io_kwargs are disabled by default",
+    ],
+)
+def test_a_model_that_takes_no_clip_is_told(words, items, frames, talking) -> None:
+    def refuse(request):
+        clip = any(p["type"] == "video_url" for p in request["messages"][0]["content"])
+        return {"status": 400, "message": words} if clip else "Hello."
+
+    server = talking(refuse)
+    with pytest.raises(UserError) as told:
+        asker(at(server), frames)(items, lambda _: None)
+    assert str(told.value).startswith(f"{server.url} refuses any request: ")
+    assert words in str(told.value)
+
+
+def test_an_item_that_alone_has_no_answer_is_told(items, frames, talking) -> None:
+    # A blank canary is much shorter than any item.
+    def refuse(request):
+        long = len(json.dumps(request)) > 10_000
+        return {"status": 400, "message": "prompt is too long"} if long else "Hello."
+
+    server = talking(refuse)
+    with pytest.raises(UserError, match=r"no answer to item .*prompt is too long.*goes on with"):
+        asker(at(server, concurrency=1), frames)(items, lambda _: None)
+
+
+def test_what_is_served_is_told_apart(talking) -> None:
+    server = talking(lambda _: FULL)
+    assert revision(at(server)) == {"root": "weights", "parent": None}
+    adapter = replace(at(server), model="adapter")
+    assert revision(adapter) == {"root": "lora", "parent": "weights"}
+    with pytest.raises(
+        UserError, match=r"does not serve server\.model=other; it has served, adapter"
+    ):
+        revision(replace(at(server), model="other"))
+    server.stop()
+    with pytest.raises(UserError, match=r"no server of server\.url can be asked \(http://127"):
+        revision(at(server))
+
+
+def test_a_student_is_not_measured_by_its_base(talking, tmp_path) -> None:
+    server = talking(lambda _: FULL)
+    cfg = SelectCommand(server=replace(at(server), model=None), student=STUDENT)
+    with pytest.raises(UserError, match=r"give server\.model=NAME"):
+        model_served(cfg, tmp_path, STUDENT, "cot", None)
+
+
+def test_answers_to_other_questions_stay_and_do_not_count(items, tmp_path) -> None:
+    path, [item, *_] = tmp_path / "answers.jsonl", items
+    first = AnswerLog(path, {"record": {"seed": 0}}, items)
+    first.append([judge(item, "record", written(Reply(FULL), False))])
+    assert AnswerLog(path, {"record": {"seed": 0}}, items).answers == first.answers
+    assert not AnswerLog(path, {"record": {"seed": 1}}, items).answers
+    assert not AnswerLog(path, {"answer": {"seed": 0}}, items).answers
+    # A line that was torn is gone, the others stay.
+    path.write_text(path.read_text() + '{"item_id": "')
+    assert AnswerLog(path, {"record": {"seed": 0}}, items).answers == first.answers
+    assert [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_what_an_answer_depends_on_is_its_key() -> None:
+    def known(
+        mode="record", regime="cot", cfg=STUDENT, seed=0, rev="a", benchmark="b", control=None
+    ):
+        return known_by(mode, regime, cfg, seed, {"weights": rev}, benchmark, control)
+
+    assert known() == known(seed=1)
+    other = [
+        known("constrained"),
+        known("reasoning"),
+        known(cfg=THINKING),
+        known(cfg=THINKING, seed=1),
+        known(cfg=replace(STUDENT, max_new_tokens=41)),
+        known(cfg=replace(STUDENT, image_size=64)),
+        known(rev="c"),
+        known(benchmark="c"),
+        known(control="candidate_only"),
+    ]
+    texts = {json.dumps(k, sort_keys=True) for k in [known(), *other]}
+    assert len(texts) == 1 + len(other)
+
+
+@pytest.mark.slow
+def test_the_command_measures_a_served_model(micro, micro_store, talking, tmp_path) -> None:
+    server = talking(lambda r: FULL if "response_format" in r else "I cannot tell.")
+    cfg = SelectCommand(
+        benchmark=micro, student=STUDENT, server=at(server), store=str(micro_store.folder.parent),
+        limit=6,
+    )  # fmt: skip
+    metrics = select.main.__wrapped__(cfg, Run("x", tmp_path))
+    assert metrics["record_parse_rate"] == 0
+    assert metrics["constrained_parse_rate"] == 1
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [r["mode"] for r in report["rows"]] == ["record", "constrained"]
+    assert report["readings"]["record"] == {
+        "with a letter": 0, "  in a valid record": 0, "without: refusal": 6,
+    }  # fmt: skip
+    assert report["calibration"]["constrained"]["n"] == 6
+    assert report["positions"]["constrained"]["chosen"]["C"] == 6
+    text = (tmp_path / "report.txt").read_text()
+    assert "Confidence reported (constrained)" in text
+    # All is answered: the same command asks nothing.
+    server.asked.clear()
+    assert select.main.__wrapped__(cfg, Run("x", tmp_path)) == metrics
+    assert not server.asked
