@@ -190,8 +190,8 @@ def check_words(preset: RetrieverConfig, config: Any, tokenizer: Any) -> None:
     there, known = len(tokenizer), config.text_config.vocab_size
     if not known / 2 < there <= known:
         raise UserError(
-            f"retriever.model={preset.model} has a tokenizer of {there} tokens, and the model knows "
-            f"{known}: put the tokenizer's files there that came with the weights"
+            f"retriever.model={preset.model} has a tokenizer of {there} tokens, and the model "
+            f"knows {known}: put the tokenizer's files there that came with the weights"
         )
 
 
