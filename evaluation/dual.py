@@ -149,12 +149,13 @@ def load_dual(preset: RetrieverConfig, precision: str) -> DualEncoder:
         model = whole(AutoModel, preset.model, precision, "model", **origin)
     except UNREADABLE as error:
         raise load_failure("retriever", preset.model, error) from error
-    for part in ("tokenizer", "image_processor"):
+    for part in ("image_processor", "tokenizer"):
         if not hasattr(processor, part):
             raise UserError(
                 f"retriever.model={preset.model} lacks its {part.replace('_', ' ')}: put the files "
                 "there that came with the weights"
             )
+    check_words(preset, config, processor.tokenizer)
     check_size(preset, config)
     return DualEncoder(preset, model, model, processor.tokenizer, processor.image_processor)
 
@@ -170,15 +171,28 @@ def whole(kind: Any, source: str, precision: str, key: str, **options: Any) -> P
         dtype=DTYPES[precision],
         use_safetensors=True,
         output_loading_info=True,
+        ignore_mismatched_sizes=True,
         **options,
     )
-    if lacking := sorted(told["missing_keys"]):
+    misfits = (key for key, *_ in told["mismatched_keys"])
+    if lacking := sorted({*told["missing_keys"], *misfits}):
         more = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
         raise UserError(
             f"retriever.{key}={source} lacks the weights {lacking[0]}{more}: fetch the whole "
             "model, or give the one that the preset names"
         )
     return model.eval().to("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def check_words(preset: RetrieverConfig, config: Any, tokenizer: Any) -> None:
+    """Raises UserError where a tokenizer is not the model's: without its files the library makes
+    one that knows no words. A model's vocabulary may be filled up with some that nobody uses."""
+    there, known = len(tokenizer), config.text_config.vocab_size
+    if not known / 2 < there <= known:
+        raise UserError(
+            f"retriever.model={preset.model} has a tokenizer of {there} tokens, and the model "
+            f"knows {known}: put the tokenizer's files there that came with the weights"
+        )
 
 
 def check_size(preset: RetrieverConfig, config: Any) -> None:

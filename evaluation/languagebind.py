@@ -18,7 +18,16 @@ from transformers.utils import logging as transformers_logging
 
 from conf.errors import UserError
 from conf.schema import RetrieverConfig
-from evaluation.dual import DualEncoder, as_array, at_once, check_size, pixel_values, unit, whole
+from evaluation.dual import (
+    DualEncoder,
+    as_array,
+    at_once,
+    check_size,
+    check_words,
+    pixel_values,
+    unit,
+    whole,
+)
 from train.backbone import UNREADABLE, check_reachable, load_failure
 
 
@@ -92,6 +101,7 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
         image = whole(CLIPModel, preset.image_model, precision, "image_model", config=image_config)
     except UNREADABLE as error:
         raise load_failure("retriever", preset.image_model, error, "image_model") from error
+    check_words(preset, video_config, tokenizer)
     size = {"height": preset.image_size, "width": preset.image_size}
     # The released models have no file of this; their authors' transform is CLIP's.
     processor = CLIPImageProcessor(crop_size=size, size={"shortest_edge": preset.image_size})

@@ -15,17 +15,15 @@ from train.compatible import check_processor
 from train.retriever import PROCESSING
 
 TEMPLATE = (
-    "{%- for message in messages if message.content is not string -%}"
-    "{%- for part in message.content if part.type != 'text' -%}"
-    "{{ '<|' + part.type + '_pad|> ' }}"
-    "{%- endfor -%}{%- endfor -%}"
+    "{%- set told = namespace(media='', texts=[]) -%}"
     "{%- for message in messages -%}"
-    "{%- if not loop.first -%}{{ ' ' }}{%- endif -%}"
-    "{%- if message.content is string -%}{{ message.content }}"
-    "{%- else -%}"
-    "{%- for part in message.content if part.type == 'text' -%}{{ part.text }}{%- endfor -%}"
-    "{%- endif -%}"
+    "{%- if message.content is string -%}{%- set told.texts = told.texts + [message.content] -%}"
+    "{%- else -%}{%- for part in message.content -%}"
+    "{%- if part.type == 'text' -%}{%- set told.texts = told.texts + [part.text] -%}"
+    "{%- else -%}{%- set told.media = told.media + '<|' + part.type + '_pad|> ' -%}{%- endif -%}"
+    "{%- endfor -%}{%- endif -%}"
     "{%- endfor -%}"
+    "{{ told.media + told.texts | join(' ') }}"
 )
 """As the model was trained: no roles; the medium bare, the instruction, the text."""
 
