@@ -2,9 +2,9 @@
 write before it is ever asked to choose.
 
 A frame is described by its objects and their places, alone and among four candidates, one after the
-other; a clip by the built-in narrator, with the frame that comes of it shown or not; of several
-frames the one is named that is the later, or that fits a description. None of it is the selection
-task itself.
+other; an object is looked for in each of four candidates; a clip is told by the built-in narrator,
+with the frame that comes of it shown or not; of several frames the one is named that is the later,
+or that fits a description. None of it is the selection task itself.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ from train.planned import Planned, rng_of
 
 FRAME = "Describe the frame."
 CANDIDATES = "Describe each candidate."
+WHERE = "Where does each candidate show the {}?"
 CLIP = "Describe the scene, how its objects move, and what will come of it."
 LATER = 'Which candidate comes later? End with a line "Answer:" and the letter.'
 MATCH = (
     "Which candidate shows {}? Say of each candidate, in a line of its own, whether it matches and "
     'why. End with a line "Answer:" and the letter.'
 )
-ASKED = (FRAME, CANDIDATES, CLIP, LATER, MATCH)
+ASKED = (FRAME, CANDIDATES, WHERE, CLIP, LATER, MATCH)
 FRAMES = 2
 """Frames described for each item in an epoch."""
 SETS = 4
@@ -56,6 +57,7 @@ def kinds(
     return {
         "frame": [make.frame(item, k) for item in items for k in range(FRAMES)],
         "candidates": [make.candidates(item, items, k) for item in items for k in range(SETS)],
+        "where": [make.where(item, items, k) for item in items for k in range(SETS)],
         "clip": [clip for item in items for clip in make.clip(item)],
         "later": [later for item in items for later in make.later(item)],
         "match": [match for item in items for match in make.matched(item)],
@@ -102,21 +104,57 @@ class _Maker:
         self, item: SelectionItem, others: list[SelectionItem], k: int, epoch: int
     ) -> Sample:
         rng = rng_of(self.seed, epoch, item.item_id, "candidates", k)
+        shown = self._four(item, others, rng)
+        told = [
+            f"Candidate {letter}: {account(self.store.scene(scene_id), frame)}"
+            for scene_id, frame, letter in shown
+        ]
+        name = f"{item.item_id} (candidates {k})"
+        return self._of_four(name, shown, CANDIDATES, told)
+
+    def where(self, item: SelectionItem, others: list[SelectionItem], k: int) -> Planned:
+        """An object that one of four frames shows, looked for in all: so does a rationale compare
+        candidates."""
+        phrase = self.store.scene(item.scene_id).objects[0].phrase
+        lines = [f"Candidate {letter} shows the {phrase} {REGIONS[0][0]}." for letter in LETTERS]
+        text = f"{WHERE.format(phrase)} {' '.join(lines)}"
+        return Planned(text, len(LETTERS), partial(self._where, item, others, k))
+
+    def _where(
+        self, item: SelectionItem, others: list[SelectionItem], k: int, epoch: int
+    ) -> Sample:
+        rng = rng_of(self.seed, epoch, item.item_id, "where", k)
+        shown = self._four(item, others, rng)
+        seen = [seen_in(self.store.scene(scene_id), frame) for scene_id, frame, _ in shown]
+        there = sorted({phrase for objects in seen for phrase in objects})
+        if not there:
+            there = [o.phrase for o in self.store.scene(item.scene_id).objects]
+        phrase = there[rng.integers(len(there))]
+        told = [
+            f"Candidate {letter} shows the {phrase} {objects[phrase]}."
+            if phrase in objects
+            else f"Candidate {letter} lacks the {phrase}."
+            for (*_, letter), objects in zip(shown, seen, strict=True)
+        ]
+        name = f"{item.item_id} (where {k})"
+        return self._of_four(name, shown, WHERE.format(phrase), [" ".join(told)])
+
+    def _four(
+        self, item: SelectionItem, others: list[SelectionItem], rng: np.random.Generator
+    ) -> list[Picture]:
+        """An item's own candidates or, the easier to tell apart, a frame each of four items."""
         if rng.random() < 0.5:
             own = [(c.scene_id, c.frame) for c in item.candidates]
-            shown = [own[place] for place in rng.permutation(len(own))]
-        else:
-            drawn = [others[place] for place in rng.integers(len(others), size=len(LETTERS))]
-            shown = [self._any(one, rng) for one in drawn]
+            return lettered([own[place] for place in rng.permutation(len(own))])
+        drawn = [others[place] for place in rng.integers(len(others), size=len(LETTERS))]
+        return lettered([self._any(one, rng) for one in drawn])
+
+    def _of_four(self, name: str, shown: list[Picture], asked: str, told: list[str]) -> Sample:
         parts: list[str | np.ndarray] = []
-        told = []
-        for letter, (scene_id, frame) in zip(LETTERS, shown, strict=True):
+        for scene_id, frame, letter in shown:
             parts += [f"\nCandidate {letter}: ", self.frames.array(scene_id, frame)]
-            told.append(f"Candidate {letter}: {account(self.store.scene(scene_id), frame)}")
-        parts.append(f"\n{CANDIDATES}")
-        sights = self._sights(lettered(shown))
-        name = f"{item.item_id} (candidates {k})"
-        return conversation(name, parts, "\n".join(told), None, sights)
+        parts.append(f"\n{asked}")
+        return conversation(name, parts, "\n".join(told), None, self._sights(shown))
 
     def _any(self, item: SelectionItem, rng: np.random.Generator) -> tuple[str, int]:
         """Any of the frames that an item shows."""
@@ -203,14 +241,19 @@ class _Maker:
         return shown_frames(item.prefix_start, item.prefix_stop, self.cfg.frames)
 
 
+def seen_in(scene: Scene, frame: int) -> dict[str, str]:
+    """The places of the objects that a frame shows, by their phrases."""
+    return {
+        o.phrase: region_of(scene, frame, k)
+        for k, o in enumerate(scene.objects)
+        if scene.in_view[frame, k] and scene.visible_fraction[frame, k] > HIDDEN
+    }
+
+
 def account(scene: Scene, frame: int) -> str:
     """The objects that a frame shows and where, from the top-left to the bottom-right."""
     places = [region for row in REGIONS for region in row]
-    seen = [
-        (places.index(region_of(scene, frame, k)), o.phrase)
-        for k, o in enumerate(scene.objects)
-        if scene.in_view[frame, k] and scene.visible_fraction[frame, k] > HIDDEN
-    ]
+    seen = [(places.index(place), phrase) for phrase, place in seen_in(scene, frame).items()]
     told = [f"The {phrase} is {places[place]}." for place, phrase in sorted(seen)]
     return " ".join(told) or "No object is in view."
 

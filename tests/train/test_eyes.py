@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from data.frames import Frames
 from data.records import LETTERS
 from data.store import Store
 from teacher.predicates import region_of
@@ -27,6 +28,17 @@ def shown(store: Store, scene_id: str, frame: int) -> dict[str, str]:
     }
 
 
+def all_shown(store: Store, frames: Frames) -> dict[bytes, list[dict[str, str]]]:
+    """What frames show, by their pixels. A scene at rest is told alike, but where an object creeps
+    over a region's border."""
+    every: dict[bytes, list[dict[str, str]]] = {}
+    for scene_id in {item.scene_id for item in store.selection()}:
+        for frame in range(128):
+            pixels = frames.array(scene_id, frame).tobytes()
+            every.setdefault(pixels, []).append(shown(store, scene_id, frame))
+    return every
+
+
 def asked_and_answered(planned: Planned, epoch: int = 0) -> tuple[str, str]:
     sample = planned.make(epoch)
     return sample.content[-1]["text"], sample.response
@@ -43,12 +55,7 @@ def test_a_frame_is_told_object_by_object(micro_store, kinds) -> None:
 
 
 def test_each_candidate_is_told_under_its_letter(micro_store, frames, kinds) -> None:
-    every: dict[bytes, list[dict[str, str]]] = {}
-    for scene_id in {item.scene_id for item in micro_store.selection()}:
-        for frame in range(128):
-            # A scene at rest is told alike, but where an object creeps over a region's border.
-            pixels = frames.array(scene_id, frame).tobytes()
-            every.setdefault(pixels, []).append(shown(micro_store, scene_id, frame))
+    every = all_shown(micro_store, frames)
     told_apart = 0
     for planned in kinds["candidates"][:16]:
         for epoch in range(4):
@@ -60,6 +67,28 @@ def test_each_candidate_is_told_under_its_letter(micro_store, frames, kinds) -> 
                 assert objects in every[image.tobytes()]
             told_apart += len({str(objects) for objects in told}) > 1
     assert told_apart > 24
+
+
+def test_an_object_is_where_it_is_said_to_be_in_each_candidate(micro_store, frames, kinds) -> None:
+    every = all_shown(micro_store, frames)
+    answers = set()
+    for planned in kinds["where"][:16]:
+        for epoch in range(4):
+            sample = planned.make(epoch)
+            asked = re.fullmatch(
+                r"\nWhere does each candidate show the (.+)\?", sample.content[-1]["text"]
+            )[1]
+            said = re.findall(
+                r"Candidate (\w) (lacks|shows) the (.+?)(?: (near [^.]+))?\.", sample.response
+            )
+            assert [(letter, phrase) for letter, _, phrase, _ in said] == [
+                (letter, asked) for letter in LETTERS
+            ]
+            for image, (_, verb, _, place) in zip(sample.images, said, strict=True):
+                assert (verb == "lacks") == (not place)
+                assert any(objects.get(asked, "") == place for objects in every[image.tobytes()])
+            answers.add(tuple(place for *_, place in said))
+    assert len(answers) > 16
 
 
 def test_one_candidate_alone_fits_a_description(micro_store, kinds) -> None:
