@@ -88,7 +88,9 @@ class Plan:
 
     def measured(self, regime: str, seed: int) -> list[str]:
         folder = self.checkpoints / "sft" / self.name(regime, seed)
-        student = [] if regime == "zero-shot" else [f"model={folder}"]
+        # A base would be asked for the record, which it never saw.
+        base = regime == "zero-shot"
+        student = ["modes=[reasoning,answer]"] if base else [f"model={folder}"]
         return ["evaluation.select", *student, "batch=64", *self._common(regime, seed)]
 
     def kept(self, regime: str, seed: int) -> Path:
