@@ -120,8 +120,9 @@ def make(plan: Plan, wanted: tuple[str, int], threads: int) -> None:
 def keep(plan: Plan, regime: str, answers: Path, path: Path) -> None:
     """Write what a student answered to every test item, in a column a mode."""
     cfg = compose("evaluation.select", SelectCommand, [f"benchmark={plan.benchmark}"])
-    rows = [json.loads(line) for line in answers.read_text().splitlines()[1:]]
-    letters = {(row["item_id"], row["mode"]): row["letter"] or UNREAD for row in rows}
+    rows = [json.loads(line) for line in answers.read_text().splitlines()]
+    told = [row for row in rows if "item_id" in row]
+    letters = {(row["item_id"], row["mode"]): row["letter"] or UNREAD for row in told}
     modes = MODES.get(regime, BOTH)
     lines = [",".join(["item_id", "family", "scene_id", "right", *modes])]
     for item in open_store(Path(plan.store) / cfg.benchmark.name).selection("test"):

@@ -19,6 +19,7 @@ from conf.errors import UserError
 from conf.schema import (
     ArchitectureConfig,
     ContrastiveCommand,
+    ContrastiveTrainConfig,
     LateConfig,
     LoraConfig,
     RetrieveCommand,
@@ -52,7 +53,8 @@ def save_run(cfg: RetrieverConfig, folder: Path, micro, micro_store) -> Path:
     for weight in built.parameters():
         weight.data += 0.01
     built.save_pretrained(str(folder / "retriever"), create_model_card=False)
-    settings = ContrastiveCommand(benchmark=micro, retriever=cfg)
+    train = ContrastiveTrainConfig(precision="bf16")
+    settings = ContrastiveCommand(benchmark=micro, retriever=cfg, train=train)
     OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
     (folder / "metrics.json").write_text("{}")
     return folder
