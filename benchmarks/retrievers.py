@@ -6,7 +6,8 @@ negatives, and by late interaction; each over three seeds, at every width.
 
 Trains and measures what is missing, each by the project's own commands and in runs of their own, so
 that it may be stopped and started again, and prints one table: means over the seeds, and between
-which values they lie.
+which values they lie. What each measured is kept in benchmarks/ranks/: a run that is kept there is
+not made again, and `--table` reads no more than them.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.jobs import run, run_all
+from conf.runs import write_text
 from evaluation.tables import RetrievalRow
 
 WAYS: dict[str, list[str]] = {
@@ -33,53 +36,89 @@ WAYS: dict[str, list[str]] = {
 MEASURES = ("recall@1", "recall@10", "recall@50", "mrr", "median_rank")
 
 
+KEPT = Path(__file__).parent / "ranks"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--benchmark", default="small")
     parser.add_argument("--store", default="store")
     parser.add_argument("--checkpoints", default="checkpoints")
+    parser.add_argument("--kept", type=Path, default=KEPT, help="where what was measured is kept")
     parser.add_argument("--jobs", type=int, default=1, help="runs at once, sharing the cores")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--table", action="store_true", help="of what is kept")
     args = parser.parse_args()
-    where = [
-        f"benchmark={args.benchmark}", f"store={args.store}", f"checkpoints={args.checkpoints}"
-    ]  # fmt: skip
-    run(["data.build", *where[:2]])
+    plan = Plan(args.benchmark, args.store, Path(args.checkpoints), args.kept)
     seeds = range(args.seeds)
-    # Seed by seed, so that a comparison of fewer is there early.
-    wanted = [(way, seed) for seed in seeds for way in WAYS]
-    run_all(partial(make, args.benchmark, where, Path(args.checkpoints)), wanted, args.jobs)
-    print_table(args.benchmark, Path(args.checkpoints), seeds)
+    if not args.table:
+        run(["data.build", *plan.where[:2]])
+        # Seed by seed, so that a comparison of fewer is there early.
+        wanted = [(way, seed) for seed in seeds for way in WAYS]
+        run_all(partial(make, plan), [w for w in wanted if not plan.file(*w).exists()], args.jobs)
+    print_table(plan, seeds)
 
 
-def make(
-    benchmark: str, where: list[str], checkpoints: Path, wanted: tuple[str, int], threads: int
-) -> None:
-    """Train and measure one retriever."""
+@dataclass(frozen=True)
+class Plan:
+    """What is compared, and where it lies."""
+
+    benchmark: str
+    store: str
+    checkpoints: Path
+    kept: Path
+
+    @property
+    def where(self) -> list[str]:
+        return [
+            f"benchmark={self.benchmark}",
+            f"store={self.store}",
+            f"checkpoints={self.checkpoints}",
+        ]
+
+    def name(self, way: str, seed: int) -> str:
+        return f"{self.benchmark}-{way}-{seed}"
+
+    def file(self, way: str, seed: int) -> Path:
+        return self.kept / f"{self.name(way, seed)}.json"
+
+
+def make(plan: Plan, wanted: tuple[str, int], threads: int) -> None:
+    """Train and measure one retriever, and keep what was measured over all builders."""
     way, seed = wanted
-    name = f"{benchmark}-{way}-{seed}"
-    run(["train.contrastive", *WAYS[way], f"seed={seed}", *where, f"run={name}"], threads)
-    if not (checkpoints / "retrieve" / name / "metrics.json").exists():
-        model = f"model={checkpoints / 'contrastive' / name}"
-        run(["evaluation.retrieve", model, *where, f"run={name}"], threads)
+    name = plan.name(way, seed)
+    run(["train.contrastive", *WAYS[way], f"seed={seed}", *plan.where, f"run={name}"], threads)
+    measured = plan.checkpoints / "retrieve" / name
+    if not (measured / "metrics.json").exists():
+        model = f"model={plan.checkpoints / 'contrastive' / name}"
+        run(["evaluation.retrieve", model, *plan.where, f"run={name}"], threads)
+    rows = json.loads((measured / "report.json").read_text())["rows"]
+    plan.kept.mkdir(parents=True, exist_ok=True)
+    lines = [json.dumps(row) for row in rows if row["builder"] is None]
+    write_text(plan.file(way, seed), "[\n" + ",\n".join(lines) + "\n]\n")
 
 
-def print_table(benchmark: str, checkpoints: Path, seeds: Sequence[int]) -> None:
+def print_table(plan: Plan, seeds: Sequence[int]) -> None:
     print("\n| negatives | width | " + " | ".join(MEASURES) + " |\n" + "|---" * 7 + "|")
     for way in ("untrained", *WAYS):
         # The preset untrained is measured beside each that is trained, and is the same for all.
         source, used = ("in-batch", seeds[:1]) if way == "untrained" else (way, seeds)
-        folders = [checkpoints / "retrieve" / f"{benchmark}-{source}-{seed}" for seed in used]
-        for same in zip(*(rows_of(f, way == "untrained") for f in folders), strict=True):
+        files = [plan.file(source, seed) for seed in used]
+        for same in zip(*(rows_of(f, way == "untrained") for f in files), strict=True):
             cells = [spread([row.measures[name].value for row in same], name) for name in MEASURES]
             print(f"| {way} | {same[0].width} | " + " | ".join(cells) + " |", flush=True)
 
 
-def rows_of(folder: Path, untrained: bool) -> list[RetrievalRow]:
-    """Over all builders, a row a width."""
-    rows = json.loads((folder / "report.json").read_text())["rows"]
-    found = [RetrievalRow.from_dict(row) for row in rows]
-    return [row for row in found if row.builder is None and row.untrained == untrained]
+def rows_of(path: Path, untrained: bool) -> list[RetrievalRow]:
+    """A row a width.
+
+    Raises:
+        SystemExit: the run has not been made.
+    """
+    if not path.exists():
+        raise SystemExit(f"error: {path} is not there: run without --table, or with fewer --seeds")
+    found = [RetrievalRow.from_dict(row) for row in json.loads(path.read_text())]
+    return [row for row in found if row.untrained == untrained]
 
 
 def spread(values: Sequence[float], name: str) -> str:
