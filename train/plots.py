@@ -33,8 +33,8 @@ def empty_figure(width: float, height: float) -> Figure:
 
 
 def curves_figure(records: Sequence[dict[str, float]], path: Path | str) -> None:
-    """Training and evaluation losses over steps; below them, where they were evaluated, the
-    measures of all items, and below these the letter accuracy by family.
+    """Training and evaluation losses over steps; then, where they were evaluated, the measures of
+    all items, each on axes of its own where they are many, and the letter accuracy by family.
 
     Args:
         records: lines of a run's journal, each with `step` and some of `loss`, `eval_loss`,
@@ -44,23 +44,40 @@ def curves_figure(records: Sequence[dict[str, float]], path: Path | str) -> None
     losses = [k for k in measured if k.endswith("_loss")]
     families = [k for k in measured if FAMILY.search(k)]
     others = [k for k in measured if k not in (*losses, *families)]
-    below = [("held out", others), ("letter accuracy", families)]
+    below = [*_by_measure(others).items(), ("letter accuracy by family", families)]
     panels = [("loss", losses), *((label, keys) for label, keys in below if keys)]
-    figure = empty_figure(8.5, 0.6 + 2.5 * len(panels))
-    drawn = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    columns = 1 if len(panels) <= 3 else 2
+    rows = -(-len(panels) // columns)
+    figure = empty_figure(8.5 * columns, 0.6 + 2.5 * rows)
+    drawn = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+    for axes in drawn[len(panels) :]:
+        axes.set_axis_off()
     _curve(drawn[0], records, "loss", color="#999999", linewidth=1.2, label="training")
-    for axes, (label, keys) in zip(drawn, panels, strict=True):
+    for axes, (label, keys) in zip(drawn, panels, strict=False):
         for key, style in _styles(keys).items():
             # The losses stand beside the one that is trained on.
-            name = f"held out {_name(key)}".strip() if label == "loss" else _name(key)
-            _curve(axes, records, key, **style, label=name)
+            name = f"held out {_name(key)}" if label == "loss" else _name(key).removesuffix(label)
+            _curve(axes, records, key, **style, label=name.strip() or label)
         axes.set_ylabel(label)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#eeeeee")
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
-    drawn[-1].set_xlabel("step")
+    for axes in drawn[len(panels) - columns : len(panels)]:
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel("step")
     figure.savefig(path)
+
+
+def _by_measure(keys: Sequence[str]) -> dict[str, list[str]]:
+    """The measures by their axes' label: all together while there is a colour for each; else those
+    that share their last two words, such as the place accuracy of several kinds of samples."""
+    if len(keys) <= len(COLORS):
+        return {"held out": list(keys)}
+    found: dict[str, list[str]] = {}
+    for key in keys:
+        found.setdefault(" ".join(_name(key).split()[-2:]), []).append(key)
+    return found
 
 
 def _styles(keys: Sequence[str]) -> dict[str, dict[str, object]]:
