@@ -3,8 +3,9 @@ write before it is ever asked to choose.
 
 A frame is described by its objects and their places, alone and among four candidates, one after the
 other; an object is looked for in each of four candidates; a clip is told by the built-in narrator,
-with the frame that comes of it shown or not; of several frames the one is named that is the later,
-or that fits a description. None of it is the selection task itself.
+with the frame that comes of it shown or not; a clip is told and then an object looked for in its
+item's candidates; of several frames the one is named that is the later, or that fits a description.
+None of it is the selection task itself.
 """
 
 from __future__ import annotations
@@ -28,16 +29,18 @@ FRAME = "Describe the frame."
 CANDIDATES = "Describe each candidate."
 WHERE = "Where does each candidate show the {}?"
 CLIP = "Describe the scene, how its objects move, and what will come of it."
+COMPARED = f"{CLIP} {WHERE}"
 LATER = 'Which candidate comes later? End with a line "Answer:" and the letter.'
 MATCH = (
     "Which candidate shows {}? Say of each candidate, in a line of its own, whether it matches and "
     'why. End with a line "Answer:" and the letter.'
 )
-ASKED = (FRAME, CANDIDATES, WHERE, CLIP, LATER, MATCH)
+ASKED = (FRAME, CANDIDATES, WHERE, CLIP, COMPARED, LATER, MATCH)
 FRAMES = 2
 """Frames described for each item in an epoch."""
-SETS = 4
-"""Sets of candidates described for each item in an epoch."""
+SETS = 3
+"""Sets of candidates for each item in an epoch, each of those described, looked through, and looked
+through after a clip."""
 MOVED = 0.08
 """Share of the view's width by which an object has moved in the later of two frames, at least."""
 CLEAR = 0.3
@@ -59,6 +62,7 @@ def kinds(
         "candidates": [make.candidates(item, items, k) for item in items for k in range(SETS)],
         "where": [make.where(item, items, k) for item in items for k in range(SETS)],
         "clip": [clip for item in items for clip in make.clip(item)],
+        "compared": [one for item in items for k in range(SETS) for one in make.compared(item, k)],
         "later": [later for item in items for later in make.later(item)],
         "match": [match for item in items for match in make.matched(item)],
     }
@@ -116,8 +120,7 @@ class _Maker:
         """An object that one of four frames shows, looked for in all: so does a rationale compare
         candidates."""
         phrase = self.store.scene(item.scene_id).objects[0].phrase
-        lines = [f"Candidate {letter} shows the {phrase} {REGIONS[0][0]}." for letter in LETTERS]
-        text = f"{WHERE.format(phrase)} {' '.join(lines)}"
+        text = f"{WHERE.format(phrase)} {self._everywhere(phrase)}"
         return Planned(text, len(LETTERS), partial(self._where, item, others, k))
 
     def _where(
@@ -125,19 +128,33 @@ class _Maker:
     ) -> Sample:
         rng = rng_of(self.seed, epoch, item.item_id, "where", k)
         shown = self._four(item, others, rng)
+        phrase, told = self._sought(item, shown, rng)
+        return self._of_four(f"{item.item_id} (where {k})", shown, WHERE.format(phrase), [told])
+
+    def _sought(
+        self, item: SelectionItem, shown: list[Picture], rng: np.random.Generator
+    ) -> tuple[str, str]:
+        """An object that some of the candidates show, one whose place tells them apart where there
+        is such, and where each of them has it."""
         seen = [seen_in(self.store.scene(scene_id), frame) for scene_id, frame, _ in shown]
         there = sorted({phrase for objects in seen for phrase in objects})
         if not there:
             there = [o.phrase for o in self.store.scene(item.scene_id).objects]
-        phrase = there[rng.integers(len(there))]
+        apart = [p for p in there if len({objects.get(p) for objects in seen}) > 1] or there
+        phrase = apart[rng.integers(len(apart))]
         told = [
             f"Candidate {letter} shows the {phrase} {objects[phrase]}."
             if phrase in objects
             else f"Candidate {letter} lacks the {phrase}."
             for (*_, letter), objects in zip(shown, seen, strict=True)
         ]
-        name = f"{item.item_id} (where {k})"
-        return self._of_four(name, shown, WHERE.format(phrase), [" ".join(told)])
+        return phrase, " ".join(told)
+
+    @staticmethod
+    def _everywhere(phrase: str) -> str:
+        """As long as what is told of an object that is looked for."""
+        lines = [f"Candidate {letter} shows the {phrase} {REGIONS[0][0]}." for letter in LETTERS]
+        return " ".join(lines)
 
     def _four(
         self, item: SelectionItem, others: list[SelectionItem], rng: np.random.Generator
@@ -150,11 +167,13 @@ class _Maker:
         return lettered([self._any(one, rng) for one in drawn])
 
     def _of_four(self, name: str, shown: list[Picture], asked: str, told: list[str]) -> Sample:
-        parts: list[str | np.ndarray] = []
-        for scene_id, frame, letter in shown:
-            parts += [f"\nCandidate {letter}: ", self.frames.array(scene_id, frame)]
-        parts.append(f"\n{asked}")
+        parts = [*self._labelled(shown), f"\n{asked}"]
         return conversation(name, parts, "\n".join(told), None, self._sights(shown))
+
+    def _labelled(self, shown: list[Picture]) -> Iterator[str | np.ndarray]:
+        for scene_id, frame, letter in shown:
+            yield f"\nCandidate {letter}: "
+            yield self.frames.array(scene_id, frame)
 
     def _any(self, item: SelectionItem, rng: np.random.Generator) -> tuple[str, int]:
         """Any of the frames that an item shows."""
@@ -164,12 +183,14 @@ class _Maker:
 
     def clip(self, item: SelectionItem) -> Iterator[Planned]:
         """The clip with the frame that comes of it, to be read off, or without, to be foreseen."""
-        scene = self.store.scene(item.scene_id)
-        start, stop, target = item.prefix_start, item.prefix_stop, item.target_frame
-        text = describe(scene, start, stop, target, self.seed)
-        if text is not None:
+        if (text := self._told(item)) is not None:
             media = self.cfg.frames // 2 + 1
             yield Planned(f"{CLIP} {text}", media, partial(self._clip, item, text))
+
+    def _told(self, item: SelectionItem) -> str | None:
+        """The clip and what comes of it in the narrator's words, None where it is too short."""
+        scene = self.store.scene(item.scene_id)
+        return describe(scene, item.prefix_start, item.prefix_stop, item.target_frame, self.seed)
 
     def _clip(self, item: SelectionItem, text: str, epoch: int) -> Sample:
         shown = rng_of(self.seed, epoch, item.item_id, "clip").random() < 0.5
@@ -177,6 +198,23 @@ class _Maker:
         later = ["Later: ", pixels, "\n"] if shown else []
         images = [(item.scene_id, item.target_frame, "")] if shown else []
         return self._after_prefix(item, [*later, CLIP], text, images)
+
+    def compared(self, item: SelectionItem, k: int) -> Iterator[Planned]:
+        """The clip, and where its item's candidates show an object. As in a rationale, what is
+        foreseen stands before what is to be seen, and must not be taken for it."""
+        if (text := self._told(item)) is not None:
+            phrase = self.store.scene(item.scene_id).objects[0].phrase
+            long = f"{COMPARED.format(phrase)} {text} {self._everywhere(phrase)}"
+            media = self.cfg.frames // 2 + len(LETTERS)
+            yield Planned(long, media, partial(self._compared, item, text, k))
+
+    def _compared(self, item: SelectionItem, text: str, k: int, epoch: int) -> Sample:
+        rng = rng_of(self.seed, epoch, item.item_id, "compared", k)
+        own = [(c.scene_id, c.frame) for c in item.candidates]
+        shown = lettered([own[place] for place in rng.permutation(len(own))])
+        phrase, told = self._sought(item, shown, rng)
+        parts = [*self._labelled(shown), f"\n{COMPARED.format(phrase)}"]
+        return self._after_prefix(item, parts, f"{text}\n{told}", shown)
 
     def later(self, item: SelectionItem) -> Iterator[Planned]:
         """Two frames that can be told apart, where something still moves after the prefix."""
@@ -189,13 +227,10 @@ class _Maker:
         rng = rng_of(self.seed, epoch, item.item_id, "later")
         first, second = item.prefix_stop, after[rng.integers(len(after))]
         order = rng.permutation(2)
-        parts: list[str | np.ndarray] = []
-        images = [(first, second)[k] for k in order]
-        for letter, frame in zip(LETTERS, images, strict=False):
-            parts += [f"\nCandidate {letter}: ", self.frames.array(item.scene_id, frame)]
         right = LETTERS[order.tolist().index(1)]
-        shown = lettered([(item.scene_id, frame) for frame in images])
-        return self._after_prefix(item, [*parts, f"\n{LATER}"], answer_line(right), shown)
+        shown = lettered([(item.scene_id, (first, second)[k]) for k in order])
+        parts = [*self._labelled(shown), f"\n{LATER}"]
+        return self._after_prefix(item, parts, answer_line(right), shown)
 
     def matched(self, item: SelectionItem) -> Iterator[Planned]:
         """A description that one candidate alone fits, where there is such."""
@@ -213,12 +248,8 @@ class _Maker:
         yield Planned(f"{asked} {answer}", len(LETTERS), make)
 
     def _match(self, item: SelectionItem, asked: str, answer: str, epoch: int) -> Sample:
-        parts: list[str | np.ndarray] = []
-        for letter, c in zip(LETTERS, item.candidates, strict=True):
-            parts += [f"\nCandidate {letter}: ", self.frames.array(c.scene_id, c.frame)]
-        sights = self._sights(lettered([(c.scene_id, c.frame) for c in item.candidates]))
-        parts.append(f"\n{asked}")
-        return conversation(f"{item.item_id} (match)", parts, answer, None, sights)
+        shown = lettered([(c.scene_id, c.frame) for c in item.candidates])
+        return self._of_four(f"{item.item_id} (match)", shown, asked, [answer])
 
     def _after_prefix(
         self, item: SelectionItem, parts: list[str | np.ndarray], told: str, images: list[Picture]

@@ -69,15 +69,20 @@ def test_each_candidate_is_told_under_its_letter(micro_store, frames, kinds) -> 
     assert told_apart > 24
 
 
-def test_an_object_is_where_it_is_said_to_be_in_each_candidate(micro_store, frames, kinds) -> None:
+@pytest.mark.parametrize("kind", ["where", "compared"])
+def test_an_object_is_where_it_is_said_to_be_in_each_candidate(
+    micro_store, frames, kinds, kind
+) -> None:
     every = all_shown(micro_store, frames)
     answers = set()
-    for planned in kinds["where"][:16]:
+    for planned in kinds[kind][:16]:
         for epoch in range(4):
             sample = planned.make(epoch)
-            asked = re.fullmatch(
-                r"\nWhere does each candidate show the (.+)\?", sample.content[-1]["text"]
+            asked = re.search(
+                r"Where does each candidate show the (.+)\?$", sample.content[-1]["text"]
             )[1]
+            assert (sample.clip is not None) == ("Scene parse: " in sample.response)
+            assert (sample.clip is not None) == (kind == "compared")
             said = re.findall(
                 r"Candidate (\w) (lacks|shows) the (.+?)(?: (near [^.]+))?\.", sample.response
             )
