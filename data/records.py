@@ -143,6 +143,11 @@ class FrameRef:
     scene_id: str
     frame: int
 
+    @property
+    def name(self) -> str:
+        """What logs and caches know it by."""
+        return f"{self.scene_id}/{self.frame}"
+
 
 @dataclass(frozen=True)
 class Candidate(FrameRef):
@@ -203,6 +208,11 @@ class SelectionItem:
     def letter(self) -> str:
         return LETTERS[self.answer]
 
+    @property
+    def name(self) -> str:
+        """What logs and caches know it by."""
+        return self.item_id
+
     def to_row(self) -> dict[str, Any]:
         return asdict(self)
 
@@ -230,6 +240,11 @@ class RetrievalQuery:
     removed_object: str | None = None
     standard: bool = False
     """Whether it belongs to the standard test."""
+
+    @property
+    def name(self) -> str:
+        """What logs and caches know it by."""
+        return self.query_id
 
     def to_row(self) -> dict[str, Any]:
         return asdict(self)

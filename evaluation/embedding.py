@@ -17,7 +17,7 @@ import numpy as np
 
 from conf.schema import RetrieverConfig
 from data.frames import Frames
-from data.records import FrameRef, SelectionItem
+from data.records import FrameRef
 from data.store import Store
 from evaluation.cache import Embeddings
 from evaluation.tables import UNTRAINED
@@ -138,18 +138,10 @@ def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Em
     return Embedder(name, preset, precision, weights, processor_digest(preset.model), load)
 
 
-def frame_name(frame: FrameRef) -> str:
-    return f"{frame.scene_id}/{frame.frame}"
-
-
-def query_name(query: Query) -> str:
-    return query.item_id if isinstance(query, SelectionItem) else query.query_id
-
-
 def embed_queries(
     embedder: Embedder, queries: Sequence[Query], store: Store, frames: Frames, batch: int
 ) -> Embeddings:
-    """The embeddings of prefixes with their questions, by `query_name`; pixels are read a batch at
+    """The embeddings of prefixes with their questions, by name; pixels are read a batch at
     a time.
 
     Raises:
@@ -158,8 +150,8 @@ def embed_queries(
     preset = embedder.preset
     about = {"instruction": preset.query_instruction, "frames": preset.frames}
     # Scene by scene, so that a scene's frames are decoded once.
-    ordered = sorted(queries, key=lambda q: (q.scene_id, query_name(q)))
-    things = {query_name(q): q for q in ordered}
+    ordered = sorted(queries, key=lambda q: (q.scene_id, q.name))
+    things = {q.name: q for q in ordered}
     return _embedded(
         embedder, "query", about, things, lambda e, some: e.queries(some, frames), store, batch
     )
@@ -168,10 +160,10 @@ def embed_queries(
 def embed_frames(
     embedder: Embedder, database: Iterable[FrameRef], store: Store, frames: Frames, batch: int
 ) -> Embeddings:
-    """The embeddings of frames, by `frame_name`. Errors are those of `embed_queries`."""
+    """The embeddings of frames, by name. Errors are those of `embed_queries`."""
     about = {"instruction": embedder.preset.frame_instruction}
     ordered = sorted(database, key=lambda f: (f.scene_id, f.frame))
-    things = {frame_name(f): f for f in ordered}
+    things = {f.name: f for f in ordered}
     return _embedded(
         embedder, "frame", about, things, lambda e, some: e.frames(some, frames), store, batch
     )

@@ -9,7 +9,6 @@ import numpy as np
 from conf.schema import RetrieverConfig
 from data.records import SelectionItem
 from evaluation.cache import Embeddings
-from evaluation.embedding import frame_name, query_name
 from evaluation.metrics import expected_hits, ranks_of
 from evaluation.ranking import Cut, pair_scores
 
@@ -19,11 +18,11 @@ def candidate_scores(
 ) -> np.ndarray:
     """(items, candidates) fp32 scores at the widest width, the ones that retrieval ranks by: equal
     embeddings tie to the last bit."""
-    queries = asked.rows([query_name(item) for item in items])
+    queries = asked.rows([item.name for item in items])
     per_item = len(items[0].candidates)
     columns = []
     for k in range(per_item):
-        frames = shown.rows([frame_name(item.candidates[k]) for item in items])
+        frames = shown.rows([item.candidates[k].name for item in items])
         if preset.late is not None:
             from evaluation import late
 

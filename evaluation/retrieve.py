@@ -44,8 +44,8 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     check_test(store, queries, database)
     frames = Frames(store, preset.image_size)
     ids = [q.query_id for q in queries]
-    names = [embedding.frame_name(f) for f in database]
-    targets = [embedding.frame_name(q.target) for q in queries]
+    names = [f.name for f in database]
+    targets = [q.target.name for q in queries]
     rows, curves, indexes = [], [], []
     precision = settled(trained.train.precision)
     for embedder in embedding.embedders(folder, preset, precision, store, run.folder):

@@ -28,7 +28,7 @@ from conf.schema import (
 from data.frames import Frames
 from data.store import open_store
 from evaluation import retrieve
-from evaluation.embedding import EMBEDDINGS, embed_frames, embed_queries, embedders, frame_name
+from evaluation.embedding import EMBEDDINGS, embed_frames, embed_queries, embedders
 from evaluation.metrics import rank_metrics
 from train import retriever
 
@@ -94,7 +94,7 @@ def edit_config(folder: Path, **changes: object) -> None:
 def test_it_is_measured_once_and_read_back(world, tmp_path, micro_store) -> None:
     first = world()
     queries, database = micro_store.standard_test(), micro_store.database()
-    frames, names = Frames(micro_store, 96), [frame_name(f) for f in database]
+    frames, names = Frames(micro_store, 96), [f.name for f in database]
     (trained, _) = embedders(tmp_path / "run", CFG, "bf16", micro_store, tmp_path)
     store = open_store(tmp_path / "store" / "micro")
     asked = embed_queries(trained, queries, store, frames, 16).rows([q.query_id for q in queries])
@@ -221,7 +221,7 @@ def test_a_kept_embedding_depends_on_what_is_shown(micro_store, saved, tmp_path)
     for preset in [replace(CFG, **change) for change in changes]:
         again = replace(embedder, preset=preset)
         kept = embed_frames(again, database, store, Frames(store, preset.image_size), 2)
-        assert kept.rows([frame_name(f) for f in database]).shape == (2, 64)
+        assert kept.rows([f.name for f in database]).shape == (2, 64)
         folders.add(kept.folder)
     folders.add(embed_frames(untrained, database, store, Frames(store, 96), 2).folder)
     bf16 = replace(embedder, precision="bf16")
