@@ -67,13 +67,19 @@ class Place:
 class Client:
     """Asks `cfg.model` at `cfg.urls`, each time at the least busy server that is up.
 
-    `request` goes with every chat. `canary` is what any server can answer that serves such chats.
-    Use it inside one event loop, as a context.
+    `request` goes with every chat. `canary` is what any server can answer that serves such chats,
+    `kind` what they are asked as. Use it inside one event loop, as a context.
     """
 
-    def __init__(self, cfg: ServersConfig, request: Request, canary: Chat = CANARY) -> None:
+    def __init__(
+        self,
+        cfg: ServersConfig,
+        request: Request,
+        canary: Chat = CANARY,
+        kind: type[Server] = Server,
+    ) -> None:
         self.cfg, self.request, self.canary = cfg, request, canary
-        self.places = [Place(Server(url, cfg)) for url in dict.fromkeys(cfg.urls)]
+        self.places = [Place(kind(url, cfg)) for url in dict.fromkeys(cfg.urls)]
         self.stuck_since: float | None = None
         """When no server could be asked, with no answer since."""
 

@@ -67,10 +67,7 @@ class Server:
         try:
             # The client's own timeout starts again with every byte that comes.
             async with asyncio.timeout(cfg.timeout):
-                completion = await self.client.chat.completions.create(
-                    model=cfg.model, messages=chat, n=n, **request
-                )
-            return replies(completion, n)
+                return await self._replies(chat, n, request)
         except openai.NotFoundError as error:
             raise await self._unknown_model() from error
         except openai.RateLimitError as error:
@@ -89,6 +86,13 @@ class Server:
             raise RequestError(str(error.__cause__ or error)) from error
         except (openai.APIResponseValidationError, *NO_REPLY) as error:
             raise MalformedReplyError(f"{type(error).__name__}: {error}") from error
+
+    async def _replies(self, chat: Chat, n: int, request: Request) -> list[Reply]:
+        """Errors are the client's own, and those of `NO_REPLY`."""
+        completion = await self.client.chat.completions.create(
+            model=self.cfg.model, messages=chat, n=n, **request
+        )
+        return replies(completion, n)
 
     async def health(self) -> str | None:
         """What is wrong with the server, None if it is up."""
