@@ -161,10 +161,11 @@ class Frames:
         missing = [f for f in frames if f not in found]
         found |= self._cache.draw(scene_id, missing)
         pixels = np.stack([found[f] for f in frames])
-        return pixels if self._size is None else _resized(pixels, self._size)
+        return pixels if self._size is None else resized(pixels, self._size)
 
 
-def _resized(pixels: np.ndarray, size: int) -> np.ndarray:
+def resized(pixels: np.ndarray, size: int) -> np.ndarray:
+    """(T, size, size, 3) uint8 of (T, height, width, 3), as models are shown frames."""
     import torch
     from torchvision.transforms.v2 import InterpolationMode
     from torchvision.transforms.v2.functional import resize

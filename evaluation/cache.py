@@ -33,7 +33,7 @@ from data.store import digest, write_atomically
 log = logging.getLogger(__name__)
 
 ABOUT, NOTES = "about.json", "[0-9]*.json"
-KINDS = {"frame": "frames", "query": "queries"}
+KINDS = {"frame": "frames", "query": "queries", "text": "texts", "image": "images"}
 PART, SECONDS = 512, 30
 """A file is written after so many embeddings, or so long: a kill costs no more. It is read at once,
 and ends with a batch, so that what goes on after a kill passes the model in the same batches."""
@@ -48,7 +48,7 @@ class Part:
 
 
 class Embeddings:
-    """One model's embeddings of one kind of thing (frame, query), by name."""
+    """One model's embeddings of one kind of thing, by name."""
 
     def __init__(self, root: Path, kind: str, about: Mapping[str, Any]) -> None:
         """`kind` is one of `KINDS`; `about` is everything that the embeddings depend on, as JSON

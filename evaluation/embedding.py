@@ -1,4 +1,5 @@
-"""Embed the queries, items and frames of a benchmark with a retriever, once.
+"""Embed the queries, items and frames of a benchmark with a retriever, once, and what was written
+or drawn of them.
 
 What loads a model is imported only where something has to be embedded: importing it takes longer
 than ranking.
@@ -14,9 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from PIL import Image
 
 from conf.schema import RetrieverConfig
-from data.frames import Frames
+from data.frames import Frames, resized
 from data.records import FrameRef
 from data.store import Store
 from evaluation.cache import Embeddings
@@ -167,6 +169,34 @@ def embed_frames(
     return _embedded(
         embedder, "frame", about, things, lambda e, some: e.frames(some, frames), store, batch
     )
+
+
+def embed_texts(embedder: Embedder, texts: Iterable[str], store: Store, batch: int) -> Embeddings:
+    """The embeddings of texts that stand for a query by themselves, by the text. Errors are those
+    of `embed_queries`."""
+    about = {"instruction": embedder.preset.query_instruction}
+    things = {text: text for text in sorted(set(texts))}
+    return _embedded(embedder, "text", about, things, lambda e, some: e.texts(some), store, batch)
+
+
+def embed_images(
+    embedder: Embedder, images: Mapping[str, Path], store: Store, batch: int
+) -> Embeddings:
+    """The embeddings of images in files, by their names, made as those of frames are. Errors are
+    those of `embed_queries`."""
+    about = {"instruction": embedder.preset.frame_instruction}
+    size = embedder.preset.image_size
+
+    def encode(encoder: Encoder, some: list[Path]) -> np.ndarray:
+        return encoder.images([image_pixels(path, size) for path in some])
+
+    return _embedded(embedder, "image", about, dict(images), encode, store, batch)
+
+
+def image_pixels(path: Path, size: int) -> np.ndarray:
+    """(size, size, 3) uint8 of an image in a file, as a frame is shown."""
+    with Image.open(path) as image:
+        return resized(np.asarray(image.convert("RGB"))[None], size)[0]
 
 
 def _embedded(

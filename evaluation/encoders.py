@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from PIL import Image
 
 from conf.schema import RetrieverConfig
 from data.frames import Frames
@@ -30,6 +31,9 @@ class Encoder(Protocol):
 
     def frames(self, shown: list[FrameRef], frames: Frames) -> np.ndarray: ...
 
+    def images(self, shown: list[np.ndarray]) -> np.ndarray:
+        """Of (S, S, 3) uint8 pixels at the preset's size, as of frames."""
+
     def texts(self, texts: list[str]) -> np.ndarray:
         """Of texts that stand for a query by themselves."""
 
@@ -46,11 +50,16 @@ class JointEncoder:
         return self._embedded(shown, self._preset.query_instruction, "query")
 
     def frames(self, shown: list[FrameRef], frames: Frames) -> np.ndarray:
-        images = [frame_input(frame, frames) for frame in shown]
-        return self._embedded(images, self._preset.frame_instruction, "frame")
+        return self._pictures([frame_input(frame, frames) for frame in shown])
+
+    def images(self, shown: list[np.ndarray]) -> np.ndarray:
+        return self._pictures([Image.fromarray(pixels) for pixels in shown])
 
     def texts(self, texts: list[str]) -> np.ndarray:
         return self._embedded(texts, self._preset.query_instruction, "query")
+
+    def _pictures(self, shown: list[Image.Image]) -> np.ndarray:
+        return self._embedded(shown, self._preset.frame_instruction, "frame")
 
     def _embedded(self, inputs: list[Any], prompt: str, kind: str) -> np.ndarray:
         if self._preset.late is not None:
