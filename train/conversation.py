@@ -4,6 +4,9 @@ The prompt is the prefix as a video with its true times, the question, the four 
 labelled images, and what to write. In reasoning mode the response is the rationale as the regime
 has it, whether each candidate matches it (the match layout, where the regime has that), and the
 answer's line; in answer mode it is that line alone.
+
+What has no candidates is asked for a text alone: what a query's future frame will show, reasoned
+out or described at once, or what a frame shows.
 """
 
 from __future__ import annotations
@@ -17,10 +20,19 @@ import numpy as np
 from conf.schema import StudentConfig
 from data.controls import observed
 from data.frames import Frames
-from data.records import FPS, FRAMES, LETTERS, SelectionItem
+from data.records import FPS, FRAMES, LETTERS, FrameRef, RetrievalQuery, SelectionItem, shown_frames
 from teacher.sections import without
 
 MODES = ("reasoning", "answer")
+TOLD = {
+    "rationale": "Reason about the scene step by step: scene parse, motion analysis, prediction "
+    "and outcome.",
+    "prediction": "Describe in a sentence or two the frame that answers this: the objects that it "
+    "shows, and where each of them is.",
+    "caption": "Describe in a sentence or two the objects that the frame shows, and where each of "
+    "them is.",
+}
+"""What a model is asked for, of a query or of a frame, where it has no candidates."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +98,8 @@ def answer_line(letter: str) -> str:
 
 def instruction(mode: str, regime: str) -> str:
     """What a student is told to write."""
+    if mode in TOLD:
+        return TOLD[mode]
     if mode == "answer":
         return 'Reply with one line, "Answer:" and the letter.'
     steps = ["scene parse", "motion analysis", "prediction"]
@@ -146,14 +160,30 @@ def asked_sample(
 ) -> Sample:
     """A selection item with what is `asked` about it, as `selection_sample` shows it."""
     shown = observed(item, cfg.frames, control)
-    scene = frames.scene(item.scene_id)
     parts: list[str | np.ndarray] = [item.question]
     for letter, c in zip(LETTERS, item.candidates, strict=True):
         parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
-    clip = None
-    if shown:
-        clip = Clip(frames.stack(item.scene_id, shown), sorted(shown), scene.fps, scene.frames)
+    clip = clip_of(item.scene_id, shown, frames) if shown else None
     return conversation(f"{item.item_id} ({mode})", [*parts, f"\n{asked}"], response, clip)
+
+
+def told_sample(
+    frames: Frames, cfg: StudentConfig, mode: str, thing: RetrievalQuery | FrameRef
+) -> Sample:
+    """A query's prefix and question, or a frame, with what is asked of it in a mode of `TOLD`."""
+    name, asked = f"{thing.name} ({mode})", f"\n{TOLD[mode]}"
+    if isinstance(thing, FrameRef):
+        pixels = frames.array(thing.scene_id, thing.frame)
+        return conversation(name, [pixels, asked], None)
+    shown = shown_frames(thing.prefix_start, thing.prefix_stop, cfg.frames)
+    clip = clip_of(thing.scene_id, shown, frames)
+    return conversation(name, [thing.question, asked], None, clip)
+
+
+def clip_of(scene_id: str, shown: list[int], frames: Frames) -> Clip:
+    """Frames of a scene as a clip, whose times run on in whatever order they are `shown`."""
+    scene = frames.scene(scene_id)
+    return Clip(frames.stack(scene_id, shown), sorted(shown), scene.fps, scene.frames)
 
 
 def conversation(

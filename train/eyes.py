@@ -22,7 +22,7 @@ from data.records import LETTERS, Scene, SelectionItem, shown_frames
 from data.store import Store
 from teacher.predicates import REGIONS, Predicates, predicates_of, region_of
 from teacher.template import describe, matches
-from train.conversation import Clip, Sample, Sight, answer_line, conversation
+from train.conversation import Sample, Sight, answer_line, clip_of, conversation
 from train.planned import Planned, rng_of
 
 FRAME = "Describe the frame."
@@ -254,8 +254,8 @@ class _Maker:
     def _after_prefix(
         self, item: SelectionItem, parts: list[str | np.ndarray], told: str, images: list[Picture]
     ) -> Sample:
-        scene, shown = self.store.scene(item.scene_id), self._prefix(item)
-        clip = Clip(self.frames.stack(item.scene_id, shown), shown, scene.fps, scene.frames)
+        shown = self._prefix(item)
+        clip = clip_of(item.scene_id, shown, self.frames)
         # A visual token of a clip shows two frames; its object is where the first has it.
         sights = self._sights([*((item.scene_id, f, "") for f in shown[::2]), *images])
         return conversation(f"{item.item_id} (clip and frames)", parts, told, clip, sights)
