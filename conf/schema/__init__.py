@@ -35,10 +35,11 @@ from conf.schema.models import (
     RetrieverConfig,
     StudentConfig,
 )
-from conf.schema.servers import ServerConfig, ServersConfig
+from conf.schema.servers import ImageServerConfig, ServerConfig, ServersConfig
 from conf.schema.study import ExportStudyCommand, StudyCommand
 from conf.schema.teacher import TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainConfig
+from conf.schema.two_stage import MatcherConfig, TwoStageCommand
 
 __all__ = [
     "ENGINES",
@@ -52,8 +53,10 @@ __all__ = [
     "ExportModelCommand",
     "ExportStudyCommand",
     "GalleryCommand",
+    "ImageServerConfig",
     "LateConfig",
     "LoraConfig",
+    "MatcherConfig",
     "NarrateCommand",
     "Quota",
     "ReportCommand",
@@ -73,4 +76,5 @@ __all__ = [
     "StudyCommand",
     "TeacherConfig",
     "TrainConfig",
+    "TwoStageCommand",
 ]

@@ -288,8 +288,6 @@ class SelectCommand(CommandConfig):
                 "modes: constrained needs a server, which holds a model to the record's JSON "
                 "schema; give server.url=http://HOST:PORT/v1"
             )
-        if self.server.model is not None and self.server.url is None:
-            problems.append(f"server.model={self.server.model} needs server.url=...")
         return problems
 
 

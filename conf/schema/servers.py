@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -59,3 +60,31 @@ class ServerConfig(ServersConfig):
     """Requests in flight, over all servers; each holds an item's frames."""
     timeout: float = 600.0
     """Seconds that one request may take; thinking takes minutes."""
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        if self.model is not None and self.url is None:
+            problems.append(f"server.model={self.model} needs server.url=...")
+        return problems
+
+
+@dataclass
+class ImageServerConfig(ServersConfig):
+    """Servers that draw images of texts (/v1/images/generations, as vLLM-Omni has it)."""
+
+    GROUP: ClassVar[str] = "images"
+
+    concurrency: int = 4
+    """Images in the making, over all servers."""
+    timeout: float = 600.0
+    """Seconds that one image may take."""
+    size: str = "480x320"
+    """Width and height in px of an image; it is then shown to the matcher as frames are."""
+    seed: int = 0
+    """Of every image: the same text gives the same one."""
+
+    def check(self) -> list[str]:
+        problems = super().check() + too_small(self, "images.", {"seed": 0})
+        if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", self.size):
+            problems.append(f"images.size={self.size} is no size in px, such as 480x320")
+        return problems

@@ -23,6 +23,7 @@ SCHEMAS = {
     "evaluation.select": schema.SelectCommand,
     "evaluation.retrieve": schema.RetrieveCommand,
     "evaluation.similarity": schema.SimilarityCommand,
+    "evaluation.two_stage": schema.TwoStageCommand,
     "evaluation.report": schema.ReportCommand,
     "evaluation.study": schema.StudyCommand,
     "evaluation.study.export": schema.ExportStudyCommand,
