@@ -13,14 +13,16 @@ from typing import Any
 from tqdm import tqdm
 
 from conf.runs import write_text
-from data.records import SelectionItem
+from data.records import FrameRef, RetrievalQuery, SelectionItem
 from evaluation.protocol import Record, parse, read_record
 from train.generate import Written
 
-Keep = Callable[[list[tuple[SelectionItem, Written]]], None]
-"""Takes what was said to some items as soon as it is there."""
-Say = Callable[[list[SelectionItem], Keep], None]
-"""Has a model answer items and keeps what it says."""
+Thing = SelectionItem | RetrievalQuery | FrameRef
+"""What a model is asked about."""
+Keep = Callable[[list[tuple[Thing, Written]]], None]
+"""Takes what was said to some things as soon as it is there."""
+Say = Callable[[list[Thing], Keep], None]
+"""Has a model answer and keeps what it says."""
 
 RECORDS = ("record", "constrained")
 """Modes in which the structured record is asked for."""
@@ -47,70 +49,17 @@ class Answer:
         return read_record(self.text) if self.valid else None
 
 
-class AnswerLog:
-    """The answers in a file, one JSON line each, by what they are answers to.
+@dataclass(frozen=True)
+class Told:
+    """What a model said where no letter is asked for, about the query or frame of that name."""
 
-    `asked` says it of each mode, in plain values: the model's revision, the items, the prompt, how
-    tokens are drawn, the seed. A line of its own tells it once, under a key that the answers bear.
-    Answers under other keys stay in the file and are no answers to these. Only what was said is
-    taken from a line; what it says and whether that is right is judged again.
-    """
-
-    def __init__(
-        self, path: Path, asked: dict[str, dict[str, Any]], items: Sequence[SelectionItem]
-    ) -> None:
-        self._path = path
-        self._keys = {mode: _key(mode, what) for mode, what in asked.items()}
-        self.answers: dict[tuple[str, str], Answer] = {}
-        item_of = {item.item_id: item for item in items}
-        lines = path.read_bytes().splitlines() if path.exists() else []
-        whole, told = [], set()
-        for line in lines:
-            try:
-                row = json.loads(line)
-                if "asked" in row:
-                    told.add(row["key"])
-                elif (item := item_of.get(row["item_id"])) and self._bears_key(row):
-                    answer = judge(item, row["mode"], Written(row["text"], row["cut"]))
-                    self.answers[answer.item_id, answer.mode] = answer
-            except (ValueError, TypeError, KeyError, AttributeError):
-                # Torn by a kill: that item is asked again.
-                continue
-            whole.append(line.decode())
-        whole += [
-            json.dumps({"key": key, "mode": mode, "asked": asked[mode]})
-            for mode, key in self._keys.items()
-            if key not in told
-        ]
-        write_text(path, "".join(f"{line}\n" for line in whole))
-
-    def _bears_key(self, row: dict[str, Any]) -> bool:
-        return row["mode"] in self._keys and row["key"] == self._keys[row["mode"]]
-
-    def append(self, answers: list[Answer]) -> None:
-        with open(self._path, "a") as file:
-            file.writelines(
-                json.dumps({**asdict(a), "key": self._keys[a.mode]}) + "\n" for a in answers
-            )
-        self.answers |= {(a.item_id, a.mode): a for a in answers}
+    item_id: str
+    mode: str
+    text: str
+    cut: bool
 
 
-def _key(mode: str, asked: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps([mode, asked], sort_keys=True).encode()).hexdigest()[:16]
-
-
-def ask_all(items: list[SelectionItem], mode: str, say: Say, log: AnswerLog) -> list[Answer]:
-    """Every item's answer in `mode`; items that the log holds are not asked."""
-    waiting = [i for i in items if (i.item_id, mode) not in log.answers]
-    with tqdm(total=len(items), initial=len(items) - len(waiting), desc=mode, unit="item") as bar:
-
-        def keep(said: list[tuple[SelectionItem, Written]]) -> None:
-            log.append([judge(item, mode, written) for item, written in said])
-            bar.update(len(said))
-
-        if waiting:
-            say(waiting, keep)
-    return [log.answers[i.item_id, mode] for i in items]
+Kept = Answer | Told
 
 
 def judge(item: SelectionItem, mode: str, written: Written) -> Answer:
@@ -129,7 +78,85 @@ def judge(item: SelectionItem, mode: str, written: Written) -> Answer:
     )
 
 
-def seed_of(seed: int, item: SelectionItem, mode: str) -> int:
-    """The seed (32 bits) of the answer that is drawn for an item in a mode."""
-    digest = hashlib.sha256(f"{seed} {mode} {item.item_id}".encode()).digest()
+def as_told(thing: Thing, mode: str, written: Written) -> Told:
+    """A text as it was written, which nothing judges."""
+    return Told(thing.name, mode, written.text, written.cut)
+
+
+class AnswerLog:
+    """The answers in a file, one JSON line each, by what they are answers to.
+
+    `asked` says it of each mode, in plain values: the model's revision, the items, the prompt, how
+    tokens are drawn, the seed. A line of its own tells it once, under a key that the answers bear.
+    Answers under other keys stay in the file and are no answers to these. Only what was said is
+    taken from a line; what it says and whether that is right is `judged` again.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        asked: dict[str, dict[str, Any]],
+        things: Sequence[Thing],
+        judged: Callable[[Thing, str, Written], Kept] = judge,
+    ) -> None:
+        self._path = path
+        self._keys = {mode: _key(mode, what) for mode, what in asked.items()}
+        self.judged = judged
+        self.answers: dict[tuple[str, str], Kept] = {}
+        thing_of = {thing.name: thing for thing in things}
+        lines = path.read_bytes().splitlines() if path.exists() else []
+        whole, told = [], set()
+        for line in lines:
+            try:
+                row = json.loads(line)
+                if "asked" in row:
+                    told.add(row["key"])
+                elif (thing := thing_of.get(row["item_id"])) and self._bears_key(row):
+                    answer = judged(thing, row["mode"], Written(row["text"], row["cut"]))
+                    self.answers[answer.item_id, answer.mode] = answer
+            except (ValueError, TypeError, KeyError, AttributeError):
+                # Torn by a kill: that is asked again.
+                continue
+            whole.append(line.decode())
+        whole += [
+            json.dumps({"key": key, "mode": mode, "asked": asked[mode]})
+            for mode, key in self._keys.items()
+            if key not in told
+        ]
+        write_text(path, "".join(f"{line}\n" for line in whole))
+
+    def _bears_key(self, row: dict[str, Any]) -> bool:
+        return row["mode"] in self._keys and row["key"] == self._keys[row["mode"]]
+
+    def append(self, answers: list[Kept]) -> None:
+        with open(self._path, "a") as file:
+            file.writelines(
+                json.dumps({**asdict(a), "key": self._keys[a.mode]}) + "\n" for a in answers
+            )
+        self.answers |= {(a.item_id, a.mode): a for a in answers}
+
+
+def _key(mode: str, asked: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps([mode, asked], sort_keys=True).encode()).hexdigest()[:16]
+
+
+def ask_all(
+    things: Sequence[Thing], mode: str, say: Say, log: AnswerLog, unit: str = "item"
+) -> list[Kept]:
+    """What is said to each in `mode`; what the log holds is not asked."""
+    waiting = [t for t in things if (t.name, mode) not in log.answers]
+    with tqdm(total=len(things), initial=len(things) - len(waiting), desc=mode, unit=unit) as bar:
+
+        def keep(said: list[tuple[Thing, Written]]) -> None:
+            log.append([log.judged(thing, mode, written) for thing, written in said])
+            bar.update(len(said))
+
+        if waiting:
+            say(waiting, keep)
+    return [log.answers[t.name, mode] for t in things]
+
+
+def seed_of(seed: int, thing: Thing, mode: str) -> int:
+    """The seed (32 bits) of the answer that is drawn for a thing in a mode."""
+    digest = hashlib.sha256(f"{seed} {mode} {thing.name}".encode()).digest()
     return int.from_bytes(digest[:4], "big")

@@ -1,64 +1,93 @@
-"""How a model is asked about selection items: here or at servers, in which modes, and by what an
-answer is known again."""
+"""How a model is asked: here or at servers, in which modes, and what tells its answers apart."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from conf.errors import UserError
-from conf.schema import SelectCommand, StudentConfig
+from conf.schema import SelectCommand, SftCommand, StudentConfig, TwoStageCommand
 from data.frames import Frames
 from data.records import SelectionItem
 from evaluation import here, served
-from evaluation.answers import RECORDS, Say
+from evaluation.answers import RECORDS, Keep, Say, Thing
 from evaluation.protocol import instruction as record_instruction
 from evaluation.protocol import schema
 from train import backbone, compatible, room
 from train.conversation import Sample, asked_sample, instruction
 from train.generate import new_tokens
-from train.trained import product_folder
+from train.precision import settled
+from train.trained import product_folder, run_title
+
+if TYPE_CHECKING:
+    from torch import nn
+    from transformers import ProcessorMixin
+
+SampleOf = Callable[[str, Thing], Sample]
+"""Shows and asks a thing in a mode."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """A model that can be asked: `say` by mode, and what its answers are known by."""
+    """A model that can be asked: its name for a table, `say` by mode, and what its answers are
+    known by."""
 
+    name: str
     revision: dict[str, Any]
     say: Callable[[str], Say]
 
 
+def asked_model(
+    cfg: SelectCommand | TwoStageCommand,
+    folder: Path | None,
+    trained: SftCommand | SelectCommand | TwoStageCommand,
+    sample_of: SampleOf,
+) -> Asked:
+    """The model that `cfg` names: at servers where it names some, else on this machine. `trained`
+    are the settings of the run in `folder`, or the command's own.
+
+    Raises:
+        UserError: what `model_served` and `model_here` raise.
+    """
+    if cfg.server.url is not None:
+        return model_served(cfg, folder, trained.student, sample_of)
+    return model_here(cfg, folder, trained.student, settled(trained.train.precision), sample_of)
+
+
 def model_here(
-    cfg: SelectCommand,
+    cfg: SelectCommand | TwoStageCommand,
     folder: Path | None,
     student: StudentConfig,
     precision: str,
-    regime: str,
-    frames: Frames,
+    sample_of: SampleOf,
 ) -> Asked:
-    """A model that is loaded on this machine: the student in a run's or an export's `folder`, or
-    the base.
+    """A model that is loaded on this machine, when it is first asked: the student in a run's or an
+    export's `folder`, or the base.
 
     Raises:
         UserError: it cannot be loaded, or its base is not the one that it was trained over.
     """
-    room.keep_big_blocks()
     weights = None
     if folder is not None:
         compatible.check_base(folder, student.model)
         weights = product_folder(folder, "student")
-        model, processor = backbone.load_trained(student, precision, weights)
-    else:
-        model, processor = backbone.load_base(student, precision, list)
+
+    @cache
+    def loaded() -> tuple[nn.Module, ProcessorMixin]:
+        room.keep_big_blocks()
+        if weights is None:
+            return backbone.load_base(student, precision, list)
+        return backbone.load_trained(student, precision, weights)
 
     def say(mode: str) -> Say:
-        sample_of = partial(shown, mode, regime, frames, student, cfg.control)
-        return partial(
-            here.say, model, processor, student, precision, cfg.batch, cfg.seed, mode, sample_of
-        )
+        def answer(things: list[Thing], keep: Keep) -> None:
+            shown = partial(sample_of, mode)
+            here.say(*loaded(), student, precision, cfg.batch, cfg.seed, mode, shown, things, keep)
+
+        return answer
 
     revision = {
         "weights": compatible.weights_digest(student.model, weights),
@@ -66,11 +95,14 @@ def model_here(
         "quantization": student.quantization,
         "precision": precision,
     }
-    return Asked(revision, say)
+    return Asked(_title(folder, student), revision, say)
 
 
 def model_served(
-    cfg: SelectCommand, folder: Path | None, student: StudentConfig, regime: str, frames: Frames
+    cfg: SelectCommand | TwoStageCommand,
+    folder: Path | None,
+    student: StudentConfig,
+    sample_of: SampleOf,
 ) -> Asked:
     """A model that servers have.
 
@@ -88,10 +120,13 @@ def model_served(
     told["weights"] = compatible.weights_digest(told["root"], told["parent"], weights)
 
     def say(mode: str) -> Say:
-        sample_of = partial(shown, mode, regime, frames, student, cfg.control)
-        return partial(served.say, server, student, cfg.seed, mode, sample_of)
+        return partial(served.say, server, student, cfg.seed, mode, partial(sample_of, mode))
 
-    return Asked({"served": server.model, **told}, say)
+    return Asked(_title(folder, student), {"served": server.model, **told}, say)
+
+
+def _title(folder: Path | None, student: StudentConfig) -> str:
+    return run_title(folder) if folder else f"{student.name} base"
 
 
 def told(mode: str, regime: str) -> str:
@@ -100,13 +135,14 @@ def told(mode: str, regime: str) -> str:
 
 
 def shown(
-    mode: str,
     regime: str,
     frames: Frames,
     cfg: StudentConfig,
     control: str | None,
+    mode: str,
     item: SelectionItem,
 ) -> Sample:
+    """A selection item as a student of a regime is asked about it in a mode."""
     return asked_sample(item, mode, told(mode, regime), frames, cfg, control=control)
 
 

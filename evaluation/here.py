@@ -1,4 +1,4 @@
-"""A model that answers on this machine, a batch of items at a time."""
+"""A model that answers on this machine, a batch of what it is asked at a time."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from torch import nn
 from transformers import ProcessorMixin
 
 from conf.schema import StudentConfig
-from data.records import SelectionItem
-from evaluation.answers import Keep, seed_of
+from evaluation.answers import Keep, Thing, seed_of
 from train.collate import Collator
 from train.conversation import Sample
 from train.generate import generate, new_tokens
@@ -24,16 +23,16 @@ def say(
     batch: int,
     seed: int,
     mode: str,
-    sample_of: Callable[[SelectionItem], Sample],
-    items: list[SelectionItem],
+    sample_of: Callable[[Thing], Sample],
+    things: list[Thing],
     keep: Keep,
 ) -> None:
-    """Have a model answer items in `mode`, as `sample_of` shows and asks them."""
+    """Have a model answer in `mode`, as `sample_of` shows and asks each."""
     collator = Collator(processor, cfg.max_length, cfg.thinking)
     limit = new_tokens(mode, cfg)
-    for start in range(0, len(items), batch):
-        group = items[start : start + batch]
-        steps = sampler(cfg, [seed_of(seed, item, mode) for item in group])
-        inputs = collator([sample_of(item) for item in group])
+    for start in range(0, len(things), batch):
+        group = things[start : start + batch]
+        steps = sampler(cfg, [seed_of(seed, thing, mode) for thing in group])
+        inputs = collator([sample_of(thing) for thing in group])
         written = generate(model, processor, inputs, limit, precision, steps)
         keep(list(zip(group, written, strict=True)))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from pathlib import Path
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import write_text
 from conf.schema import ContrastiveCommand, RetrieveCommand
 
 log = logging.getLogger(__name__)
@@ -16,10 +14,9 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.retrieve", RetrieveCommand)
 def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
-    from train.trained import settings_of
+    from train.trained import measured
 
-    folder = Path(cfg.model) if cfg.model is not None else None
-    trained = settings_of(folder, ContrastiveCommand, "retriever") if folder else cfg
+    folder, trained = measured(cfg, ContrastiveCommand, "retriever")
     preset = trained.retriever
     if cfg.index == "faiss":
         from evaluation.index import import_faiss
@@ -36,12 +33,10 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.frames import Frames
-    from data.retrieval.checks import check_test
-    from evaluation import embedding, figures, index, measures, ranking, tables
+    from evaluation import embedding, index, measures, ranked, tables
     from train.precision import settled
 
-    queries, database = store.standard_test(), store.database("test")
-    check_test(store, queries, database)
+    queries, database = ranked.standard_test(store)
     frames = Frames(store, preset.image_size)
     ids = [q.query_id for q in queries]
     names = [f.name for f in database]
@@ -54,12 +49,8 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
         name = embedder.name
         log.info("ranking %s frames with %s", f"{len(names):,}", name)
         parts = (part for _, part in shown.parts(names))
-        if preset.late is not None:
-            from evaluation.late import late_ranks
-
-            ranks = late_ranks(asked, shown.rows(targets), parts, preset.late.width)
-        elif cfg.index == "exact":
-            ranks = ranking.exact_ranks(asked, shown.rows(targets), parts, preset.widths)
+        if cfg.index == "exact":
+            ranks = ranked.ranks_of(preset, asked, shown.rows(targets), parts)
         else:
             name = f"{name} ({cfg.index})"
             ranks, told = index.approximate_ranks(
@@ -69,15 +60,8 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
         rows += measures.retrieval_rows(store.name, name, ranks, queries, cfg.seed)
         curves += measures.recall_curves(name, ranks, queries)
 
-    table = f"{tables.retrieval_table(rows)}\n\n{tables.cost_table(rows)}"
-    log.info("%s", table)
     told = [tables.index_table(indexes)] if indexes else []
-    page = "\n\n".join([table, *told, *tables.builder_tables(rows)])
-    write_text(run.folder / "report.txt", page + "\n")
-    report = {"rows": [r.to_dict() for r in rows], "curves": curves, "indexes": indexes}
-    write_text(run.folder / "report.json", json.dumps(report, indent=1))
-    figures.retrieval_figure(rows, run.folder / "retrieval.png")
-    figures.builders_figure(rows, curves, run.folder / "builders.png")
+    ranked.write_report(run.folder, rows, curves, told, indexes=indexes)
     return {name: found.value for name, found in rows[0].measures.items() if name != "tie_rate"}
 
 

@@ -7,6 +7,7 @@ import json
 import logging
 from collections import Counter
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 from conf.entry import Run, command
@@ -19,10 +20,9 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.select", SelectCommand)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
-    from train.trained import run_title, settings_of
+    from train.trained import measured
 
-    folder = Path(cfg.model) if cfg.model is not None else None
-    trained = settings_of(folder, SftCommand, "student") if folder else cfg
+    folder, trained = measured(cfg, SftCommand, "student")
     student, regime = trained.student, trained.train.regime
     modes = cfg.modes or default_modes(cfg, regime)
     if folder is not None and regime == "answer_only" and "reasoning" in modes:
@@ -39,20 +39,16 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from evaluation import answers, asked, figures, tables
     from evaluation.confidence import calibration, positions
     from evaluation.metrics import accuracy_by, accuracy_table
-    from train.precision import settled
 
     items = spread(store.selection("test", cfg.suite), cfg.limit, cfg.seed)
     if not items:
         suite = cfg.suite or store.suite
         raise UserError(f"{store.folder} has no test items of the {suite} suite to measure on")
     frames = Frames(store, student.image_size)
-    if cfg.server.url is not None:
-        model = asked.model_served(cfg, folder, student, regime, frames)
-    else:
-        precision = settled(trained.train.precision)
-        model = asked.model_here(cfg, folder, student, precision, regime, frames)
-    name = run_title(folder) if folder else f"{student.name} base"
-    measured = ", ".join(filter(None, (store.name, cfg.suite, cfg.control)))
+    sample_of = partial(asked.shown, regime, frames, student, cfg.control)
+    model = asked.asked_model(cfg, folder, trained, sample_of)
+    name = model.name
+    asked_of = ", ".join(filter(None, (store.name, cfg.suite, cfg.control)))
     known = {
         mode: asked.known_by(
             mode, regime, student, cfg.seed, model.revision, store.identity, cfg.control
@@ -68,7 +64,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
         right = [float(a.right) for a in given]
         accuracy = accuracy_table([i.family for i in items], right)
         parsed = sum(a.letter is not None for a in given) / len(given)
-        rows.append(tables.SelectionRow.of(measured, name, mode, accuracy, parsed))
+        rows.append(tables.SelectionRow.of(asked_of, name, mode, accuracy, parsed))
         subtypes[mode] = accuracy_by([f"{i.family}/{i.subtype}" for i in items], right)
         letters[mode] = positions([a.letter for a in given], [i.letter for i in items])
         reasons[mode] = readings(given)

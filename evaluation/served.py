@@ -16,8 +16,7 @@ from PIL import Image
 
 from conf.errors import UserError
 from conf.schema import ServerConfig, StudentConfig
-from data.records import SelectionItem
-from evaluation.answers import Keep, seed_of
+from evaluation.answers import Keep, Thing, seed_of
 from evaluation.protocol import schema
 from teacher.servers.client import Client, UnansweredError
 from teacher.servers.lanes import in_lanes
@@ -37,17 +36,17 @@ def say(
     cfg: StudentConfig,
     seed: int,
     mode: str,
-    sample_of: Callable[[SelectionItem], Sample],
-    items: list[SelectionItem],
+    sample_of: Callable[[Thing], Sample],
+    things: list[Thing],
     keep: Keep,
 ) -> None:
-    """Have a served model answer items in `mode`, as `sample_of` shows and asks them.
+    """Have a served model answer in `mode`, as `sample_of` shows and asks each.
 
     Raises:
-        UserError: no server can be asked, does not take a clip and images, or has no answer to an
-            item though it answers others.
+        UserError: no server can be asked, does not take a clip and images, or has no answer to
+            one though it answers others.
     """
-    asyncio.run(_say(server, cfg, seed, mode, sample_of, items, keep))
+    asyncio.run(_say(server, cfg, seed, mode, sample_of, things, keep))
 
 
 async def _say(
@@ -55,38 +54,36 @@ async def _say(
     cfg: StudentConfig,
     seed: int,
     mode: str,
-    sample_of: Callable[[SelectionItem], Sample],
-    items: list[SelectionItem],
+    sample_of: Callable[[Thing], Sample],
+    things: list[Thing],
     keep: Keep,
 ) -> None:
     loop = asyncio.get_running_loop()
     # Frames are kept in one cache, which takes one thread at a time.
     with ThreadPoolExecutor(1) as desk:
-        first = await loop.run_in_executor(desk, sample_of, items[0])
+        first = await loop.run_in_executor(desk, sample_of, things[0])
         request = request_of(cfg, mode, first.clip)
         async with Client(server, request, chat_of(blank(first))) as client:
 
-            async def ask(item: SelectionItem) -> None:
-                chat, clip = await loop.run_in_executor(desk, _shown, sample_of, item)
+            async def ask(thing: Thing) -> None:
+                chat, clip = await loop.run_in_executor(desk, _shown, sample_of, thing)
                 own = request_of(cfg, mode, clip)
                 if cfg.temperature:
-                    own["seed"] = seed_of(seed, item, mode)
+                    own["seed"] = seed_of(seed, thing, mode)
                 try:
                     [reply] = await client.ask(chat, **own)
                 except UnansweredError as fault:
                     raise UserError(
-                        f"{server.model} has no answer to item {item.item_id} ({fault}); once that "
-                        "is mended, run the same command again, it goes on with what is answered"
+                        f"{server.model} has no answer about {thing.name} ({fault}); once that is "
+                        "mended, run the same command again, it goes on with what is answered"
                     ) from fault
-                keep([(item, written(reply, cfg.thinking))])
+                keep([(thing, written(reply, cfg.thinking))])
 
-            await in_lanes(items, server.concurrency, ask)
+            await in_lanes(things, server.concurrency, ask)
 
 
-def _shown(
-    sample_of: Callable[[SelectionItem], Sample], item: SelectionItem
-) -> tuple[Chat, Clip | None]:
-    sample = sample_of(item)
+def _shown(sample_of: Callable[[Thing], Sample], thing: Thing) -> tuple[Chat, Clip | None]:
+    sample = sample_of(thing)
     return chat_of(sample), sample.clip
 
 

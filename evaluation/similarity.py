@@ -17,10 +17,9 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.similarity", SimilarityCommand)
 def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
-    from train.trained import settings_of
+    from train.trained import measured
 
-    folder = Path(cfg.model) if cfg.model is not None else None
-    trained = settings_of(folder, ContrastiveCommand, "retriever") if folder else cfg
+    folder, trained = measured(cfg, ContrastiveCommand, "retriever")
     preset = trained.retriever
 
     from data.build import ensure_benchmark

@@ -172,17 +172,20 @@ def calibration_table(mode: str, found: Calibration) -> str:
     )
 
 
-def reading_table(reasons: dict[str, dict[str, int]]) -> str:
+def reading_table(reasons: dict[str, dict[str, int]], head: str = "Answers") -> str:
     """How the answers of each mode could be read: counts by reason."""
     names = list(dict.fromkeys(name for counts in reasons.values() for name in counts))
     cells = [
         [name, *(f"{counts[name]:,}" if name in counts else "-" for counts in reasons.values())]
         for name in names
     ]
-    return _table(["Answers", *reasons], {"": cells})
+    return _table([head, *reasons], {"": cells})
 
 
-def retrieval_table(rows: Sequence[RetrievalRow]) -> str:
+def retrieval_table(
+    rows: Sequence[RetrievalRow],
+    reference: Sequence[paper.RetrievalReference] = paper.RETRIEVAL_DISTILLED,
+) -> str:
     """The rows over all queries by width, widest first, each width's untrained row on top; then the
     paper's."""
     every = [r for r in rows if r.builder is None]
@@ -193,7 +196,7 @@ def retrieval_table(rows: Sequence[RetrievalRow]) -> str:
         sizes = [f"{r.queries:,}", f"{r.frames:,}"]
         own.append([_short(r.name, NAME_WIDTH), width, *_values(r), *sizes])
         own.append(["  95% interval", "", *_ranges(r), "", ""])
-    reference = [
+    printed = [
         [
             r.name,
             "",
@@ -204,11 +207,11 @@ def retrieval_table(rows: Sequence[RetrievalRow]) -> str:
             "2,002",
             "10,000",
         ]
-        for r in paper.RETRIEVAL_DISTILLED
+        for r in reference
     ]
     table = _table(
         ["Retrieval", "Width", *_heads(), "Queries", "Frames"],
-        {"": own, "paper (Qwen3-VL 8B, full benchmark)": reference},
+        {"": own, "paper (Qwen3-VL 8B, full benchmark)": printed},
     )
     return f"{table}\nIntervals are bootstrapped over scenes; a target that is not found is last."
 

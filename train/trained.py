@@ -82,5 +82,16 @@ def settings_of(folder: Path, schema: type[Command], product: str, key: str = "m
         ) from error
 
 
+def measured(
+    cfg: Any, schema: type[Command], product: str, key: str = "model"
+) -> tuple[Path | None, Any]:
+    """The folder that `cfg.model` names and the settings of what was trained there; None and `cfg`
+    itself, which has a preset's, where it names none. Errors are those of `settings_of`."""
+    if cfg.model is None:
+        return None, cfg
+    folder = Path(cfg.model)
+    return folder, settings_of(folder, schema, product, key)
+
+
 def _finished(folder: Path, product: str) -> bool:
     return (folder / "metrics.json").exists() and (folder / product).is_dir()

@@ -1,15 +1,18 @@
-"""A small real server that speaks the chat protocol and says what it is given to say."""
+"""A small real server that speaks the chat protocol, and that of images, and says or draws what it
+is given."""
 
 from __future__ import annotations
 
+import base64
 import json
 import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-Said = str | int | dict[str, Any]
-"""A text; a status; or an answer's `content`, `reasoning`, `finish_reason` or `message`."""
+Said = str | int | bytes | dict[str, Any]
+"""A text; a status; an image's bytes; or an answer's `content`, `reasoning`, `finish_reason` or
+`message`."""
 
 
 class TalkingServer(ThreadingHTTPServer):
@@ -54,6 +57,10 @@ class Handler(BaseHTTPRequestHandler):
             said = {"status": said}
         elif isinstance(said, str):
             said = {"content": said}
+        elif isinstance(said, bytes):
+            image = {"b64_json": base64.b64encode(said).decode()}
+            self.say(200, {"created": 0, "data": [image]})
+            return
         if status := said.get("status"):
             self.say(status, {"error": {"message": said.get("message", "fault")}})
             return

@@ -22,7 +22,6 @@ from evaluation.asked import known_by, model_served, shown
 from evaluation.protocol import instruction, schema
 from evaluation.served import revision, say, written
 from teacher.servers.replies import CUT_OFF, Reply
-from tests.evaluation.talking import TalkingServer
 from tests.evaluation.test_protocol import FULL
 
 STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
@@ -39,21 +38,6 @@ def frames(micro_store):
     return Frames(micro_store, STUDENT.image_size)
 
 
-@pytest.fixture
-def talking(monkeypatch):
-    monkeypatch.setattr("teacher.servers.client.PAUSE", 0.01)
-    monkeypatch.setattr("teacher.servers.client.LONGEST_PAUSE", 0.05)
-    servers = []
-
-    def start(says, port=0):
-        servers.append(TalkingServer(says, port))
-        return servers[-1]
-
-    yield start
-    for server in servers:
-        server.stop()
-
-
 def at(*servers, **changes) -> ServerConfig:
     settings = {"concurrency": 3, "patience": 5.0, "timeout": 10.0, **changes}
     return ServerConfig(url=[s.url for s in servers], model="served", **settings)
@@ -64,7 +48,7 @@ def opened(tmp_path, items, **known) -> AnswerLog:
 
 
 def asker(server, frames, cfg=STUDENT, mode="record", control=None, seed=0):
-    sample_of = partial(shown, mode, "cot", frames, cfg, control)
+    sample_of = partial(shown, "cot", frames, cfg, control, mode)
     return partial(say, server, cfg, seed, mode, sample_of)
 
 
@@ -76,7 +60,7 @@ def test_the_same_frames_and_times_are_sent(items, frames, talking, tmp_path) ->
     assert [a.right for a in given] == [i.letter == "C" for i in items]
     assert {a.valid for a in given} == {True}
     for item, asked in zip(items, server.asked, strict=True):
-        sample = shown("record", "cot", frames, STUDENT, None, item)
+        sample = shown("cot", frames, STUDENT, None, "record", item)
         parts = asked["messages"][0]["content"]
         video = parts[0]["video_url"]["url"].removeprefix("data:video/jpeg;base64,")
         assert np.array_equal(np.stack([*map(pixels, video.split(","))]), sample.clip.pixels)
@@ -208,7 +192,7 @@ def test_an_item_that_alone_has_no_answer_is_told(items, frames, talking) -> Non
         return {"status": 400, "message": "prompt is too long"} if long else "Hello."
 
     server = talking(refuse)
-    with pytest.raises(UserError, match=r"no answer to item .*prompt is too long.*goes on with"):
+    with pytest.raises(UserError, match=r"no answer about .*prompt is too long.*goes on with"):
         asker(at(server, concurrency=1), frames)(items, lambda _: None)
 
 
@@ -230,7 +214,7 @@ def test_a_student_is_not_measured_by_its_base(talking, tmp_path) -> None:
     server = talking(lambda _: FULL)
     cfg = SelectCommand(server=replace(at(server), model=None), student=STUDENT)
     with pytest.raises(UserError, match=r"give server\.model=NAME"):
-        model_served(cfg, tmp_path, STUDENT, "cot", None)
+        model_served(cfg, tmp_path, STUDENT, None)
 
 
 def test_answers_to_other_questions_stay_and_do_not_count(items, tmp_path) -> None:

@@ -63,7 +63,7 @@ def test_the_server_is_asked_with_the_ids_that_a_model_here_reads(
     backbone.pin_sizes(processor, cfg.image_size, cfg.frames)
     client = openai.OpenAI(base_url=server.url, api_key="none")
     for mode, item in zip(("record", "answer"), micro_store.selection("test"), strict=False):
-        sample = shown(mode, "cot", frames, cfg, control, item)
+        sample = shown("cot", frames, cfg, control, mode, item)
         request = request_of(cfg, mode, sample.clip) | {"max_tokens": 1}
         request["extra_body"]["return_token_ids"] = True
         told = client.chat.completions.create(model="tiny", messages=chat_of(sample), **request)

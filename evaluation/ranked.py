@@ -1,0 +1,62 @@
+"""What the commands that rank a benchmark's standard test share: how they open, rank and report."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from conf.runs import write_text
+from conf.schema import RetrieverConfig
+from data.records import FrameRef, RetrievalQuery
+from data.retrieval.checks import check_test
+from data.store import Store
+from evaluation import figures, paper, tables
+from evaluation.ranking import Ranks, exact_ranks
+
+log = logging.getLogger(__name__)
+
+
+def standard_test(store: Store) -> tuple[list[RetrievalQuery], list[FrameRef]]:
+    """The queries and the database. Errors are those of `check_test`."""
+    queries, database = store.standard_test(), store.database("test")
+    check_test(store, queries, database)
+    return queries, database
+
+
+def ranks_of(
+    preset: RetrieverConfig,
+    asked: np.ndarray,
+    targets: np.ndarray,
+    database: Iterable[np.ndarray],
+) -> Ranks:
+    """Exact ranks by a retriever's own scores. Arguments are those of `exact_ranks`."""
+    if preset.late is not None:
+        from evaluation.late import late_ranks
+
+        return late_ranks(asked, targets, database, preset.late.width)
+    return exact_ranks(asked, targets, database, preset.widths)
+
+
+def write_report(
+    folder: Path,
+    rows: Sequence[tables.RetrievalRow],
+    curves: Sequence[dict[str, Any]],
+    told: Sequence[str] = (),
+    reference: Sequence[paper.RetrievalReference] = paper.RETRIEVAL_DISTILLED,
+    **also: Any,
+) -> None:
+    """Write report.txt, report.json and the figures of some rows; `told` are more tables and `also`
+    more entries."""
+    table = f"{tables.retrieval_table(rows, reference)}\n\n{tables.cost_table(rows)}"
+    log.info("%s", table)
+    page = "\n\n".join([table, *told, *tables.builder_tables(rows)])
+    write_text(folder / "report.txt", page + "\n")
+    report = {"rows": [r.to_dict() for r in rows], "curves": curves, **also}
+    write_text(folder / "report.json", json.dumps(report, indent=1))
+    figures.retrieval_figure(rows, folder / "retrieval.png")
+    figures.builders_figure(rows, curves, folder / "builders.png")
