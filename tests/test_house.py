@@ -23,6 +23,7 @@ COMMANDS = (
     "train.export",
     "evaluation.select",
     "evaluation.retrieve",
+    "evaluation.two_stage",
     "evaluation.report",
     "evaluation.study",
     "evaluation.study.export",

@@ -1,0 +1,85 @@
+"""Measure two-stage retrieval: a model writes what the future frame shows, and a frozen encoder
+matches that to the whole test database."""
+
+from __future__ import annotations
+
+import json
+import logging
+from functools import partial
+from pathlib import Path
+
+from conf.entry import Run, command
+from conf.errors import UserError
+from conf.runs import write_text
+from conf.schema import ContrastiveCommand, SftCommand, TwoStageCommand
+from conf.schema.two_stage import ROUTES
+
+log = logging.getLogger(__name__)
+
+
+@command("evaluation.two_stage", TwoStageCommand)
+def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
+    from train.trained import measured
+
+    folder, trained = measured(cfg, SftCommand, "student")
+    matched_by, frozen = measured(cfg.matcher, ContrastiveCommand, "retriever", "matcher.model")
+    routes = cfg.routes or default_routes(cfg)
+    if folder is not None and trained.train.regime == "answer_only" and "cot_text" in routes:
+        raise UserError(
+            f"model={folder} was trained in answer mode alone (train.regime=answer_only) and "
+            "writes no rationale: leave cot_text out of routes"
+        )
+
+    from data.build import ensure_benchmark
+
+    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+
+    from data.frames import Frames
+    from evaluation import foreseen, matching, measures, paper, ranked, tables
+    from evaluation.asked import asked_model
+    from evaluation.embedding import embedders
+    from train.conversation import told_sample
+    from train.precision import settled
+
+    queries, database = ranked.standard_test(store)
+    precision = settled(frozen.train.precision)
+    matcher = next(embedders(matched_by, frozen.retriever, precision, store, run.folder))
+    student = trained.student
+    sample_of = partial(told_sample, Frames(store, student.image_size), student)
+    model = asked_model(cfg, folder, trained, sample_of)
+    name = model.name
+    log.info("asking %s", name)
+    modes = foreseen.modes_of(routes)
+    written = foreseen.write_texts(cfg, student, model, modes, queries, database, store)
+    texts = {mode: foreseen.texts_of(told) for mode, told in written.items()}
+    # The matcher needs the room.
+    del model
+
+    rows, curves, matched, metrics = [], [], [], {}
+    for key in routes:
+        route = foreseen.ROUTES[key]
+        log.info("matching %s with %s", route.title, matcher.name)
+        ranks = matching.ranks(cfg, route, matcher, texts, queries, database, store)
+        title = f"{name} {route.title}, {matcher.name.removeprefix(tables.UNTRAINED).strip()}"
+        found = measures.retrieval_rows(store.name, title, ranks, queries, cfg.seed)
+        rows += found
+        curves += measures.recall_curves(title, ranks, queries)
+        matched += matching.matched(key, queries, texts[route.mode], ranks)
+        metrics |= {f"{key}_{m}": i.value for m, i in found[0].measures.items() if m != "tie_rate"}
+
+    told = {mode: foreseen.counts(of) for mode, of in written.items()}
+    reading = tables.reading_table(told, "What was written")
+    ranked.write_report(
+        run.folder, rows, curves, [reading], paper.RETRIEVAL_TWO_STAGE, indexes=[], texts=told
+    )
+    write_text(run.folder / "matched.jsonl", "".join(json.dumps(m) + "\n" for m in matched))
+    return metrics
+
+
+def default_routes(cfg: TwoStageCommand) -> list[str]:
+    """The paper's: of a student by its rationale, of a base all three."""
+    return ["cot_text"] if cfg.model is not None else list(ROUTES[:3])
+
+
+if __name__ == "__main__":
+    main()
