@@ -59,9 +59,9 @@ class DualEncoder:
         return unit(prefixes + self.texts([q.question for q in asked]))
 
     def frames(self, shown: list[FrameRef], frames: Frames) -> np.ndarray:
-        return self.images([frames.array(f.scene_id, f.frame) for f in shown])
+        return self.drawn([frames.array(f.scene_id, f.frame) for f in shown])
 
-    def images(self, shown: list[np.ndarray]) -> np.ndarray:
+    def drawn(self, shown: list[np.ndarray]) -> np.ndarray:
         return self._seen(np.stack(shown))
 
     def texts(self, texts: list[str]) -> np.ndarray:

@@ -188,7 +188,7 @@ def embed_images(
     size = embedder.preset.image_size
 
     def encode(encoder: Encoder, some: list[Path]) -> np.ndarray:
-        return encoder.images([image_pixels(path, size) for path in some])
+        return encoder.drawn([image_pixels(path, size) for path in some])
 
     return _embedded(embedder, "image", about, dict(images), encode, store, batch)
 

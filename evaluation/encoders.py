@@ -31,7 +31,7 @@ class Encoder(Protocol):
 
     def frames(self, shown: list[FrameRef], frames: Frames) -> np.ndarray: ...
 
-    def images(self, shown: list[np.ndarray]) -> np.ndarray:
+    def drawn(self, shown: list[np.ndarray]) -> np.ndarray:
         """Of (S, S, 3) uint8 pixels at the preset's size, as of frames."""
 
     def texts(self, texts: list[str]) -> np.ndarray:
@@ -52,7 +52,7 @@ class JointEncoder:
     def frames(self, shown: list[FrameRef], frames: Frames) -> np.ndarray:
         return self._pictures([frame_input(frame, frames) for frame in shown])
 
-    def images(self, shown: list[np.ndarray]) -> np.ndarray:
+    def drawn(self, shown: list[np.ndarray]) -> np.ndarray:
         return self._pictures([Image.fromarray(pixels) for pixels in shown])
 
     def texts(self, texts: list[str]) -> np.ndarray:
