@@ -196,7 +196,7 @@ def embed_images(
 def image_pixels(path: Path, size: int) -> np.ndarray:
     """(size, size, 3) uint8 of an image in a file, as a frame is shown."""
     with Image.open(path) as image:
-        return resized(np.asarray(image.convert("RGB"))[None], size)[0]
+        return resized(np.array(image.convert("RGB"))[None], size)[0]
 
 
 def _embedded(

@@ -23,6 +23,11 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
 
     folder, trained = measured(cfg, SftCommand, "student")
     matched_by, frozen = measured(cfg.matcher, ContrastiveCommand, "retriever", "matcher.model")
+    if frozen.retriever.late is not None:
+        raise UserError(
+            "a matcher by late interaction (retriever.late) scores the tokens of images and clips "
+            "alone, and cannot match a text: give another matcher"
+        )
     routes = cfg.routes or default_routes(cfg)
     if folder is not None and trained.train.regime == "answer_only" and "cot_text" in routes:
         raise UserError(

@@ -47,9 +47,11 @@ SMALL = ArchitectureConfig(
     vision_hidden=64, vision_layers=1, vision_heads=2, vision_feed_forward=64,
 )  # fmt: skip
 WHOLE = {"quantization": "none", "lora": LoraConfig(rank=0)}
+# It is random, and so are its words.
 STUDENT = StudentConfig(
-    name="small", architecture=SMALL, image_size=96, max_length=1500, max_new_tokens=12, **WHOLE
-)
+    name="small", architecture=SMALL, image_size=96, max_length=1500, max_new_tokens=12,
+    temperature=1.0, top_k=50, **WHOLE,
+)  # fmt: skip
 SERVED = StudentConfig(name="any", model="any", image_size=96, max_new_tokens=40)
 RATIONALE = (
     "Scene parse: A cube.\nMotion analysis: It moves.\nPrediction: The cube will be near the top.\n"
@@ -164,21 +166,6 @@ def test_captions_match_by_their_words(ranks, store) -> None:
     bare = ranks("predict_caption", said, ["" if k == first else c for k, c in enumerate(captions)])
     assert bare.found[0].tolist() == [s != said[0] for s in said]
     assert bare.frames == len(database)
-
-
-def test_a_late_interaction_matcher_takes_texts(store, tmp_path) -> None:
-    cfg = RetrieverConfig(
-        name="late", architecture=SMALL, image_size=96, late=LateConfig(width=24), **WHOLE
-    )
-    queries, database = standard_test(store)
-    matcher = next(embedders(None, cfg, "fp32", store, tmp_path))
-    texts = {"prediction": {q.name: q.question for q in queries}}
-    command = TwoStageCommand(matcher=MatcherConfig(batch=16))
-    found = matching.ranks(
-        command, ROUTES["predict_image"], matcher, texts, queries, database, store
-    )
-    assert found.widths == (24,)
-    assert found.found.all()
 
 
 def test_a_drawn_target_is_found_first_and_drawn_once(ranks, store, talking) -> None:
@@ -336,6 +323,12 @@ def test_texts_are_kept_when_the_server_dies(world, store, talking) -> None:
     shutil.rmtree(store.folder / "texts")
     world("four", server=at(server), routes=["cot_text", "predict_image"])
     assert sorted(log_of(store).read_text().splitlines()) == once
+
+
+def test_a_matcher_that_reads_no_text_is_refused(world) -> None:
+    late = RetrieverConfig(name="late", model="unused", late=LateConfig(width=24))
+    with pytest.raises(UserError, match=r"by late interaction .* cannot match a text"):
+        world(matcher=MatcherConfig(retriever=late))
 
 
 def test_a_student_without_rationales_is_told(world, micro, tmp_path) -> None:
