@@ -28,7 +28,7 @@ from conf.runs import write_text
 from conf.schema import SelectCommand
 from data.records import FAMILIES
 from data.store import open_store
-from evaluation.metrics import bootstrap_by_scene
+from evaluation.metrics import macro_by_scene
 
 REGIMES = ("answer_only", "cot", "cot_no_candidate_analysis", "cot_no_match_layout")
 MODES = {"answer_only": ["answer"]}
@@ -185,17 +185,12 @@ def figure(
 ) -> str:
     """The mean of families' means over items and seeds (items, seeds), with its interval, in
     percent."""
-    codes = np.array([FAMILIES.index(item["family"]) for item in items])
-    wanted = [FAMILIES.index(family) for family in families]
-    kept = np.isin(codes, wanted)
-
-    def mean(rows: np.ndarray) -> float:
-        return float(np.mean([rows[rows[:, 0] == k, 1].mean() for k in wanted]))
-
-    table = np.stack([codes, values.mean(axis=1)], axis=1)[kept]
-    scenes = [item["scene_id"] for item, keep in zip(items, kept, strict=True) if keep]
-    low, high = bootstrap_by_scene(table, scenes, mean, seed=0)
-    return f"{100 * mean(table):{sign}.1f} [{100 * low:{sign}.1f}, {100 * high:{sign}.1f}]"
+    kept = [k for k, item in enumerate(items) if item["family"] in families]
+    of = [(items[k]["family"], items[k]["scene_id"]) for k in kept]
+    found = macro_by_scene(values[kept].mean(axis=1), *zip(*of, strict=True), seed=0)
+    shares = (found.value, found.low, found.high)
+    mean, low, high = (f"{100 * share:{sign}.1f}" for share in shares)
+    return f"{mean} [{low}, {high}]"
 
 
 if __name__ == "__main__":
