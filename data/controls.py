@@ -9,7 +9,7 @@ frames out of order.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -92,7 +92,7 @@ def fill_pairs(
 
 
 def _pair(item: SelectionItem) -> tuple[SelectionItem, SelectionItem]:
-    place = f"{item.scene_id}-{item.prefix_stop}-{item.target_frame}"
+    place = _place(item)
     by_time = replace(item, suite=MATCHED, item_id=f"{MATCHED}-time-{place}")
     by_event = replace(
         by_time,
@@ -102,6 +102,17 @@ def _pair(item: SelectionItem) -> tuple[SelectionItem, SelectionItem]:
         question=EVENT_QUESTION,
     )
     return by_event, by_time
+
+
+def pairs(items: Sequence[SelectionItem]) -> list[tuple[SelectionItem, SelectionItem]]:
+    """The matched-anchor pairs among items, in their order: that which names the event, and that
+    which names the time."""
+    by_time = {_place(item): item for item in items if item.family == "time"}
+    return [(item, by_time[_place(item)]) for item in items if item.family == "event"]
+
+
+def _place(item: SelectionItem) -> str:
+    return f"{item.scene_id}-{item.prefix_stop}-{item.target_frame}"
 
 
 def observed(item: SelectionItem, count: int, control: str | None) -> list[int]:

@@ -10,6 +10,7 @@ from data.records import FAMILIES, LETTERS
 from evaluation import paper
 from evaluation.confidence import Calibration, Positions
 from evaluation.metrics import Accuracy, Interval
+from evaluation.paired import Paired
 
 RECALLS = (1, 10, 50)
 """Cut-offs that the retrieval rows report."""
@@ -30,7 +31,8 @@ class SelectionRow:
     wrong.
 
     `mode` says how it was asked, such as answer, reasoning or similarity; `parse_rate` is None
-    where nothing is parsed; `n` is the number of items.
+    where nothing is parsed; `n` is the number of items. `horizons` are the time items by their
+    distance, "1 s" and "2 s"; the interval of `macro` is drawn over scenes.
     """
 
     benchmark: str
@@ -41,21 +43,36 @@ class SelectionRow:
     micro: Interval
     parse_rate: float | None
     n: int
+    macro_interval: Interval | None = None
+    horizons: dict[str, Interval] = field(default_factory=dict)
 
     @classmethod
     def of(
-        cls, benchmark: str, name: str, mode: str, found: Accuracy, parse_rate: float | None
+        cls,
+        benchmark: str,
+        name: str,
+        mode: str,
+        found: Accuracy,
+        parse_rate: float | None,
+        macro_interval: Interval | None = None,
+        horizons: dict[str, Interval] | None = None,
     ) -> SelectionRow:
         shares = (found.families, found.macro, found.micro, parse_rate)
-        return cls(benchmark, name, mode, *shares, found.micro.n)
+        told = (macro_interval, horizons or {})
+        return cls(benchmark, name, mode, *shares, found.micro.n, *told)
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
 
     @classmethod
     def from_dict(cls, row: dict[str, Any]) -> SelectionRow:
-        families = {name: Interval(**found) for name, found in row["families"].items()}
-        return cls(**{**row, "families": families, "micro": Interval(**row["micro"])})
+        groups = {
+            key: {name: Interval(**found) for name, found in row.get(key, {}).items()}
+            for key in ("families", "horizons")
+        }
+        macro = row.get("macro_interval")
+        whole = {"micro": Interval(**row["micro"]), "macro_interval": macro and Interval(**macro)}
+        return cls(**{**row, **groups, **whole})
 
 
 @dataclass(frozen=True)
@@ -107,18 +124,27 @@ def selection_table(rows: Sequence[SelectionRow]) -> str:
         shares = [*(i and i.value for i in found), r.macro, r.micro.value, r.parse_rate]
         name = _short(r.name, NAME_WIDTH - len(r.mode) - 3)
         own.append([f"{name} ({r.mode})", *map(_percent, shares), f"{r.n:,}"])
-        own.append(["  95% interval", *map(_range, found), "", _range(r.micro), "", ""])
+        spans = map(_range, (*found, r.macro_interval, r.micro))
+        own.append(["  95% interval", *spans, "", ""])
+        for horizon, of in r.horizons.items():
+            label = f"  time, {horizon} ({_range(of)})"
+            own.append([label, "", _percent(of.value), "", "", "", "", f"{of.n:,}"])
     similar = paper.SELECTION_SIMILARITY if any(r.mode == SIMILARITY for r in rows) else ()
-    reference = [
-        [r.name, *map(_printed, (r.event, r.time, r.window, r.macro, r.micro, r.parse_rate)), ""]
-        for r in (paper.CHANCE, *similar, *paper.SELECTION_DISTILLED, paper.HUMAN_MAJORITY)
-    ]
+    reference = []
+    for r in (paper.CHANCE, *similar, *paper.SELECTION_DISTILLED, paper.HUMAN_MAJORITY):
+        shares = (r.event, r.time, r.window, r.macro, r.micro, r.parse_rate)
+        reference.append([r.name, *map(_printed, shares), ""])
+        for seconds, percent in paper.TIME_BY_HORIZON.get(r.name, {}).items():
+            reference.append([f"  time, {seconds} s", "", _printed(percent), *[""] * 5])
     head = ["Selection accuracy, %", *(f.capitalize() for f in FAMILIES)]
     table = _table(
         [*head, "Macro", "Micro", "Parsed", "Items"],
         {"": own, "paper (Qwen3-VL 8B, full benchmark)": reference},
     )
-    return f"{table}\nIntervals are Wilson's; an answer that cannot be parsed is wrong."
+    return (
+        f"{table}\nIntervals are Wilson's, macro's is bootstrapped over scenes; an answer that "
+        "cannot be parsed is\nwrong."
+    )
 
 
 def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> str:
@@ -131,6 +157,32 @@ def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> str:
         rows.append([cell, *shares, str(found[0].n)])
     heads = [_short(mode, NAME_WIDTH) for mode in modes]
     return _table(["Accuracy by subtype, %", *heads, "Items"], {"": rows})
+
+
+def paired_table(found: Sequence[tuple[str, Sequence[Paired]]]) -> str:
+    """What two ways of answering the same items are apart, by how these were asked."""
+    parts = {
+        f"{way}: {of[0].left} (left) less {of[0].right} (right)": [
+            [
+                p.of,
+                *map(_percent, (p.left_accuracy, p.right_accuracy)),
+                f"{100 * p.difference:+.1f}",
+                f"{100 * p.low:+.1f} to {100 * p.high:+.1f}",
+                *("-" if count is None else f"{count:,}" for count in (p.only_left, p.only_right)),
+                "-" if p.p is None else f"{p.p:.2g}",
+                f"{p.n:,}",
+            ]
+            for p in of
+        ]
+        for way, of in found
+    }
+    head = ["Paired accuracy, %", "Left", "Right", "Apart", "95%", "Only left", "Only right"]
+    table = _table([*head, "p", "Items"], parts)
+    return (
+        f"{table}\nApart: left less right, its interval bootstrapped over scenes. Only left, only "
+        "right: items\nanswered right that way alone; p is McNemar's exact test of the two, which "
+        "takes the items of a\nscene for independent."
+    )
 
 
 def position_table(found: dict[str, Positions]) -> str:
