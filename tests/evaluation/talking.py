@@ -4,53 +4,34 @@ is given."""
 from __future__ import annotations
 
 import base64
-import json
-import threading
 from collections.abc import Callable
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
+
+from tests.local import JsonHandler, LocalServer
 
 Said = str | int | bytes | dict[str, Any]
 """A text; a status; an image's bytes; or an answer's `content`, `reasoning`, `finish_reason` or
 `message`."""
 
 
-class TalkingServer(ThreadingHTTPServer):
+class TalkingServer(LocalServer):
     """`says` gives an answer to each request; `asked` are the requests."""
 
-    daemon_threads = True
-
     def __init__(self, says: Callable[[dict[str, Any]], Said], port: int = 0) -> None:
-        super().__init__(("127.0.0.1", port), Handler)
         self.says = says
         self.asked: list[dict[str, Any]] = []
-        threading.Thread(target=self.serve_forever, args=(0.02,), daemon=True).start()
-
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.server_port}/v1"
-
-    def handle_error(self, *_: object) -> None:
-        """A client that hangs up is nothing to tell."""
-
-    def stop(self) -> None:
-        self.shutdown()
-        self.server_close()
+        super().__init__(Handler, port)
 
 
-class Handler(BaseHTTPRequestHandler):
+class Handler(JsonHandler):
     server: TalkingServer
 
-    def log_message(self, *_: object) -> None:
-        pass
-
-    def do_GET(self) -> None:
+    def get(self) -> None:
         model = {"id": "served", "object": "model", "root": "weights", "parent": None}
         adapter = {"id": "adapter", "object": "model", "root": "lora", "parent": "served"}
         self.say(200, {"object": "list", "data": [model, adapter]})
 
-    def do_POST(self) -> None:
-        request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+    def post(self, request: dict[str, Any]) -> None:
         self.server.asked.append(request)
         said = self.server.says(request)
         if isinstance(said, int):
@@ -71,11 +52,3 @@ class Handler(BaseHTTPRequestHandler):
         choice = {"index": 0, "finish_reason": finish, "message": message}
         body = {"id": "x", "object": "chat.completion", "created": 0, "model": "served"}
         self.say(200, {**body, "choices": [choice]})
-
-    def say(self, status: int, body: dict[str, Any]) -> None:
-        content = json.dumps(body).encode()
-        self.send_response(status)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        self.wfile.write(content)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import struct
 import threading
 import time
 from collections.abc import Iterable
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from socket import SO_LINGER, SOL_SOCKET
 from typing import Any
 
@@ -15,6 +13,7 @@ from conf.schema import TeacherConfig
 from teacher.predicates import predicates_of
 from teacher.prompts import messages
 from teacher.template import narrate
+from tests.local import JsonHandler, LocalServer
 from tests.teacher.made import MadeStore
 
 Fault = int | bytes | str | dict[str, str]
@@ -34,14 +33,11 @@ def odd_text(word: str, text: str) -> tuple[str, str]:
     }[word]
 
 
-class OddServer(ThreadingHTTPServer):
+class OddServer(LocalServer):
     """`faults` come before proper answers, in order; `always` comes instead of them. `asked` are
     the requests; `most` is how many were in flight at once."""
 
-    daemon_threads = True
-
     def __init__(self, store: MadeStore, faults: Iterable[Fault] = (), port: int = 0) -> None:
-        super().__init__(("127.0.0.1", port), Handler)
         self.faults, self.always = list(faults), {}
         self.asked: list[dict[str, Any]] = []
         self.times: list[float] = []
@@ -54,34 +50,19 @@ class OddServer(ThreadingHTTPServer):
             if predicates:
                 chat = messages(predicates, item, TeacherConfig(name="odd"))
                 self.texts[chat[1]["content"]] = narrate(predicates, item, 0)
-        threading.Thread(target=self.serve_forever, args=(0.02,), daemon=True).start()
-
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.server_port}/v1"
-
-    def handle_error(self, *_: object) -> None:
-        """A client that hangs up is nothing to tell."""
-
-    def stop(self) -> None:
-        self.shutdown()
-        self.server_close()
+        super().__init__(Handler, port)
 
 
-class Handler(BaseHTTPRequestHandler):
+class Handler(JsonHandler):
     server: OddServer
 
-    def log_message(self, *_: object) -> None:
-        pass
-
-    def do_GET(self) -> None:
+    def get(self) -> None:
         if self.path == "/health":
             self.say(200, {})
         else:
             self.say(200, {"object": "list", "data": [{"id": "other", "object": "model"}]})
 
-    def do_POST(self) -> None:
-        request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+    def post(self, request: dict[str, Any]) -> None:
         server, said = self.server, request["messages"][-1]["content"]
         with server.lock:
             server.asked.append(request)
@@ -119,16 +100,6 @@ class Handler(BaseHTTPRequestHandler):
         else:
             told = odd_text(fault, text) if fault else (text, "stop")
             self.say(200, completion(*told, request.get("n") or 1))
-
-    def say(self, status: int, body: dict[str, Any], headers: dict[str, str] | None = None) -> None:
-        content = json.dumps(body).encode()
-        self.send_response(status)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(content)))
-        for key, value in (headers or {}).items():
-            self.send_header(key, value)
-        self.end_headers()
-        self.wfile.write(content)
 
     def raw(self, content: bytes) -> None:
         self.send_response(200)
