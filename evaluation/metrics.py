@@ -232,32 +232,6 @@ def bootstrap_by_scene(
     return float(low), float(high)
 
 
-def macro_by_scene(
-    values: Sequence[float], families: Sequence[str], scenes: Sequence[str], seed: int
-) -> Interval:
-    """The plain mean of the families' means, with its 95% interval when whole scenes are drawn
-    again: of credits a macro accuracy, of differences of credits what two macros are apart, and of
-    one family its mean. A family that a draw lacks is left out of that draw's mean.
-
-    Args:
-        values: a number an item.
-        families, scenes: a name an item.
-
-    Raises:
-        ValueError: no items, or not one family and one scene an item.
-    """
-    _, codes = np.unique(np.asarray(families), return_inverse=True)
-    table = np.stack([codes, np.asarray(values, float)], axis=1)
-
-    def macro(rows: np.ndarray) -> float:
-        of = rows[:, 0].astype(int)
-        counts = np.bincount(of)
-        return float((np.bincount(of, rows[:, 1])[counts > 0] / counts[counts > 0]).mean())
-
-    low, high = bootstrap_by_scene(table, scenes, macro, seed)
-    return Interval(macro(table), low, high, len(table))
-
-
 class SceneBootstrap:
     """`bootstrap_by_scene` of means and medians, with its very draws, for many measures of the same
     items: what is drawn is how often each item counts, and nothing is copied."""
@@ -289,6 +263,37 @@ class SceneBootstrap:
         # Of an even number of items the median is the mean of the middle two.
         middle = [(reached > place).argmax(1) for place in ((total - 1) // 2, total // 2)]
         return _middle(np.asarray(values, float)[order][middle].mean(0))
+
+    def macro(self, values: np.ndarray, groups: Sequence[str]) -> np.ndarray:
+        """The 95% interval (2,) of the mean of the groups' means of values (items,); a group that a
+        draw lacks is left out of that draw's mean."""
+        _, codes = np.unique(np.asarray(groups), return_inverse=True)
+        member = np.eye(codes.max() + 1)[codes]
+        sums, counts = self._times @ (member * values[:, None]), self._times @ member
+        means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
+        return _middle(np.nanmean(means, axis=1))
+
+
+def macro_by_scene(
+    values: Sequence[float], groups: Sequence[str], scenes: Sequence[str], seed: int
+) -> Interval:
+    """The plain mean of the groups' means, with its 95% interval when whole scenes are drawn again:
+    of credits by family a macro accuracy, of differences of credits what two macros are apart, and
+    of one group its mean.
+
+    Args:
+        values: a number an item.
+        groups, scenes: a name an item.
+
+    Raises:
+        ValueError: no items, or not one group and one scene an item.
+    """
+    values, groups = np.asarray(values, float), np.asarray(groups)
+    if not len(values) == len(groups) == len(scenes):
+        raise ValueError(f"{len(values)} values for {len(groups)} groups, {len(scenes)} scenes")
+    low, high = SceneBootstrap(scenes, seed).macro(values, groups)
+    mean = np.mean([values[groups == g].mean() for g in np.unique(groups)])
+    return Interval(float(mean), float(low), float(high), len(values))
 
 
 def _middle(results: np.ndarray) -> np.ndarray:

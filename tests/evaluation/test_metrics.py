@@ -3,6 +3,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+import pytrec_eval
 import torch
 
 from evaluation.metrics import (
@@ -13,6 +14,7 @@ from evaluation.metrics import (
     compare,
     expected_hits,
     gold_scores,
+    macro_by_scene,
     metrics_from_counts,
     rank_metrics,
     ranks_of,
@@ -140,6 +142,22 @@ def test_credit_of_four_candidates():
     assert credit.tolist() == [1, 0.5, 0.25, 0, 0]
 
 
+def test_ranks_without_ties_are_those_of_an_independent_library():
+    rng = np.random.default_rng(5)
+    scores = rng.permuted(np.tile(np.arange(120.0), (40, 1)), axis=1)
+    gold = rng.integers(120, size=40)
+    run = {f"q{i}": {f"f{j}": s for j, s in enumerate(row)} for i, row in enumerate(scores)}
+    asked = {f"q{i}": {f"f{g}": 1} for i, g in enumerate(gold)}
+    judge = pytrec_eval.RelevanceEvaluator(asked, {"recall.1,10,50", "recip_rank"})
+    expected = judge.evaluate(run).values()
+    found = rank_metrics(scores, gold, (1, 10, 50))
+    for k in (1, 10, 50):
+        assert found[f"recall@{k}"] == pytest.approx(np.mean([q[f"recall_{k}"] for q in expected]))
+    ranks = np.array([1 / q["recip_rank"] for q in expected])
+    assert found["mrr"] == pytest.approx((1 / ranks).mean())
+    assert found["median_rank"] == pytest.approx(np.median(ranks))
+
+
 @pytest.mark.parametrize(("successes", "n"), [(0, 5), (5, 5), (7, 20), (92, 249), (2.5, 10)])
 def test_wilson_is_its_formula(successes, n):
     z, p = 1.959963984540054, successes / n
@@ -217,6 +235,36 @@ def test_many_measures_at_once_draw_what_one_does(items):
         drawn = bootstrap_by_scene(values, scenes, statistic, seed=7, resamples=300)
         assert found == pytest.approx(drawn, abs=1e-12)
         assert found[0] <= statistic(values) <= found[1]
+
+
+@pytest.mark.parametrize("items", [1, 3, 40, 401])
+def test_a_macro_is_the_mean_of_its_families_means(items):
+    rng = np.random.default_rng(items)
+    scenes = [f"scene {k}" for k in rng.integers(max(1, items // 5), size=items)]
+    families = rng.choice(["event", "time", "window"], size=items, p=[0.1, 0.2, 0.7])
+    credits = rng.integers(2, size=items)
+
+    def macro(rows):
+        return np.mean([rows[rows[:, 0] == f, 1].astype(float).mean() for f in set(rows[:, 0])])
+
+    found = macro_by_scene(credits, families, scenes, seed=7)
+    assert found.value == pytest.approx(accuracy_table(families, credits).macro)
+    assert found.n == items
+    table = np.stack([families, credits.astype(str)], axis=1)
+    drawn = bootstrap_by_scene(table, scenes, macro, seed=7)
+    assert (found.low, found.high) == pytest.approx(drawn, abs=1e-12)
+    # Of one family it is the mean.
+    alone = macro_by_scene(credits, ["time"] * items, scenes, seed=7)
+    assert (alone.low, alone.high) == pytest.approx(
+        bootstrap_by_scene(credits, scenes, np.mean, seed=7)
+    )
+
+
+def test_a_macro_of_parts_that_do_not_fit_is_refused():
+    with pytest.raises(ValueError, match="values for"):
+        macro_by_scene([1, 0], ["event"], ["a", "b"], seed=0)
+    with pytest.raises(ValueError, match="no items"):
+        macro_by_scene([], [], [], seed=0)
 
 
 def test_many_measures_of_nothing_are_refused():
