@@ -32,19 +32,18 @@ SampleOf = Callable[[str, Thing], Sample]
 
 @dataclass(frozen=True)
 class Asked:
-    """A model that can be asked: its name for a table, `say` by mode, and what its answers are
-    known by."""
+    """A model that can be asked: its name for a table, what its answers are known by, and
+    `say(mode, sample_of)`, by which it answers things as `sample_of` shows and asks them."""
 
     name: str
     revision: dict[str, Any]
-    say: Callable[[str], Say]
+    say: Callable[[str, SampleOf], Say]
 
 
 def asked_model(
     cfg: SelectCommand | TwoStageCommand,
     folder: Path | None,
     trained: SftCommand | SelectCommand | TwoStageCommand,
-    sample_of: SampleOf,
 ) -> Asked:
     """The model that `cfg` names: at servers where it names some, else on this machine. `trained`
     are the settings of the run in `folder`, or the command's own.
@@ -53,8 +52,8 @@ def asked_model(
         UserError: what `model_served` and `model_here` raise.
     """
     if cfg.server.url is not None:
-        return model_served(cfg, folder, trained.student, sample_of)
-    return model_here(cfg, folder, trained.student, settled(trained.train.precision), sample_of)
+        return model_served(cfg, folder, trained.student)
+    return model_here(cfg, folder, trained.student, settled(trained.train.precision))
 
 
 def model_here(
@@ -62,7 +61,6 @@ def model_here(
     folder: Path | None,
     student: StudentConfig,
     precision: str,
-    sample_of: SampleOf,
 ) -> Asked:
     """A model that is loaded on this machine, when it is first asked: the student in a run's or an
     export's `folder`, or the base.
@@ -82,7 +80,7 @@ def model_here(
             return backbone.load_base(student, precision, list)
         return backbone.load_trained(student, precision, weights)
 
-    def say(mode: str) -> Say:
+    def say(mode: str, sample_of: SampleOf) -> Say:
         def answer(things: list[Thing], keep: Keep) -> None:
             shown = partial(sample_of, mode)
             here.say(*loaded(), student, precision, cfg.batch, cfg.seed, mode, shown, things, keep)
@@ -99,10 +97,7 @@ def model_here(
 
 
 def model_served(
-    cfg: SelectCommand | TwoStageCommand,
-    folder: Path | None,
-    student: StudentConfig,
-    sample_of: SampleOf,
+    cfg: SelectCommand | TwoStageCommand, folder: Path | None, student: StudentConfig
 ) -> Asked:
     """A model that servers have.
 
@@ -119,7 +114,7 @@ def model_served(
     weights = product_folder(folder, "student") if folder else None
     told["weights"] = compatible.weights_digest(told["root"], told["parent"], weights)
 
-    def say(mode: str) -> Say:
+    def say(mode: str, sample_of: SampleOf) -> Say:
         return partial(served.say, server, student, cfg.seed, mode, partial(sample_of, mode))
 
     return Asked(_title(folder, student), {"served": server.model, **told}, say)

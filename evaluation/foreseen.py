@@ -17,7 +17,7 @@ from conf.schema import StudentConfig, TwoStageCommand
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
 from evaluation.answers import AnswerLog, Told, as_told, ask_all
-from evaluation.asked import Asked, known_by
+from evaluation.asked import Asked, SampleOf, known_by
 from evaluation.drawn import short_hash
 from teacher.sections import SECTIONS, parts
 
@@ -66,6 +66,7 @@ def write_texts(
     cfg: TwoStageCommand,
     student: StudentConfig,
     model: Asked,
+    sample_of: SampleOf,
     modes: Sequence[str],
     queries: Sequence[RetrievalQuery],
     database: Sequence[FrameRef],
@@ -91,7 +92,7 @@ def write_texts(
             things, unit = (database, "frame") if mode == "caption" else (queries, "query")
             # Scene by scene, so that a scene's frames are decoded once.
             ordered = sorted(things, key=lambda t: (t.scene_id, t.name))
-            written[mode] = ask_all(ordered, mode, model.say(mode), log, unit)
+            written[mode] = ask_all(ordered, mode, model.say(mode, sample_of), log, unit)
         return written
 
 

@@ -1,4 +1,5 @@
-"""From ranks to rows: every measure of a retriever, by builder and width, with its interval."""
+"""From ranks and credits to rows: every measure of a retriever, by builder and width, and of a
+choice among candidates, by family and subtype, with its interval."""
 
 from __future__ import annotations
 
@@ -7,10 +8,44 @@ from typing import Any
 
 import numpy as np
 
-from data.records import RetrievalQuery
-from evaluation.metrics import Interval, SceneBootstrap, expected_hits, query_measures, summary
+from data.records import RetrievalQuery, SelectionItem
+from data.selection.time import CELLS
+from evaluation.metrics import (
+    Interval,
+    SceneBootstrap,
+    accuracy_by,
+    accuracy_table,
+    expected_hits,
+    macro_by_scene,
+    query_measures,
+    summary,
+)
 from evaluation.ranking import Ranks
-from evaluation.tables import RECALLS, RetrievalRow
+from evaluation.tables import RECALLS, RetrievalRow, SelectionRow
+
+
+def selection_row(
+    benchmark: str,
+    name: str,
+    mode: str,
+    items: Sequence[SelectionItem],
+    credits: Sequence[float],
+    parse_rate: float | None,
+    seed: int,
+) -> SelectionRow:
+    """A row of the credit that each item was given, 1 for a right choice and 1/m for a tie among m.
+    The scenes of macro's interval are drawn by `seed`."""
+    families = [i.family for i in items]
+    macro = macro_by_scene(credits, families, [i.scene_id for i in items], seed)
+    timed = [(i, credit) for i, credit in zip(items, credits, strict=True) if i.family == "time"]
+    horizons = accuracy_by([f"{CELLS[i.subtype]} s" for i, _ in timed], [c for _, c in timed])
+    accuracy = accuracy_table(families, credits)
+    return SelectionRow.of(benchmark, name, mode, accuracy, parse_rate, macro, horizons)
+
+
+def by_subtype(items: Sequence[SelectionItem], credits: Sequence[float]) -> dict[str, Interval]:
+    """Accuracy of each cell, named `family/subtype`."""
+    return accuracy_by([f"{i.family}/{i.subtype}" for i in items], credits)
 
 
 def retrieval_rows(

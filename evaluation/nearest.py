@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from conf.schema import RetrieverConfig
-from data.records import SelectionItem
+from data.records import LETTERS, SelectionItem
 from evaluation.cache import Embeddings
 from evaluation.metrics import expected_hits, ranks_of
 from evaluation.ranking import Cut, pair_scores
@@ -40,3 +40,11 @@ def credits(scores: np.ndarray, answers: Sequence[int]) -> np.ndarray:
     0."""
     greater, tied = ranks_of(scores, np.asarray(answers))
     return expected_hits(greater, tied, np.ones(len(scores), bool), 1)
+
+
+def letters(scores: np.ndarray) -> list[str | None]:
+    """The letter of the candidate that scores highest, an item each; None where several do or none
+    has a score."""
+    # fmax passes over NaN, which is no score.
+    best = scores == np.fmax.reduce(scores, axis=1, keepdims=True)
+    return [LETTERS[row.argmax()] if row.sum() == 1 else None for row in best]

@@ -3,17 +3,18 @@ base by the structured record; loaded here, or asked at servers."""
 
 from __future__ import annotations
 
-import json
 import logging
-from collections import Counter
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import write_text
 from conf.schema import SelectCommand, SftCommand
+
+if TYPE_CHECKING:
+    from data.records import SelectionItem
+    from data.store import Store
 
 log = logging.getLogger(__name__)
 
@@ -36,63 +37,29 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.frames import Frames
-    from evaluation import answers, asked, figures, tables
-    from evaluation.confidence import calibration, positions
-    from evaluation.metrics import accuracy_by, accuracy_table
+    from evaluation import answers, asked, selected
 
-    items = spread(store.selection("test", cfg.suite), cfg.limit, cfg.seed)
-    if not items:
-        suite = cfg.suite or store.suite
-        raise UserError(f"{store.folder} has no test items of the {suite} suite to measure on")
+    items = chosen_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = Frames(store, student.image_size)
-    sample_of = partial(asked.shown, regime, frames, student, cfg.control)
-    model = asked.asked_model(cfg, folder, trained, sample_of)
-    name = model.name
-    asked_of = ", ".join(filter(None, (store.name, cfg.suite, cfg.control)))
-    known = {
-        mode: asked.known_by(
-            mode, regime, student, cfg.seed, model.revision, store.identity, cfg.control
-        )
-        for mode in modes
-    }
-    journal = answers.AnswerLog(run.folder / "answers.jsonl", known, items)
-    rows, metrics = [], {}
-    subtypes, letters, confidences, reasons = {}, {}, {}, {}
-    for mode in modes:
-        log.info("asking %s in %s mode", name, mode)
-        given = answers.ask_all(items, mode, model.say(mode), journal)
-        right = [float(a.right) for a in given]
-        accuracy = accuracy_table([i.family for i in items], right)
-        parsed = sum(a.letter is not None for a in given) / len(given)
-        rows.append(tables.SelectionRow.of(asked_of, name, mode, accuracy, parsed))
-        subtypes[mode] = accuracy_by([f"{i.family}/{i.subtype}" for i in items], right)
-        letters[mode] = positions([a.letter for a in given], [i.letter for i in items])
-        reasons[mode] = readings(given)
-        sure = [(a.record.confidence, a.right) for a in given if a.valid]
-        confidences[mode] = calibration(*zip(*sure, strict=True)) if sure else None
-        metrics |= {f"{mode}_{f}": found.value for f, found in accuracy.families.items()}
-        metrics |= {f"{mode}_macro": accuracy.macro, f"{mode}_micro": accuracy.micro.value}
-        metrics[f"{mode}_parse_rate"] = parsed
+    model = asked.asked_model(cfg, folder, trained)
+    given = {}
+    # What a control changes shows only beside the same items as they are.
+    for control in dict.fromkeys([None, cfg.control]):
+        known = {
+            mode: asked.known_by(
+                mode, regime, student, cfg.seed, model.revision, store.identity, control
+            )
+            for mode in modes
+        }
+        journal = answers.AnswerLog(run.folder / "answers.jsonl", known, items)
+        sample_of = partial(asked.shown, regime, frames, student, control)
+        for mode in modes:
+            log.info("asking %s in %s mode%s", model.name, mode, f", {control}" if control else "")
+            given[mode, control] = answers.ask_all(items, mode, model.say(mode, sample_of), journal)
 
-    table = tables.selection_table(rows)
-    log.info("%s", table)
-    told = {mode: found for mode, found in confidences.items() if found}
-    parts = [table, tables.subtype_table(subtypes), tables.reading_table(reasons)]
-    parts += [tables.position_table(letters)]
-    parts += [tables.calibration_table(mode, found) for mode, found in told.items()]
-    write_text(run.folder / "report.txt", "\n\n".join(parts) + "\n")
-    cells = {mode: {c: vars(found) for c, found in by.items()} for mode, by in subtypes.items()}
-    report = {
-        "rows": [r.to_dict() for r in rows],
-        "subtypes": cells,
-        "readings": reasons,
-        "positions": {mode: asdict(found) for mode, found in letters.items()},
-        "calibration": {mode: asdict(found) for mode, found in told.items()},
-    }
-    write_text(run.folder / "report.json", json.dumps(report, indent=1))
-    figures.selection_figure(rows, run.folder / "selection.png")
-    answer = journal.answers[items[0].item_id, modes[0]]
-    draw_item(items[0], answer.letter, Frames(store), run.folder / "item.png")
+    metrics = selected.write_report(given, items, model.name, store.name, cfg, run.folder)
+    letter = given[modes[0], cfg.control][0].letter
+    draw_item(items[0], letter, Frames(store), run.folder / "item.png")
     return metrics
 
 
@@ -101,16 +68,6 @@ def default_modes(cfg: SelectCommand, regime: str) -> list[str]:
     if cfg.model is not None:
         return ["answer"] if regime == "answer_only" else ["reasoning", "answer"]
     return ["record"] if cfg.server.url is None else ["record", "constrained"]
-
-
-def readings(given: list) -> dict[str, int]:
-    """How many answers could be read, how many of them are or hold a valid record where one was
-    asked for, and why the others could not."""
-    counts = {"with a letter": sum(a.letter is not None for a in given)}
-    if given[0].valid is not None:
-        counts["  in a valid record"] = sum(a.valid for a in given)
-    reasons = Counter(f"without: {a.reason}" for a in given if a.letter is None)
-    return counts | dict(reasons.most_common())
 
 
 def draw_item(item, chosen, frames, path: Path) -> None:
@@ -128,6 +85,31 @@ def draw_item(item, chosen, frames, path: Path) -> None:
         item.question,
         path,
     )
+
+
+def chosen_items(
+    store: Store, suite: str | None, limit: int | None, seed: int
+) -> list[SelectionItem]:
+    """The test items of a suite that are asked: all, or `limit` spread over the families. Of
+    matched-anchor pairs both items are, or neither.
+
+    Raises:
+        UserError: the benchmark has none.
+    """
+    from data.controls import MATCHED, pairs
+
+    items = store.selection("test", suite)
+    if not items:
+        hint = "; give benchmark.selection.matched.test pairs, such as benchmark=tiny has"
+        raise UserError(
+            f"{store.folder} has no test items of the {suite or store.suite} suite to measure on"
+            f"{hint if suite == MATCHED else ''}"
+        )
+    if suite != MATCHED or limit is None:
+        return spread(items, limit, seed)
+    pair_of = {by_event.item_id: (by_event, by_time) for by_event, by_time in pairs(items)}
+    kept = spread([by_event for by_event, _ in pair_of.values()], limit // 2, seed)
+    return [item for by_event in kept for item in pair_of[by_event.item_id]]
 
 
 def spread(items: list, limit: int | None, seed: int) -> list:

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import asdict
 from pathlib import Path
 
 from conf.entry import Run, command
-from conf.errors import UserError
 from conf.runs import write_text
 from conf.schema import ContrastiveCommand, SimilarityCommand
 
@@ -26,39 +26,46 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
+    from data.controls import MATCHED
     from data.frames import Frames
     from data.records import FrameRef
     from evaluation import embedding, figures, nearest, tables
-    from evaluation.metrics import accuracy_by, accuracy_table
-    from evaluation.select import spread
+    from evaluation.confidence import positions
+    from evaluation.measures import by_subtype, selection_row
+    from evaluation.paired import anchors
+    from evaluation.select import chosen_items
     from train.precision import settled
 
-    items = spread(store.selection("test", cfg.suite), cfg.limit, cfg.seed)
-    if not items:
-        suite = cfg.suite or store.suite
-        raise UserError(f"{store.folder} has no test items of the {suite} suite to measure on")
+    items = chosen_items(store, cfg.suite, cfg.limit, cfg.seed)
     candidates = {FrameRef(c.scene_id, c.frame) for item in items for c in item.candidates}
     frames = Frames(store, preset.image_size)
     precision = settled(trained.train.precision)
     asked_of = ", ".join(filter(None, (store.name, cfg.suite)))
-    rows, subtypes = [], {}
+    rows, subtypes, letters, apart = [], {}, {}, []
     for embedder in embedding.embedders(folder, preset, precision, store, run.folder):
         asked = embedding.embed_queries(embedder, items, store, frames, cfg.batch)
         shown = embedding.embed_frames(embedder, candidates, store, frames, cfg.batch)
         log.info("choosing for %s items with %s", f"{len(items):,}", embedder.name)
         scores = nearest.candidate_scores(items, asked, shown, preset)
         right = nearest.credits(scores, [item.answer for item in items])
-        accuracy = accuracy_table([i.family for i in items], right)
-        rows.append(
-            tables.SelectionRow.of(asked_of, embedder.name, tables.SIMILARITY, accuracy, None)
-        )
-        subtypes[embedder.name] = accuracy_by([f"{i.family}/{i.subtype}" for i in items], right)
+        name = embedder.name
+        rows.append(selection_row(asked_of, name, tables.SIMILARITY, items, right, None, cfg.seed))
+        subtypes[name] = by_subtype(items, right)
+        letters[name] = positions(nearest.letters(scores), [item.letter for item in items])
+        if cfg.suite == MATCHED:
+            credits = {item.item_id: credit for item, credit in zip(items, right, strict=True)}
+            apart.append((name, anchors(items, credits, cfg.seed)))
 
-    table = tables.selection_table(rows)
-    log.info("%s", table)
-    write_text(run.folder / "report.txt", f"{table}\n\n{tables.subtype_table(subtypes)}\n")
-    cells = {name: {c: vars(found) for c, found in by.items()} for name, by in subtypes.items()}
-    report = {"rows": [r.to_dict() for r in rows], "subtypes": cells}
+    parts = [tables.selection_table(rows), *([tables.paired_table(apart)] if apart else [])]
+    log.info("%s", "\n\n".join(parts))
+    parts += [tables.subtype_table(subtypes), tables.position_table(letters)]
+    write_text(run.folder / "report.txt", "\n\n".join(parts) + "\n")
+    report = {
+        "rows": [r.to_dict() for r in rows],
+        "controls": [{"mode": name, **asdict(p)} for name, found in apart for p in found],
+        "subtypes": {n: {c: vars(i) for c, i in by.items()} for n, by in subtypes.items()},
+        "positions": {n: asdict(found) for n, found in letters.items()},
+    }
     write_text(run.folder / "report.json", json.dumps(report, indent=1))
     figures.selection_figure(rows, run.folder / "selection.png")
     first = rows[0]

@@ -141,10 +141,10 @@ def selection_table(rows: Sequence[SelectionRow]) -> str:
         [*head, "Macro", "Micro", "Parsed", "Items"],
         {"": own, "paper (Qwen3-VL 8B, full benchmark)": reference},
     )
-    return (
-        f"{table}\nIntervals are Wilson's, macro's is bootstrapped over scenes; an answer that "
-        "cannot be parsed is\nwrong."
+    note = (
+        "Intervals are Wilson's, macro's bootstrapped over scenes; what cannot be parsed is wrong."
     )
+    return f"{table}\n{note}"
 
 
 def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> str:

@@ -51,11 +51,11 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     matcher = next(embedders(matched_by, frozen.retriever, precision, store, run.folder))
     student = trained.student
     sample_of = partial(told_sample, Frames(store, student.image_size), student)
-    model = asked_model(cfg, folder, trained, sample_of)
+    model = asked_model(cfg, folder, trained)
     name = model.name
     log.info("asking %s", name)
     modes = foreseen.modes_of(routes)
-    written = foreseen.write_texts(cfg, student, model, modes, queries, database, store)
+    written = foreseen.write_texts(cfg, student, model, sample_of, modes, queries, database, store)
     texts = {mode: foreseen.texts_of(told) for mode, told in written.items()}
     # The matcher needs the room.
     del model

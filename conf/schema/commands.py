@@ -262,18 +262,18 @@ class SelectCommand(CommandConfig):
     limit: int | None = None
     """Test items at most, spread over the cells; null takes all."""
     seed: int = 0
-    """Of the items that `limit` leaves, and of answers that are drawn."""
+    """Of the items that `limit` leaves, of answers that are drawn, and of the scenes that are drawn
+    for intervals."""
     suite: str | None = None
     """matched_anchor for the pairs that differ in their anchor alone; null takes the benchmark's
     own items."""
     control: str | None = None
-    """candidate_only hides the prefix, shuffled_prefix shows its frames out of order; null shows
-    it as it is."""
+    """candidate_only hides the prefix, shuffled_prefix shows its frames out of order, both beside
+    the same items as they are; null shows them so alone."""
 
     def check(self) -> list[str]:
         problems = super().check() + too_small(self, "", {"batch": 1, "limit": 1})
-        if self.suite not in SUITES:
-            problems.append(f"suite={self.suite}: the options are matched_anchor and null")
+        problems += suite_problems(self)
         if self.control not in (None, "candidate_only", "shuffled_prefix"):
             problems.append(
                 f"control={self.control}: the options are candidate_only, shuffled_prefix and null"
@@ -333,18 +333,25 @@ class SimilarityCommand(CommandConfig):
     limit: int | None = None
     """Test items at most, spread over the families; null takes all."""
     seed: int = 0
-    """Of the items that `limit` leaves."""
+    """Of the items that `limit` leaves, and of the scenes that are drawn for intervals."""
     suite: str | None = None
     """matched_anchor for the pairs that differ in their anchor alone; null takes the benchmark's
     own items."""
 
     def check(self) -> list[str]:
         problems = super().check() + too_small(self, "", {"batch": 1, "limit": 1})
-        if self.suite not in SUITES:
-            problems.append(f"suite={self.suite}: the options are matched_anchor and null")
+        problems += suite_problems(self)
         return problems
 
 
 @dataclass
 class ReportCommand(CommandConfig):
     pass
+
+
+def suite_problems(cfg: SelectCommand | SimilarityCommand) -> list[str]:
+    if cfg.suite not in SUITES:
+        return [f"suite={cfg.suite}: the options are matched_anchor and null"]
+    if cfg.suite is not None and cfg.limit == 1:
+        return [f"limit=1: suite={cfg.suite} asks pairs of items, give 2 or more"]
+    return []

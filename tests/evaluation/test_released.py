@@ -25,7 +25,7 @@ from conf.schema import (
     SimilarityCommand,
 )
 from data.frames import Frames
-from data.records import FPS, FRAMES, FrameRef, shown_frames
+from data.records import FPS, FRAMES, LETTERS, FrameRef, shown_frames
 from evaluation import nearest, retrieve, similarity
 from evaluation.dual import unit
 from evaluation.embedding import EMBEDDINGS
@@ -216,6 +216,8 @@ def test_the_nearest_candidate_is_chosen_once_and_read_back(
         of = [item.family == family for item in items]
         assert found["value"] == pytest.approx(right[of].mean())
     assert set(report["subtypes"]["clip"]) == {f"{i.family}/{i.subtype}" for i in items}
+    chosen = report["positions"]["clip"]["chosen"]
+    assert chosen == {x: int((scores.argmax(1) == k).sum()) for k, x in enumerate(LETTERS)}
     text = (tmp_path / "first" / "report.txt").read_text()
     assert "SigLIP 2" in text
     assert all(subtype in text for subtype in report["subtypes"]["clip"])
@@ -233,6 +235,19 @@ def test_released_models_are_ranked_as_retrievers(measure, presets) -> None:
 def test_a_tie_is_shared() -> None:
     scores = np.array([[1, 1, 0, 0], [1, 1, 1, 1], [0, 2, 1, 0], [3, 3, 3, 4]], np.float32)
     assert nearest.credits(scores, [1, 0, 1, 0]).tolist() == [0.5, 0.25, 1, 0]
+
+
+def test_a_tie_is_no_choice() -> None:
+    rng = np.random.default_rng(0)
+    scores, answers = rng.integers(3, size=(200, 4)).astype(np.float32), rng.integers(4, size=200)
+    scores[:5, 1:] = np.nan
+    scores[5] = np.nan
+    chosen = nearest.letters(scores)
+    assert chosen[:6] == ["A"] * 5 + [None]
+    # What is chosen is right where the credit is whole.
+    credits = nearest.credits(scores, answers)[6:]
+    right = [c == LETTERS[a] for c, a in zip(chosen[6:], answers[6:], strict=True)]
+    assert right == (credits == 1).tolist()
 
 
 def without(part: str) -> Callable[[Path], None]:

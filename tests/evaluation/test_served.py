@@ -214,7 +214,7 @@ def test_a_student_is_not_measured_by_its_base(talking, tmp_path) -> None:
     server = talking(lambda _: FULL)
     cfg = SelectCommand(server=replace(at(server), model=None), student=STUDENT)
     with pytest.raises(UserError, match=r"give server\.model=NAME"):
-        model_served(cfg, tmp_path, STUDENT, None)
+        model_served(cfg, tmp_path, STUDENT)
 
 
 def test_answers_to_other_questions_stay_and_do_not_count(items, tmp_path) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data.records import FrameRef, RetrievalQuery
+from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
 from evaluation import paper
 from evaluation.figures import (
     builders_figure,
@@ -13,13 +13,14 @@ from evaluation.figures import (
     retrieval_figure,
     selection_figure,
 )
-from evaluation.measures import recall_curves
+from evaluation.measures import recall_curves, selection_row
 from evaluation.measures import retrieval_rows as retrieval_rows_of
 from evaluation.metrics import (
     accuracy_table,
     bootstrap_by_scene,
     metrics_from_counts,
     query_measures,
+    wilson,
 )
 from evaluation.ranking import Ranks
 from evaluation.tables import (
@@ -184,6 +185,35 @@ def test_retrieval_table_sets_the_untrained_row_beside_each_width(retrieval_rows
     assert [line.split()[:2] for line in lines[2:14:2]] == [
         [name, str(width)] for width in (4096, 256, 64) for name in (UNTRAINED, "contrastive")
     ]
+
+
+def test_a_row_holds_the_time_items_by_their_distance_and_macros_interval():
+    families = ["event"] * 20 + ["time"] * 30 + ["window"] * 50
+    items = [
+        SelectionItem(
+            f"i{k}", "test", "dynapix", family, ("in_1s", "in_2s")[k % 2], "Which?", f"s{k % 9}",
+            0, 20, 40, tuple(Candidate(f"s{k % 9}", f, "x") for f in (40, 50, 60, 70)), 0, 12.0,
+        )
+        for k, family in enumerate(families)
+    ]  # fmt: skip
+    credits = [1.0, 0.0, 0.0, 0.5] * 25
+    row = selection_row("tiny", "one", "answer", items, credits, 1.0, seed=4)
+    for k, horizon in enumerate(("1 s", "2 s")):
+        of = [c for n, c in enumerate(credits) if families[n] == "time" and n % 2 == k]
+        assert row.horizons[horizon].value == pytest.approx(np.mean(of))
+        assert (row.horizons[horizon].low, row.horizons[horizon].high) == wilson(sum(of), len(of))
+    assert row.families == accuracy_table(families, credits).families
+    assert row.macro_interval.value == pytest.approx(row.macro)
+    assert SelectionRow.from_dict(json.loads(json.dumps(row.to_dict()))) == row
+    table = selection_table([row])
+    assert max(map(len, table.splitlines())) <= 100
+    own, reference = table.split("paper (Qwen3-VL 8B, full benchmark)")
+    for part, share in ((own, f"{100 * row.horizons['2 s'].value:.1f}"), (reference, "37.6")):
+        [line] = [x for x in part.splitlines() if "time, 2 s" in x and share in x]
+        assert line.index(share) == table.index("Time")
+    # An older report's row has neither.
+    old = {k: v for k, v in row.to_dict().items() if k not in ("macro_interval", "horizons")}
+    assert SelectionRow.from_dict(old).micro == row.micro
 
 
 def test_rows_are_json(selection_rows, retrieval_rows):

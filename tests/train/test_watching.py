@@ -89,7 +89,7 @@ def test_what_is_written_is_what_the_evaluation_reads(
         assert len(written) == 2
         asked = [items[item_id] for item_id in written]
         log = AnswerLog(tmp_path / f"{mode}.jsonl", {mode: {}}, asked)
-        sample_of = partial(shown, mode, "cot", frames, settings.student, None)
+        sample_of = partial(shown, "cot", frames, settings.student, None, mode)
         answer = partial(
             here.say, model, processor, settings.student, "fp32", 2, 0, mode, sample_of
         )

@@ -1,0 +1,111 @@
+"""A control is told beside the same items as they are, by the real command and a real server."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from conf.entry import Run
+from conf.errors import UserError
+from conf.schema import BenchmarkConfig, SelectCommand, ServerConfig, StudentConfig
+from data.controls import MATCHED, pairs
+from evaluation import select
+from evaluation.tables import SelectionRow
+
+STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
+
+
+@pytest.fixture
+def command(micro, micro_store):
+    def asked(server, **changes) -> SelectCommand:
+        served = ServerConfig(url=[server.url], model="served", patience=5.0, timeout=10.0)
+        store = str(micro_store.folder.parent)
+        settings = {"modes": ["answer"], **changes}
+        return SelectCommand(
+            benchmark=micro, student=STUDENT, server=served, store=store, **settings
+        )
+
+    return asked
+
+
+def parts_of(request) -> list[dict]:
+    return request["messages"][0]["content"]
+
+
+def test_a_prefix_is_worth_what_its_items_lose_without_it(
+    command, micro_store, talking, tmp_path
+) -> None:
+    def says(request) -> str:
+        return "Answer: C" if any(p["type"] == "video_url" for p in parts_of(request)) else "B"
+
+    server = talking(says)
+    cfg = command(server, control="candidate_only", limit=12)
+    metrics = select.main.__wrapped__(cfg, Run("x", tmp_path))
+    items = select.chosen_items(micro_store, None, 12, 0)
+    plain, control = (sum(i.letter == x for i in items) for x in "CB")
+    told = json.loads((tmp_path / "report.json").read_text())
+    name = micro_store.name
+    rows = [SelectionRow.from_dict(r) for r in told["rows"]]
+    assert [(r.benchmark, r.mode) for r in rows] == [
+        (name, "answer"), (f"{name}, candidate_only", "answer"),
+    ]  # fmt: skip
+    assert metrics["answer_micro"] == rows[1].micro.value == control / 12
+    whole = next(p for p in told["controls"] if p["of"] == "all")
+    assert (whole["mode"], whole["left"], whole["right"]) == (
+        "answer", "as they are", "candidate_only",
+    )  # fmt: skip
+    assert (whole["only_left"], whole["only_right"], whole["n"]) == (plain, control, 12)
+    assert whole["difference"] == pytest.approx((plain - control) / 12)
+    text = (tmp_path / "report.txt").read_text()
+    assert "answer: as they are (left) less candidate_only (right)" in text
+    assert "any base (answer, candidate_only)" in text
+
+    # All is answered, either way: the same command asks nothing and says the same.
+    server.asked.clear()
+    assert select.main.__wrapped__(cfg, Run("x", tmp_path)) == metrics
+    assert not server.asked
+    assert json.loads((tmp_path / "report.json").read_text()) == told
+
+
+def test_the_questions_of_a_pair_are_held_against_each_other(
+    command, micro_store, talking, tmp_path
+) -> None:
+    items = select.chosen_items(micro_store, MATCHED, None, 0)
+    letters = {}
+    for by_event, by_time in pairs(items):
+        letters[by_event.question] = "A"
+        letters[by_time.question] = "B"
+
+    def says(request) -> str:
+        asked = next(p["text"] for p in parts_of(request) if p["type"] == "text")
+        return next(letter for question, letter in letters.items() if asked.startswith(question))
+
+    cfg = command(talking(says), suite=MATCHED)
+    metrics = select.main.__wrapped__(cfg, Run("x", tmp_path))
+    [found] = json.loads((tmp_path / "report.json").read_text())["controls"]
+    truth = [by_event.letter for by_event, _ in pairs(items)]
+    assert (found["left"], found["right"], found["n"]) == ("event", "time", len(truth))
+    assert (found["only_left"], found["only_right"]) == (truth.count("A"), truth.count("B"))
+    assert found["left_accuracy"] == metrics["answer_event"]
+    assert found["right_accuracy"] == metrics["answer_time"]
+
+
+def test_a_limit_keeps_pairs_whole(micro_store) -> None:
+    items = select.chosen_items(micro_store, MATCHED, None, 0)
+    assert len(items) == 2 * len(pairs(items)) >= 2
+    few = select.chosen_items(micro_store, MATCHED, 3, 0)
+    [(by_event, by_time)] = pairs(few)
+    assert few == [by_event, by_time]
+
+
+def test_a_limit_that_leaves_no_pair_is_told() -> None:
+    cfg = SelectCommand(
+        benchmark=BenchmarkConfig(name="any"), student=STUDENT, suite=MATCHED, limit=1
+    )
+    assert cfg.check() == ["limit=1: suite=matched_anchor asks pairs of items, give 2 or more"]
+
+
+def test_a_suite_that_a_benchmark_lacks_is_told(micro_store) -> None:
+    with pytest.raises(UserError, match="has no test items of the physion suite to measure on"):
+        select.chosen_items(micro_store, "physion", None, 0)
