@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -115,7 +116,11 @@ def model_served(
     told["weights"] = compatible.weights_digest(told["root"], told["parent"], weights)
 
     def say(mode: str, sample_of: SampleOf) -> Say:
-        return partial(served.say, server, student, cfg.seed, mode, partial(sample_of, mode))
+        def answer(things: list[Thing], keep: Keep) -> None:
+            shown = partial(sample_of, mode)
+            asyncio.run(served.say(server, student, cfg.seed, mode, shown, things, keep))
+
+        return answer
 
     return Asked(_title(folder, student), {"served": server.model, **told}, say)
 

@@ -31,7 +31,7 @@ BLANK = 64
 """Edge in px of the frames of a canary."""
 
 
-def say(
+async def say(
     server: ServerConfig,
     cfg: StudentConfig,
     seed: int,
@@ -46,18 +46,6 @@ def say(
         UserError: no server can be asked, does not take a clip and images, or has no answer to
             one though it answers others.
     """
-    asyncio.run(_say(server, cfg, seed, mode, sample_of, things, keep))
-
-
-async def _say(
-    server: ServerConfig,
-    cfg: StudentConfig,
-    seed: int,
-    mode: str,
-    sample_of: Callable[[Thing], Sample],
-    things: list[Thing],
-    keep: Keep,
-) -> None:
     loop = asyncio.get_running_loop()
     # Frames are kept in one cache, which takes one thread at a time.
     with ThreadPoolExecutor(1) as desk:

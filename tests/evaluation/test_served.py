@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import io
 import json
@@ -49,7 +50,7 @@ def opened(tmp_path, items, **known) -> AnswerLog:
 
 def asker(server, frames, cfg=STUDENT, mode="record", control=None, seed=0):
     sample_of = partial(shown, "cot", frames, cfg, control, mode)
-    return partial(say, server, cfg, seed, mode, sample_of)
+    return lambda things, keep: asyncio.run(say(server, cfg, seed, mode, sample_of, things, keep))
 
 
 def test_the_same_frames_and_times_are_sent(items, frames, talking, tmp_path) -> None:
