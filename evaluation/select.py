@@ -90,34 +90,38 @@ def draw_item(item, chosen, frames, path: Path) -> None:
 def chosen_items(
     store: Store, suite: str | None, limit: int | None, seed: int
 ) -> list[SelectionItem]:
-    """The test items of a suite that are asked: all, or `limit` spread over the families. Of
-    matched-anchor pairs both items are, or neither.
+    """The test items of a suite that are asked, see `spread`.
 
     Raises:
         UserError: the benchmark has none.
     """
-    from data.controls import MATCHED, pairs
+    from data.controls import MATCHED
 
     items = store.selection("test", suite)
     if not items:
-        hint = "; give benchmark.selection.matched.test pairs, such as benchmark=tiny has"
+        hint = (
+            "; a benchmark has pairs by benchmark.selection.matched.test, such as benchmark=small"
+        )
         raise UserError(
             f"{store.folder} has no test items of the {suite or store.suite} suite to measure on"
             f"{hint if suite == MATCHED else ''}"
         )
-    if suite != MATCHED or limit is None:
-        return spread(items, limit, seed)
-    pair_of = {by_event.item_id: (by_event, by_time) for by_event, by_time in pairs(items)}
-    kept = spread([by_event for by_event, _ in pair_of.values()], limit // 2, seed)
-    return [item for by_event in kept for item in pair_of[by_event.item_id]]
+    return spread(items, limit, seed)
 
 
-def spread(items: list, limit: int | None, seed: int) -> list:
-    """`limit` items in a seeded order that takes the families in turn; all where it is null."""
+def spread(items: list[SelectionItem], limit: int | None, seed: int) -> list[SelectionItem]:
+    """`limit` items in a seeded order that takes the families in turn; all where it is null. Of
+    matched-anchor pairs it takes both items or neither."""
     import numpy as np
+
+    from data.controls import MATCHED, pairs
 
     if limit is None:
         return items
+    if items[0].suite == MATCHED:
+        matched = pairs(items)
+        order = np.random.default_rng(seed).permutation(len(matched))
+        return [item for k in order[: limit // 2] for item in matched[k]]
     order = np.random.default_rng(seed).permutation(len(items))
     turns: dict[str, int] = {}
     ranked = []

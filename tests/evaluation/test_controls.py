@@ -11,7 +11,10 @@ from conf.errors import UserError
 from conf.schema import BenchmarkConfig, SelectCommand, ServerConfig, StudentConfig
 from data.controls import MATCHED, pairs
 from evaluation import select
+from evaluation.answers import judge
+from evaluation.selected import write_report
 from evaluation.tables import SelectionRow
+from train.generate import Written
 
 STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
 
@@ -68,35 +71,38 @@ def test_a_prefix_is_worth_what_its_items_lose_without_it(
     assert json.loads((tmp_path / "report.json").read_text()) == told
 
 
-def test_the_questions_of_a_pair_are_held_against_each_other(
-    command, micro_store, talking, tmp_path
-) -> None:
-    items = select.chosen_items(micro_store, MATCHED, None, 0)
-    letters = {}
-    for by_event, by_time in pairs(items):
-        letters[by_event.question] = "A"
-        letters[by_time.question] = "B"
-
-    def says(request) -> str:
-        asked = next(p["text"] for p in parts_of(request) if p["type"] == "text")
-        return next(letter for question, letter in letters.items() if asked.startswith(question))
-
-    cfg = command(talking(says), suite=MATCHED)
-    metrics = select.main.__wrapped__(cfg, Run("x", tmp_path))
-    [found] = json.loads((tmp_path / "report.json").read_text())["controls"]
+def test_the_questions_of_a_pair_are_held_against_each_other(benchmark_store, tmp_path) -> None:
+    items = benchmark_store.selection(suite=MATCHED)
+    said = {"event": "Answer: A", "time": "Answer: B"}
+    given = {
+        ("answer", control): [judge(i, "answer", Written(said[i.family], False)) for i in items]
+        for control in (None, "candidate_only")
+    }
+    cfg = SelectCommand(
+        benchmark=BenchmarkConfig(name="any"), student=STUDENT, suite=MATCHED,
+        control="candidate_only",
+    )  # fmt: skip
+    metrics = write_report(given, items, "one", "any", cfg, tmp_path)
+    told = json.loads((tmp_path / "report.json").read_text())["controls"]
     truth = [by_event.letter for by_event, _ in pairs(items)]
-    assert (found["left"], found["right"], found["n"]) == ("event", "time", len(truth))
-    assert (found["only_left"], found["only_right"]) == (truth.count("A"), truth.count("B"))
-    assert found["left_accuracy"] == metrics["answer_event"]
-    assert found["right_accuracy"] == metrics["answer_time"]
+    matched = [p for p in told if p["left"] == "event"]
+    assert [p["mode"] for p in matched] == ["answer", "answer, candidate_only"]
+    for p in matched:
+        assert (p["right"], p["of"], p["n"]) == ("time", "all", len(truth))
+        assert (p["only_left"], p["only_right"]) == (truth.count("A"), truth.count("B"))
+        assert p["left_accuracy"] == metrics["answer_event"]
+        assert p["right_accuracy"] == metrics["answer_time"]
+    # What is said alike either way is apart by nothing.
+    assert {p["difference"] for p in told if p["left"] != "event"} == {0}
 
 
-def test_a_limit_keeps_pairs_whole(micro_store) -> None:
-    items = select.chosen_items(micro_store, MATCHED, None, 0)
-    assert len(items) == 2 * len(pairs(items)) >= 2
-    few = select.chosen_items(micro_store, MATCHED, 3, 0)
+def test_a_limit_keeps_pairs_whole(benchmark_store) -> None:
+    items = benchmark_store.selection(suite=MATCHED)
+    assert len(items) == 2 * len(pairs(items))
+    few = select.spread(items, 3, 0)
     [(by_event, by_time)] = pairs(few)
     assert few == [by_event, by_time]
+    assert sorted(select.spread(items, len(items), 0), key=items.index) == items
 
 
 def test_a_limit_that_leaves_no_pair_is_told() -> None:
@@ -106,6 +112,7 @@ def test_a_limit_that_leaves_no_pair_is_told() -> None:
     assert cfg.check() == ["limit=1: suite=matched_anchor asks pairs of items, give 2 or more"]
 
 
-def test_a_suite_that_a_benchmark_lacks_is_told(micro_store) -> None:
-    with pytest.raises(UserError, match="has no test items of the physion suite to measure on"):
-        select.chosen_items(micro_store, "physion", None, 0)
+@pytest.mark.parametrize(("suite", "hint"), [("physion", "measure on$"), (MATCHED, "has pairs by")])
+def test_a_suite_that_a_benchmark_lacks_is_told(micro_store, suite, hint) -> None:
+    with pytest.raises(UserError, match=f"has no test items of the {suite} suite to .*{hint}"):
+        select.chosen_items(micro_store, suite, None, 0)
