@@ -66,13 +66,11 @@ class SelectionRow:
 
     @classmethod
     def from_dict(cls, row: dict[str, Any]) -> SelectionRow:
-        groups = {
-            key: {name: Interval(**found) for name, found in row.get(key, {}).items()}
-            for key in ("families", "horizons")
-        }
+        families = {name: Interval(**found) for name, found in row["families"].items()}
+        horizons = {name: Interval(**found) for name, found in row.get("horizons", {}).items()}
         macro = row.get("macro_interval")
         whole = {"micro": Interval(**row["micro"]), "macro_interval": macro and Interval(**macro)}
-        return cls(**{**row, **groups, **whole})
+        return cls(**{**row, "families": families, "horizons": horizons, **whole})
 
 
 @dataclass(frozen=True)
