@@ -23,11 +23,11 @@ import numpy as np
 import psutil
 
 from conf.schema import BenchmarkConfig
-from data.bullet import simulate_scene
 from data.geometry import Camera, hit_depth
 from data.records import Scene, SceneObject
 from data.renderers import check
 from data.renderers.blender import BlenderRenderer
+from data.sampling import simulate_scene
 
 SIZES = ((128, 128), (336, 224), (480, 320))
 FRAMES = (20, 60, 100)

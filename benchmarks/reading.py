@@ -23,8 +23,8 @@ import torch
 from PIL import Image
 
 from conf.schema import BenchmarkConfig
-from data.bullet import simulate_scene
 from data.frames import FrameCache, Frames, load_frames, save_frames
+from data.sampling import simulate_scene
 from data.store import save_scene, scene_path
 
 RUNS = 30

@@ -21,11 +21,11 @@ from pathlib import Path
 import numpy as np
 
 from conf.schema import BenchmarkConfig
-from data.bullet import simulate_scene
 from data.frames import save_frames
 from data.parallel import Workers
 from data.records import FRAMES, Scene
 from data.renderers.bullet import BulletRenderer
+from data.sampling import simulate_scene
 
 SIZES = ((192, 128), (240, 160), (480, 320))
 STRIDE = 2

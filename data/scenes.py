@@ -15,10 +15,10 @@ import numpy as np
 
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig
-from data.bullet import record, sample_bodies, scene_id, without
 from data.parallel import Workers
 from data.records import SPLITS
 from data.retrieval import counterfactual
+from data.sampling import record, sample_bodies, scene_id, without
 from data.store import PARTS, save_scene, scene_path, write_atomically
 from data.transfer.reading import BadRecord
 from data.transfer.release import RELEASES

@@ -9,17 +9,9 @@ import numpy as np
 import pytest
 
 from conf.schema import BenchmarkConfig
-from data.bullet import (
-    FRICTION_DECELERATION,
-    Body,
-    _debounce,
-    record,
-    sample_bodies,
-    simulate_scene,
-    without,
-    world,
-)
+from data.bullet import FRICTION_DECELERATION, Body, _debounce, world
 from data.records import FPS, Collision, Scene, SceneObject
+from data.sampling import record, sample_bodies, simulate_scene, without
 
 LIMITS = BenchmarkConfig(name="laws")
 CUBE = SceneObject("cube", "rubber", "red")

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from conf.schema import BenchmarkConfig
-from data.bullet import simulate_scene
 from data.geometry import Camera, displacements, object_match
 from data.records import COLORS, MATERIALS, SHAPES, Scene, SceneObject
 from data.renderers import renderer
 from data.renderers.bullet import BulletRenderer
 from data.renderers.looks import RGB
+from data.sampling import simulate_scene
 
 LIMITS = BenchmarkConfig(name="pixels")
 

@@ -16,13 +16,13 @@ from PIL import Image
 
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig
-from data.bullet import simulate_scene
 from data.geometry import Camera, hit_depth, standard_camera
 from data.records import Scene
 from data.renderers import RENDERERS, blender, check, renderer
 from data.renderers.bullet import BulletRenderer, _average
 from data.renderers.egl import EglRenderer
 from data.renderers.floor import Floor
+from data.sampling import simulate_scene
 
 LIMITS = BenchmarkConfig(name="renderers")
 

@@ -17,9 +17,9 @@ import pytest
 from conf.errors import SettingsError, UserError
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from data.build import build, ensure_benchmark, ensure_items
-from data.bullet import scene_id
 from data.growing import growing_folder
 from data.parallel import Workers
+from data.sampling import scene_id
 from data.scenes import split_scenes
 from data.store import MANIFEST, digest, digests, open_store, write_atomically
 

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig
-from data.bullet import simulate_scene
 from data.geometry import rotation
 from data.records import Collision
 from data.renderers import renderer
+from data.sampling import simulate_scene
 from data.transfer import clevrer
 from data.transfer.export import write_clevrer
 from data.transfer.reading import BadRecord
