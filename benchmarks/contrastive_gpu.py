@@ -6,7 +6,8 @@ switch on and off: queries a second and peak memory, in one run.
 
 Weights are random, of the released model's shape, and made on the card, so nothing is fetched;
 everything else is the preset's. Frames are noise. Batches are as builders make them: of each scene
-four queries, of which two share a prefix and every two a hard negative.
+four queries, of which two share a prefix and every two a hard negative. The rate of the trainer as
+it comes is kept for benchmarks.hours, where a card measured it.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from benchmarks import hours
 from benchmarks.contrastive_runs import repeated, trained
 from benchmarks.sft_gpu import CONFIGS, random_model
 from benchmarks.sft_runs import SEED, device_name
@@ -42,11 +44,14 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "  the tower's features reused": {"reuse_features": True},
     "  by tokens": {"mini_batch_tokens": 16384},
     "  inputs made ahead": {"workers": 2},
+    "ours, as it comes": {"distinct_frames": True, "shared_prefixes": True},
     "ours, all of it": {
         "distinct_frames": True, "shared_prefixes": True, "reuse_features": True,
         "mini_batch_tokens": 16384, "workers": 2,
     },
 }  # fmt: skip
+PRESET = "ours, as it comes"
+"""The line whose rate benchmarks.hours goes by."""
 ALONE = {"distinct_frames": False, "shared_prefixes": False}
 
 
@@ -96,6 +101,8 @@ def measure(name: str, base: str, batch: int, steps: int) -> None:
         print(
             f"{line:<40}{rate:>11.2f}{figures.peak:>10.2f}{figures.losses[-1]:>10.4f}", flush=True
         )
+        if line == PRESET and name != "tiny" and model.device.type == "cuda":
+            hours.add("contrastive_gpu", cfg.retriever.name, base, rate, device_name())
 
 
 def settings(name: str, base: str, batch: int) -> ContrastiveCommand:

@@ -10,6 +10,7 @@ samples, half of them rationales of 80 to 250 words, half answers. The peak is w
 own matrix products reach in the same run; of a step only the passes that it needs count, none that
 padding, recomputed activations or unsupervised rows of the head add. Where TRL is not installed,
 ours is measured alone; PYTHONPATH may name a folder that holds it (pip install --no-deps --target).
+The rate of what the trainer itself chooses is kept for benchmarks.hours, where a card measured it.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from torch.utils.data import Subset
 from torch.utils.flop_counter import FlopCounterMode
 from transformers import ProcessorMixin, Qwen3VLConfig, Qwen3VLForConditionalGeneration, set_seed
 
+from benchmarks import hours
 from benchmarks.sft_runs import SEED, Figures, Variant, Work, device_name, run
 from conf.compose import compose
 from conf.errors import UserError
@@ -127,7 +129,10 @@ def measure(name: str, base: str, steps: int) -> None:
     print(f"{len(shown)} samples a step, {bench.flops / 1e12:.1f} TFLOP")
     print(f"{'':<48}{'s/step':>9}{'samples/s':>11}{'of peak':>9}{'peak GiB':>10}", flush=True)
     found = [(variant.trainer, bench.line(variant, steps)) for variant in variants()]
-    found.append(("ours", bench.line(bench.chosen(shown), steps)))
+    chosen = bench.line(bench.chosen(shown), steps)
+    if chosen is not None and device.type == "cuda":
+        hours.add("sft_gpu", name, base, settings.train.batch / chosen, device_name())
+    found.append(("ours", chosen))
     fastest = {
         trainer: min(seconds for by, seconds in found if by == trainer and seconds is not None)
         for trainer in {by for by, _ in found}
