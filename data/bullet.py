@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data.geometry import BOUNDING_RADIUS, CUBE_HALF, RADIUS
-from data.records import FPS, FRAMES, Collision, SceneObject
+from data.records import FPS, FRAMES, Collision, Landing, SceneObject
 
 if TYPE_CHECKING:
     from pybullet_utils.bullet_client import BulletClient
@@ -33,14 +33,36 @@ SUBSTEPS = 7
 SOLVER_ITERATIONS = 20
 GRAVITY = 9.81
 GROUND_FRICTION, OBJECT_FRICTION = 0.1, 0.3
-RESTITUTION = {"rubber": 0.5, "metal": 0.7}
 FRICTION_DECELERATION = GROUND_FRICTION * OBJECT_FRICTION * GRAVITY
 
 CONTACT_FREE_FRAMES = 5
 """A pair's contact is a new event only after more frames than this without one."""
-REACH = 2 * max(BOUNDING_RADIUS.values()) + 0.5
-"""Objects whose centres are further apart than this do not touch within the next frame: none moves
-faster than 6 units a second."""
+CLOSING = 12.5
+"""No two objects come nearer faster than this, simulator units a second."""
+
+
+@dataclass(frozen=True)
+class Physics:
+    """What makes bodies move as they do, and how often that is recorded."""
+
+    fps: int = FPS
+    substeps: int = SUBSTEPS
+    """Physics steps a frame."""
+    gravity: float = GRAVITY
+    ground_friction: float = GROUND_FRICTION
+    object_friction: float = OBJECT_FRICTION
+    ground_restitution: float = 0.0
+    """Bullet multiplies it by an object's: on a ground of 0 nothing bounces."""
+    rubber_restitution: float = 0.5
+    metal_restitution: float = 0.7
+
+    @property
+    def reach(self) -> float:
+        """Objects whose centres are further apart than this do not touch within the next frame."""
+        return 2 * max(BOUNDING_RADIUS.values()) + CLOSING / self.fps
+
+
+STANDARD = Physics()
 
 
 @dataclass(frozen=True)
@@ -51,17 +73,20 @@ class Body:
     position: tuple[float, float]
     yaw: float
     velocity: tuple[float, float]
+    height: float | None = None
+    """Of its centre, where it starts in the air; None stands on the ground."""
 
 
 @dataclass(frozen=True)
 class Motion:
     """What Bullet did with some bodies: (F, N, 13) their positions, quaternions, linear and angular
-    velocities as in `Scene`, and first contacts."""
+    velocities as in `Scene`, first contacts, and landings of bodies that started in the air."""
 
     states: np.ndarray
     collisions: tuple[Collision, ...]
     touching_at_start: bool
     repeated_pair: bool
+    landings: tuple[Landing, ...] = ()
 
     @property
     def positions(self) -> np.ndarray:
@@ -112,49 +137,65 @@ class World:
     def __init__(self) -> None:
         self._bullet = connect()
 
-    def simulate(self, bodies: list[Body], frames: int = FRAMES) -> Motion:
+    def simulate(
+        self, bodies: list[Body], frames: int = FRAMES, physics: Physics = STANDARD
+    ) -> Motion:
         """Run `bodies` for `frames` frames. The same bodies give the same bits every time."""
-        handles = self._place(bodies)
-        step, contact_points = self._bullet.stepSimulation, self._bullet.getContactPoints
+        ground, handles = self._place(bodies, physics)
+        step = self._bullet.stepSimulation
         recorded = np.zeros((frames, len(bodies), 13))
         contacts: dict[tuple[int, int], list[int]] = {}
+        in_air = {k for k, body in enumerate(bodies) if body.height is not None}
+        landings = []
         recorded[0] = self._state(handles)
         touching_at_start = self._overlapping(handles)
         for frame in range(1, frames):
-            near = _near_pairs(recorded[frame - 1, :, :3])
-            for _ in range(SUBSTEPS):
+            near = _near_pairs(recorded[frame - 1, :, :3], physics.reach)
+            for _ in range(physics.substeps):
                 step()
                 for i, j in near:
-                    points = contact_points(handles[i], handles[j])
-                    # Bullet keeps points of pairs that no longer press on each other; only a
-                    # force is a contact.
-                    if any(point[9] > 0 for point in points):
+                    if self._press(handles[i], handles[j]):
                         frames_of_pair = contacts.setdefault((i, j), [])
                         if not frames_of_pair or frames_of_pair[-1] != frame:
                             frames_of_pair.append(frame)
+                for k in [k for k in in_air if self._press(ground, handles[k])]:
+                    in_air.remove(k)
+                    landings.append(Landing(frame, k))
             recorded[frame] = self._state(handles)
         collisions, repeated = _debounce(contacts)
-        return Motion(recorded, collisions, touching_at_start, repeated)
+        return Motion(recorded, collisions, touching_at_start, repeated, tuple(landings))
 
-    def _place(self, bodies: list[Body]) -> list[int]:
+    def _press(self, one: int, two: int) -> bool:
+        # Bullet keeps points of pairs that no longer press on each other; only a force is a
+        # contact.
+        return any(point[9] > 0 for point in self._bullet.getContactPoints(one, two))
+
+    def _place(self, bodies: list[Body], physics: Physics) -> tuple[int, list[int]]:
+        """The handles of the ground and of the bodies."""
         bullet = self._bullet
         bullet.resetSimulation()
-        bullet.setGravity(0, 0, -GRAVITY)
+        bullet.setGravity(0, 0, -physics.gravity)
         # A residual threshold of 0 keeps the number of iterations from depending on objects that
         # an object never meets: without it, removing one object moves all the others.
         bullet.setPhysicsEngineParameter(
-            fixedTimeStep=1 / (FPS * SUBSTEPS),
+            fixedTimeStep=1 / (physics.fps * physics.substeps),
             numSolverIterations=SOLVER_ITERATIONS,
             solverResidualThreshold=0,
             deterministicOverlappingPairs=1,
         )
         ground = bullet.createMultiBody(0, bullet.createCollisionShape(bullet.GEOM_PLANE))
-        bullet.changeDynamics(ground, -1, lateralFriction=GROUND_FRICTION, restitution=0)
-        return [self._add(body) for body in bodies]
+        bullet.changeDynamics(
+            ground,
+            -1,
+            lateralFriction=physics.ground_friction,
+            restitution=physics.ground_restitution,
+        )
+        return ground, [self._add(body, physics) for body in bodies]
 
-    def _add(self, body: Body) -> int:
-        bullet = self._bullet
-        shape, height = body.look.shape, CUBE_HALF if body.look.shape == "cube" else RADIUS
+    def _add(self, body: Body, physics: Physics) -> int:
+        bullet, shape, height = self._bullet, body.look.shape, body.height
+        if height is None:
+            height = CUBE_HALF if shape == "cube" else RADIUS
         if shape == "sphere":
             form = bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=RADIUS)
         elif shape == "cube":
@@ -168,10 +209,14 @@ class World:
         bullet.changeDynamics(
             handle,
             -1,
-            lateralFriction=OBJECT_FRICTION,
+            lateralFriction=physics.object_friction,
             rollingFriction=0,
             spinningFriction=0,
-            restitution=RESTITUTION[body.look.material],
+            restitution=(
+                physics.metal_restitution
+                if body.look.material == "metal"
+                else physics.rubber_restitution
+            ),
             linearDamping=0,
             angularDamping=0,
         )
@@ -201,13 +246,13 @@ def world() -> World:
     return World()
 
 
-def _near_pairs(positions: np.ndarray) -> list[tuple[int, int]]:
+def _near_pairs(positions: np.ndarray, reach: float) -> list[tuple[int, int]]:
     """Pairs that could touch within the next frame, and are polled."""
     places = positions.tolist()
     return [
         (i, j)
         for (i, one), (j, two) in combinations(enumerate(places), 2)
-        if math.dist(one, two) < REACH
+        if math.dist(one, two) < reach
     ]
 
 

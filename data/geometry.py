@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
 
 import numpy as np
@@ -40,6 +40,10 @@ class Camera:
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(forward, right), forward])
 
+    def sized(self, width: int, height: int) -> Camera:
+        """This camera at another resolution."""
+        return replace(self, width=width, height=height, focal=self.focal * width / self.width)
+
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World points (..., 3) -> px (..., 2) and depth (...) along the optical axis."""
         local = (points - np.asarray(self.eye)) @ self.axes.T
@@ -56,10 +60,7 @@ class Camera:
         return np.stack([x, y, np.ones_like(x)], axis=-1) @ self.axes
 
 
-def standard_camera(width: int, height: int) -> Camera:
-    """The camera that scenes are watched by, at another resolution."""
-    standard = Camera()
-    return Camera(width, height, standard.focal * width / standard.width)
+STANDARD_CAMERA = Camera()
 
 
 def rotation(quaternion: np.ndarray) -> np.ndarray:

@@ -12,8 +12,8 @@ from itertools import product
 import numpy as np
 
 from conf.schema import BenchmarkConfig
-from data.bullet import FRICTION_DECELERATION, Body, Motion, world
-from data.geometry import BOUNDING_RADIUS, RADIUS, Camera, visibility
+from data.bullet import FRICTION_DECELERATION, STANDARD, Body, Motion, Physics, world
+from data.geometry import BOUNDING_RADIUS, RADIUS, STANDARD_CAMERA, Camera, visibility
 from data.records import COLORS, FPS, MATERIALS, SHAPES, Scene, SceneObject
 
 AT_REST = 0.35
@@ -36,10 +36,9 @@ def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> tuple[list[
     Scenes whose pairs touch at the start or meet again are thrown away and begun anew.
     """
     rng = np.random.default_rng([seed, index])
-    every_look = [SceneObject(*look) for look in product(SHAPES, MATERIALS, COLORS)]
     while True:
-        count = int(rng.integers(limits.min_objects, limits.max_objects + 1))
-        looks = [every_look[k] for k in rng.choice(len(every_look), count, replace=False)]
+        looks = sample_looks(rng, limits)
+        count = len(looks)
         goal = int(rng.choice(list(COLLISIONS), p=list(COLLISIONS.values())))
         most = limits.max_collisions
         bodies = [_entering(looks[0], rng)]
@@ -53,10 +52,17 @@ def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> tuple[list[
             return bodies, motion
 
 
+def sample_looks(rng: np.random.Generator, limits: BenchmarkConfig) -> list[SceneObject]:
+    """As many looks as a scene has objects, no two alike."""
+    every_look = [SceneObject(*look) for look in product(SHAPES, MATERIALS, COLORS)]
+    count = int(rng.integers(limits.min_objects, limits.max_objects + 1))
+    return [every_look[k] for k in rng.choice(len(every_look), count, replace=False)]
+
+
 def _entering(look: SceneObject, rng: np.random.Generator) -> Body:
     """A body that comes in from outside the view, towards its middle."""
     bearing = rng.uniform(0, 2 * np.pi)
-    start = np.array([-0.7, 0.0]) + rng.uniform(2.6, 4.0) * _unit(bearing)
+    start = np.array([-0.7, 0.0]) + rng.uniform(2.6, 4.0) * unit(bearing)
     goal = np.array([-0.7, 0.0]) + rng.uniform(-1, 1, 2)
     direction = (goal - start) / np.linalg.norm(goal - start)
     return _moving(look, start, direction, rng.uniform(*SPEED), rng)
@@ -108,18 +114,18 @@ def _meeting(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Bod
     other = int(rng.integers(motion.positions.shape[1]))
     frame = int(rng.integers(15, 111))
     place = motion.positions[frame, other, :2] + rng.normal(0, 0.1, 2)
-    if not _on_screen(place):
+    if not shows(place):
         return None
     if rng.random() < AT_REST:
         if np.linalg.norm(motion.velocities[frame, other]) < 0.3:
             return None
-        return Body(look, _pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
+        return Body(look, pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
     seconds = frame / FPS
     speed = rng.uniform(*SPEED)
     if speed - FRICTION_DECELERATION * seconds < 0.3:
         return None
     travel = speed * seconds - FRICTION_DECELERATION * seconds**2 / 2
-    direction = _unit(rng.uniform(0, 2 * np.pi))
+    direction = unit(rng.uniform(0, 2 * np.pi))
     return _moving(look, place - travel * direction, direction, speed, rng)
 
 
@@ -127,9 +133,9 @@ def _standing_by(look: SceneObject, motion: Motion, rng: np.random.Generator) ->
     """A body at rest on screen, clear of every path."""
     place = np.array([rng.uniform(-3.5, 1.2), rng.uniform(-2.2, 2.2)])
     clear = np.linalg.norm(motion.positions[..., :2] - place, axis=-1).min() > 0.7
-    if not (clear and _on_screen(place)):
+    if not (clear and shows(place)):
         return None
-    return Body(look, _pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
+    return Body(look, pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
 
 
 def _moving(
@@ -139,12 +145,12 @@ def _moving(
     speed: float,
     rng: np.random.Generator,
 ) -> Body:
-    return Body(look, _pair(start), rng.uniform(0, 2 * np.pi), _pair(speed * direction))
+    return Body(look, pair(start), rng.uniform(0, 2 * np.pi), pair(speed * direction))
 
 
-def _on_screen(place: np.ndarray) -> bool:
-    camera = Camera()
-    pixel, depth = camera.project(np.array([*place, RADIUS]))
+def shows(place: np.ndarray, height: float = RADIUS, camera: Camera = STANDARD_CAMERA) -> bool:
+    """Whether an object's centre at a ground position and height shows, with some margin."""
+    pixel, depth = camera.project(np.array([*place, height]))
     margin = 20
     return bool(
         depth > 1
@@ -153,11 +159,11 @@ def _on_screen(place: np.ndarray) -> bool:
     )
 
 
-def _unit(angle: float) -> np.ndarray:
+def unit(angle: float) -> np.ndarray:
     return np.array([np.cos(angle), np.sin(angle)])
 
 
-def _pair(values: np.ndarray) -> tuple[float, float]:
+def pair(values: np.ndarray) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 
@@ -177,10 +183,17 @@ def without(name: str, split: str, bodies: list[Body], removed: int) -> Scene:
     return record(name, split, rest, world().simulate(rest))
 
 
-def record(name: str, split: str, bodies: list[Body], motion: Motion) -> Scene:
-    """What bodies did, observed by the camera: a scene."""
+def record(
+    name: str,
+    split: str,
+    bodies: list[Body],
+    motion: Motion,
+    physics: Physics = STANDARD,
+    camera: Camera = STANDARD_CAMERA,
+    scenario: str = "",
+) -> Scene:
+    """What bodies did, observed by a camera: a scene."""
     objects = tuple(body.look for body in bodies)
-    camera = Camera()
     in_view, fraction = visibility(objects, motion.positions, motion.quaternions, camera)
     image_positions, _ = camera.project(motion.positions)
     scene = Scene(
@@ -196,6 +209,9 @@ def record(name: str, split: str, bodies: list[Body], motion: Motion) -> Scene:
         in_view=in_view,
         visible_fraction=fraction,
         image_size=(camera.width, camera.height),
+        fps=physics.fps,
+        landings=motion.landings,
+        scenario=scenario,
     )
     return replace(scene, **{k: getattr(scene, k).astype(np.float32) for k in _FLOATS})
 

@@ -15,6 +15,7 @@ from PIL import Image
 from conf.errors import UserError
 from data.records import Scene
 from data.renderers import blender, bullet, egl
+from data.renderers.looks import STANDARD_VIEW, View
 
 
 class Renderer(Protocol):
@@ -63,11 +64,11 @@ def check(name: str) -> None:
 
 
 @cache
-def renderer(name: str, width: int, height: int) -> Renderer:
-    """This process's renderer of a name and a frame size (px).
+def renderer(name: str, width: int, height: int, view: View = STANDARD_VIEW) -> Renderer:
+    """This process's renderer of a name, a frame size (px) and a view.
 
     Raises:
         UserError: it cannot run here, or there is no such renderer.
     """
     check(name)
-    return RENDERERS[name](width, height)
+    return RENDERERS[name](width, height, view)

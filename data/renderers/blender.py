@@ -18,9 +18,9 @@ from typing import Any
 from PIL import Image
 
 from conf.errors import UserError
-from data.geometry import CUBE_HALF, RADIUS, standard_camera
+from data.geometry import CUBE_HALF, RADIUS
 from data.records import Scene
-from data.renderers.looks import RGB
+from data.renderers.looks import RGB, STANDARD_VIEW, View
 
 BPY = "4.2.23"
 """The release of Blender's module that the extra `blender` installs; another draws other pixels."""
@@ -32,11 +32,12 @@ WORKER = Path(__file__).with_name("blender_worker.py")
 
 
 class BlenderRenderer:
-    """Draws frames of any scene at one size, in a Blender of its own."""
+    """Draws frames of any scene at one size, in a Blender of its own, whose lamps and ground are
+    those of `blender_worker.py` under any view."""
 
     version = VERSION
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  as long as the worker
         # Without -P the worker would take the files beside it for libraries.
         self._worker = subprocess.Popen(
@@ -45,7 +46,7 @@ class BlenderRenderer:
             stdout=subprocess.PIPE,
             stderr=self._errors,
         )
-        camera = standard_camera(width, height)
+        camera = view.camera.sized(width, height)
         picture = {
             "width": width,
             "height": height,

@@ -16,10 +16,10 @@ import numpy as np
 from PIL import Image
 
 from data.bullet import connect
-from data.geometry import Camera, standard_camera
+from data.geometry import Camera
 from data.records import MATERIALS, Scene, SceneObject
-from data.renderers.floor import FLOOR, LIGHT, Floor
-from data.renderers.looks import RGB, mesh, texture
+from data.renderers.floor import Floor
+from data.renderers.looks import RGB, STANDARD_VIEW, View, mesh, texture
 
 if TYPE_CHECKING:
     from pybullet_utils.bullet_client import BulletClient
@@ -35,12 +35,13 @@ class BulletRenderer:
 
     version = VERSION
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
+        self._seen_as = view
         self._bullet, self._rasteriser = self._connect()
-        self._fine = standard_camera(width * OVERSAMPLING, height * OVERSAMPLING)
+        self._fine = view.camera.sized(width * OVERSAMPLING, height * OVERSAMPLING)
         self._view = self._bullet.computeViewMatrix(self._fine.eye, [0, 0, 0], [0, 0, 1])
         self._projection = _projection(self._fine)
-        self._floor = Floor(standard_camera(width, height))
+        self._floor = Floor(view.camera.sized(width, height), view.light)
         self._textures = self._load_textures()
         self._visuals: dict[SceneObject, int] = {}
         self._scene_id: str | None = None
@@ -56,7 +57,7 @@ class BulletRenderer:
         touched, objects, cover = _average(*self.photograph())
         shade = self._floor.shade(scene.positions[frame], self._shadows[frame])
         bands = []
-        for drawn, tint in zip(objects, FLOOR, strict=True):
+        for drawn, tint in zip(objects, self._seen_as.floor, strict=True):
             plane = shade * tint
             pixels = plane.reshape(-1)
             pixels[touched] = drawn + (1 - cover) * pixels[touched]
@@ -87,7 +88,7 @@ class BulletRenderer:
             self._fine.height,
             self._view,
             self._projection,
-            lightDirection=LIGHT,
+            lightDirection=self._seen_as.light,
             lightColor=[1, 1, 1],
             shadow=0,
             lightAmbientCoeff=0.45,

@@ -20,7 +20,7 @@ from conf.errors import UserError
 from data.bullet import connect, silence
 from data.records import SHAPES, Scene, SceneObject
 from data.renderers.bullet import OVERSAMPLING, BulletRenderer, save_textures
-from data.renderers.looks import mesh
+from data.renderers.looks import STANDARD_VIEW, View, mesh
 
 if TYPE_CHECKING:
     from pybullet_utils.bullet_client import BulletClient
@@ -68,7 +68,7 @@ class EglRenderer(BulletRenderer):
     _on_stage: EglRenderer | None = None
     """Whose scene stands in the process's client."""
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
         """Raises UserError where the plugin cannot draw so large a frame."""
         if width * OVERSAMPLING > WINDOW[0] or height * OVERSAMPLING > WINDOW[1]:
             raise UserError(
@@ -76,7 +76,7 @@ class EglRenderer(BulletRenderer):
                 f"{WINDOW[1] // OVERSAMPLING} px at most, you ask for {width} x {height}: make "
                 "them smaller, or use renderer=bullet"
             )
-        super().__init__(width, height)
+        super().__init__(width, height, view)
 
     def pose(self, scene: Scene, frame: int) -> list[int]:
         before = EglRenderer._on_stage

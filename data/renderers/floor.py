@@ -6,10 +6,7 @@ import numpy as np
 
 from data.geometry import RADIUS, Camera
 
-FLOOR = (158.0, 156.0, 152.0)
-"""The floor's colour, RGB of 255, where its shade is 1."""
 SHADOW_DEPTH = 0.55
-LIGHT = (3.0, 3.0, 6.0)
 
 _SPREAD = 2 * (0.85 * RADIUS) ** 2
 _REACH = 1.0
@@ -18,10 +15,10 @@ change: exp(-d^2 / _SPREAD) times SHADOW_DEPTH is under 2^-25."""
 
 
 class Floor:
-    """The floor as one camera sees it."""
+    """The floor as one camera sees it, under a lamp at `light`."""
 
-    def __init__(self, camera: Camera) -> None:
-        self._camera = camera
+    def __init__(self, camera: Camera, light: tuple[float, float, float]) -> None:
+        self._camera, self._light = camera, light
         columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         rays = camera.rays(columns.astype(float), rows.astype(float))
         reach = camera.eye[2] / -rays[..., 2]
@@ -43,7 +40,7 @@ class Floor:
         """
         shade = self._lit.copy()
         for (x, y), (left, top, right, bottom) in zip(
-            _shadow_centres(positions).tolist(), boxes.tolist(), strict=True
+            self._shadow_centres(positions).tolist(), boxes.tolist(), strict=True
         ):
             if left < right and top < bottom:
                 box = np.s_[top:bottom, left:right]
@@ -62,7 +59,7 @@ class Floor:
         """(..., 4) left, top, right and bottom of the pixels that the shadows of objects at
         (..., 3) reach."""
         ground = np.zeros(positions.shape)
-        ground[..., :2] = _shadow_centres(positions)
+        ground[..., :2] = self._shadow_centres(positions)
         corners = _REACH * np.array([[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]])
         # A corner behind the camera is projected far below the image, where it does no harm.
         pixels, _ = self._camera.project(ground[..., None, :] + corners)
@@ -70,7 +67,6 @@ class Floor:
         boxes = np.concatenate([pixels.min(axis=-2), pixels.max(axis=-2) + 1], axis=-1)
         return np.clip(boxes, 0, [*size, *size]).astype(int)
 
-
-def _shadow_centres(positions: np.ndarray) -> np.ndarray:
-    """(..., 2) where on the ground the shadows of objects at (..., 3) are darkest."""
-    return positions[..., :2] - 0.5 * RADIUS * np.asarray(LIGHT[:2]) / LIGHT[2]
+    def _shadow_centres(self, positions: np.ndarray) -> np.ndarray:
+        """(..., 2) where on the ground the shadows of objects at (..., 3) are darkest."""
+        return positions[..., :2] - 0.5 * RADIUS * np.asarray(self._light[:2]) / self._light[2]

@@ -1,11 +1,29 @@
-"""What objects look like: colours, meshes and the textures that stand for materials."""
+"""How a scene is watched and lit, and what its objects look like: colours, meshes and the textures
+that stand for materials."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from data.geometry import CUBE_HALF, RADIUS
+from data.geometry import CUBE_HALF, RADIUS, STANDARD_CAMERA, Camera
 from data.records import COLORS
+
+
+@dataclass(frozen=True)
+class View:
+    """How scenes are watched and lit."""
+
+    camera: Camera = STANDARD_CAMERA
+    """Its eye stands in the plane of x and z."""
+    floor: tuple[float, float, float] = (158.0, 156.0, 152.0)
+    """The floor's colour, RGB of 255, where its shade is 1."""
+    light: tuple[float, float, float] = (3.0, 3.0, 6.0)
+    """Where the lamp stands."""
+
+
+STANDARD_VIEW = View()
 
 RGB = dict(
     zip(

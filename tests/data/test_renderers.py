@@ -16,12 +16,13 @@ from PIL import Image
 
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig
-from data.geometry import Camera, hit_depth, standard_camera
+from data.geometry import Camera, hit_depth
 from data.records import Scene
 from data.renderers import RENDERERS, blender, check, renderer
 from data.renderers.bullet import BulletRenderer, _average
 from data.renderers.egl import EglRenderer
 from data.renderers.floor import Floor
+from data.renderers.looks import STANDARD_VIEW
 from data.sampling import simulate_scene
 
 LIMITS = BenchmarkConfig(name="renderers")
@@ -69,7 +70,8 @@ def test_objects_are_averaged_over_four_pixels_and_rounded_up_at_half() -> None:
 
 def test_a_shadow_reaches_no_pixel_beyond_its_box() -> None:
     """Objects on screen, at its edges, far off and behind the camera."""
-    floor, (width, height) = Floor(standard_camera(192, 128)), (192, 128)
+    floor = Floor(STANDARD_VIEW.camera.sized(192, 128), STANDARD_VIEW.light)
+    width, height = 192, 128
     rng = np.random.default_rng(0)
     for spread in (1.0, 3.0, 8.0):
         positions = rng.uniform(-spread, spread, (6, 3)).astype(np.float32)
