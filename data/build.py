@@ -13,7 +13,7 @@ from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
 from conf.keys import nearest
 from conf.schema import BenchmarkConfig, BuildCommand
-from data.cells import family_quotas, make_items_and_queries, recipes
+from data.cells import family_quotas, make_items_and_queries, recipes, suite
 from data.growing import flat, growing_folder
 from data.parallel import Workers
 from data.rendering import RECORD, render_ahead
@@ -36,7 +36,6 @@ from data.store import (
     versions,
     write_atomically,
 )
-from data.transfer.recipes import RECIPES as TRANSFER
 
 log = logging.getLogger(__name__)
 
@@ -93,9 +92,9 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         save_rows(rows, growing / "database.parquet")
         manifest = {
             "name": cfg.name,
-            "suite": cfg.simulator if cfg.simulator in TRANSFER else "dynapix",
+            "suite": suite(cfg),
             "seed": cfg.seed,
-            **versions(cfg.simulator, cfg.renderer),
+            **versions(cfg.simulator, cfg.renderer, cfg.standin),
             "config": asdict(cfg),
             "counts": count(scene_ids, items, queries, databases) | unread | dropped | left_out,
             "shortfalls": shortfalls(cfg, items, queries, databases),
@@ -109,7 +108,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
 
 
 def check_names(cfg: BenchmarkConfig) -> None:
-    """Raises SettingsError where a quota names a cell or builder that does not exist."""
+    """Raises SettingsError where a quota names a family, cell or builder that does not exist."""
     named = [
         (f"benchmark.selection.{family}", quotas, list(recipes(cfg)[family].CELLS))
         for family, quotas in family_quotas(cfg).items()
@@ -123,6 +122,11 @@ def check_names(cfg: BenchmarkConfig) -> None:
         for key, quotas, known in named
         for name in quotas
         if name not in known
+    ]
+    problems += [
+        f"benchmark.selection.{family}: suite {suite(cfg)} has no items of it, leave the family out"
+        for family, quotas in family_quotas(cfg).items()
+        if quotas and family not in recipes(cfg)
     ]
     if problems:
         raise SettingsError("\n".join(problems))

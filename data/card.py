@@ -150,7 +150,7 @@ def _columns(name: str, kinds: Features) -> str:
 
 def _making(store: Store) -> str:
     settings = store.manifest["config"]
-    made_by = versions(settings["simulator"], settings["renderer"])
+    made_by = versions(settings["simulator"], settings["renderer"], settings.get("standin"))
     told = ", ".join(f"{name} {version}" for name, version in made_by.items())
     config = OmegaConf.to_yaml(OmegaConf.create(settings))
     return (
@@ -163,11 +163,13 @@ def _making(store: Store) -> str:
 
 
 def _limits(store: Store, plan: dict[str, Any]) -> str:
+    scene = store.scene(store.scene_ids("test")[0])
     limits = [
         "The answers are in the files, those of the test split too: keep that split out of "
         "training, and out of prompts.",
         "Scenes are simple: rigid objects of one size and three shapes on a plane, one fixed "
-        "camera, 128 frames at 25 a second. Results say little about real footage.",
+        f"camera, {scene.frames} frames at {scene.fps:g} a second. Results say little about real "
+        "footage.",
         "A candidate of another scene (`cross_scene`) shows other objects, so it can be ruled out "
         "without foresight. Report such subtypes apart.",
         "Two candidates of an item differ in some object by `min_displacement` px or more, which "

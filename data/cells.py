@@ -72,7 +72,14 @@ def make_items_and_queries(
 
 def recipes(cfg: BenchmarkConfig) -> Mapping[str, Any]:
     """How the items of a benchmark's suite are made, by family: each has `CELLS` and `draft`."""
-    return transfer.RECIPES.get(cfg.simulator, RECIPES)
+    return transfer.RECIPES.get(suite(cfg), RECIPES)
+
+
+def suite(cfg: BenchmarkConfig) -> str:
+    """What the benchmark's items belong to."""
+    if cfg.standin is not None:
+        return f"standin_{cfg.standin}"
+    return cfg.simulator if cfg.simulator in transfer.RECIPES else "dynapix"
 
 
 def family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:

@@ -25,8 +25,9 @@ MEANING = {
     "item_id": "Name of the item.",
     "query_id": "Name of the query.",
     "split": "train or test. Scenes keep to one split, in every track.",
-    "suite": "dynapix, the simulator of a transfer suite, or matched_anchor: pairs of items that "
-    "differ in their question's anchor alone.",
+    "suite": "dynapix, the simulator of a transfer suite (standin_ before it where Bullet's scenes "
+    "stand in for that simulator's), or matched_anchor: pairs of items that differ in their "
+    "question's anchor alone.",
     "family": "What fixes the target's moment: event, time or window.",
     "subtype": "The construction cell inside the family.",
     "framing": "Event family: future (the prefix ends before the collision) or contact (at it).",

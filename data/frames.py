@@ -24,6 +24,7 @@ from PIL import Image
 
 from data.records import Scene
 from data.renderers import renderer
+from data.standins import view_of
 from data.store import Store, cached_scene, scene_path, write_atomically
 from data.transfer.release import RELEASES
 
@@ -98,12 +99,13 @@ class FrameCache:
     simulator: str
     release: str | None
     """Folder of another simulator's release, whose frames are its own."""
+    standin: str | None
 
     @classmethod
     def of(cls, store: Store) -> FrameCache:
         config = store.manifest["config"]
-        keys = ("width", "height", "renderer", "simulator", "folder")
-        return cls(store.folder, *(config[key] for key in keys))
+        keys = ("width", "height", "renderer", "simulator", "folder", "standin")
+        return cls(store.folder, *(config.get(key) for key in keys))
 
     def path(self, scene_id: str) -> Path:
         return self.folder / "frames" / f"{scene_id}.zip"
@@ -117,7 +119,7 @@ class FrameCache:
         if scene.footage is not None:
             images = RELEASES[self.simulator].images(scene, Path(self.release), frames)
             return {frame: np.asarray(image) for frame, image in images.items()}
-        render = renderer(self.renderer, self.width, self.height).render
+        render = renderer(self.renderer, self.width, self.height, view_of(self.standin)).render
         return {frame: np.asarray(render(scene, frame)) for frame in frames}
 
 

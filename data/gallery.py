@@ -97,8 +97,8 @@ def sheets(store: Store, examples: int, seed: int) -> Iterator[Sheet]:
         yield Sheet("Controls", title, f"controls-{MATCHED}.png", sheet(rows))
     names = [name for split in SPLITS for name in store.scene_ids(split)]
     scenes = [store.scene(name) for name in _some(names, 2 * examples, seed, "paths")]
-    # Another simulator's camera stands elsewhere.
-    if all(scene.footage is None for scene in scenes):
+    # Another simulator's camera stands elsewhere, and so does a stand-in's.
+    if all(scene.footage is None for scene in scenes) and store.suite == "dynapix":
         title = (
             "from hollow (start) to full (end), a dot a second, a cross and its frame a collision"
         )
@@ -251,7 +251,7 @@ PAGE = """<!doctype html>
 <h1>DynaPix, {name}</h1>
 <p>{scenes:,} scenes, store {identity}. Left of the line is what is observed, right of it what there
 is to choose from; the answer is framed in green. A number in brackets counts frames from the end of
-what is observed (25 a second), px are displacements at 336 x 336.</p>
+what is observed ({fps:g} a second), px are displacements at 336 x 336.</p>
 {body}
 </main>
 </html>
@@ -273,6 +273,7 @@ def page(store: Store, shown: Sequence[tuple[str, str, str]]) -> str:
     return PAGE.format(
         name=escape(store.name),
         identity=store.identity,
+        fps=store.scene(store.scene_ids("test")[0]).fps,
         scenes=sum(len(store.scene_ids(split)) for split in SPLITS),
         nav="\n".join(nav),
         body="\n".join(body),

@@ -11,8 +11,8 @@ from typing import Any
 from conf.errors import UserError
 from conf.runs import held
 from conf.schema import BenchmarkConfig
-from data.bullet import GENERATOR_VERSION
 from data.records import SPLITS
+from data.standins import generator_version
 from data.store import PLAN, write_atomically
 
 
@@ -39,6 +39,7 @@ def _plan(cfg: BenchmarkConfig) -> dict[str, Any]:
     """What the scenes of a build depend on; its other parts are named by what they depend on."""
     keys = (
         "simulator",
+        "standin",
         "seed",
         "test_share",
         "min_objects",
@@ -48,7 +49,7 @@ def _plan(cfg: BenchmarkConfig) -> dict[str, Any]:
     )
     absent = {split: getattr(cfg.retrieval.counterfactual, split) > 0 for split in SPLITS}
     return {
-        "generator": GENERATOR_VERSION,
+        "generator": generator_version(cfg.standin),
         "config": {key: getattr(cfg, key) for key in keys},
         "counterfactual scenes": absent,
     }

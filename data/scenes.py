@@ -19,6 +19,7 @@ from data.parallel import Workers
 from data.records import SPLITS
 from data.retrieval import counterfactual
 from data.sampling import record, sample_bodies, scene_id, without
+from data.standins import simulate_standin
 from data.store import PARTS, save_scene, scene_path, write_atomically
 from data.transfer.reading import BadRecord
 from data.transfer.release import RELEASES
@@ -46,11 +47,17 @@ def make_scenes(
             records is bad.
     """
     if cfg.simulator == "bullet":
-        names = [scene_id(cfg.seed, index) for index in range(cfg.scenes)]
+        names = [scene_name(cfg, index) for index in range(cfg.scenes)]
         scene_ids = split_scenes(cfg, names)
         simulate(cfg, folder, scene_ids, workers)
         return scene_ids, {}
     return read_release(cfg, folder, workers, strict)
+
+
+def scene_name(cfg: BenchmarkConfig, index: int) -> str:
+    """The id of a simulated scene. A stand-in's is no standard scene's."""
+    name = scene_id(cfg.seed, index)
+    return name if cfg.standin is None else f"standin_{cfg.standin}-{name}"
 
 
 def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Named]) -> dict[str, list[Named]]:
@@ -85,7 +92,7 @@ def simulate(
     split_of = {name: split for split, names in scene_ids.items() for name in names}
     jobs = {}
     for index in range(cfg.scenes):
-        name = scene_id(cfg.seed, index)
+        name = scene_name(cfg, index)
         path = scene_path(folder, name)
         if not path.exists():
             jobs[name] = partial(_simulate_one, cfg, index, split_of[name], path)
@@ -95,6 +102,9 @@ def simulate(
 
 def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> None:
     """Simulate a scene and, where the benchmark asks for it, the scene with an object absent."""
+    if cfg.standin is not None:
+        save_scene(simulate_standin(path.stem, index, split, cfg), path)
+        return
     bodies, motion = sample_bodies(cfg.seed, index, cfg)
     scene = record(path.stem, split, bodies, motion)
     if getattr(cfg.retrieval.counterfactual, split):

@@ -18,8 +18,9 @@ from conf.entry import Run, command
 from conf.errors import UserError
 from conf.runs import write_text
 from conf.schema import StatisticsCommand
-from data.geometry import DIAGONAL, MODEL_SIZE, Camera, displacement_across
-from data.records import FPS, LETTERS, SPLITS, Candidate, SelectionItem
+from data.geometry import DIAGONAL, MODEL_SIZE, displacement_across
+from data.records import LETTERS, SPLITS, Candidate, SelectionItem
+from data.standins import view_of
 from data.store import Store
 
 log = logging.getLogger(__name__)
@@ -192,9 +193,9 @@ def constant_velocity(item: SelectionItem, candidate: Candidate, store: Store) -
     the mean over objects in px at 336, one that is in only one of the scenes as far as can be. It
     is told the moment, which a question of the event family does not tell."""
     scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
-    seconds = (item.target_frame - item.prefix_stop) / FPS
+    seconds = (item.target_frame - item.prefix_stop) / scene.fps
     places = scene.positions[item.prefix_stop] + seconds * scene.velocities[item.prefix_stop]
-    expected, _ = Camera().project(places)
+    expected, _ = view_of(store.manifest["config"].get("standin")).camera.project(places)
     there = {o: other.image_positions[candidate.frame, k] for k, o in enumerate(other.objects)}
     scale = MODEL_SIZE / np.array(scene.image_size)
     apart = [

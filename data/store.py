@@ -30,7 +30,6 @@ import numpy as np
 
 from conf.errors import UserError
 from data import renderers
-from data.bullet import GENERATOR_VERSION
 from data.records import (
     Collision,
     FrameRef,
@@ -41,6 +40,7 @@ from data.records import (
     SelectionItem,
 )
 from data.selection.drafts import BUILDERS_VERSION
+from data.standins import generator_version
 
 MANIFEST = "manifest.json"
 SEAL = "sha256"
@@ -48,11 +48,11 @@ PLAN = "plan.json"
 """What a build in progress is to become; gone from a whole store."""
 
 
-def versions(simulator: str, renderer: str) -> dict[str, str]:
+def versions(simulator: str, renderer: str, standin: str | None) -> dict[str, str]:
     """What makes the same config give another benchmark: scenes, pixels, items and queries."""
     rendered = simulator == "bullet"
     return {
-        "generator": GENERATOR_VERSION,
+        "generator": generator_version(standin),
         "renderer": renderers.version(renderer) if rendered else f"{simulator}'s own frames",
         "builders": BUILDERS_VERSION,
     }
@@ -231,7 +231,11 @@ def open_store(folder: Path) -> Store:
     try:
         manifest = json.loads(path.read_text())
         config = manifest.get("config", {})
-        current = versions(config.get("simulator", "bullet"), config.get("renderer", "bullet"))
+        current = versions(
+            config.get("simulator", "bullet"),
+            config.get("renderer", "bullet"),
+            config.get("standin"),
+        )
         built = {key: manifest.get(key) for key in current}
     except (ValueError, AttributeError) as error:
         raise UserError(f"{path} is damaged and cannot be read; {rebuild}") from error

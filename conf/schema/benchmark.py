@@ -10,6 +10,8 @@ from conf.schema.checks import too_small
 
 RENDERERS = ("bullet", "egl", "blender")
 SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
+STANDINS = ("movi_a", "physion")
+STANDIN_OBJECTS = 6
 LOOKS = 48
 """Objects that can be told apart by their names: 3 shapes, 8 colours, 2 materials."""
 
@@ -75,6 +77,9 @@ class BenchmarkConfig:
     """Name of the folder below `store`."""
     simulator: str = "bullet"
     """bullet simulates scenes; clevrer, movi_a and physion read a release of that simulator."""
+    standin: str | None = None
+    """The transfer suite, movi_a or physion, for which scenes of another look and physics stand in:
+    Bullet's own, by that suite's recipe. Null simulates standard scenes."""
     folder: str | None = None
     """Folder of the release, where one is read."""
     fps: float = 30.0
@@ -118,6 +123,7 @@ class BenchmarkConfig:
                 f"benchmark.retrieval.counterfactual with benchmark.simulator={self.simulator}: "
                 "scenes of a release cannot be simulated again, set both of its quotas to 0"
             )
+        problems += self._standin_problems()
         if not 2 <= self.min_objects <= self.max_objects <= LOOKS:
             problems.append(
                 f"benchmark.min_objects={self.min_objects} and "
@@ -128,6 +134,36 @@ class BenchmarkConfig:
             problems.append(
                 f"benchmark.width={self.width} and benchmark.height={self.height}: frames are "
                 "3 wide to 2 high and 48 x 32 px at least, such as 480 x 320"
+            )
+        return problems
+
+    def _standin_problems(self) -> list[str]:
+        if self.standin is None:
+            return []
+        named = f"benchmark.standin={self.standin}"
+        if self.standin not in STANDINS:
+            return [f"{named}: the options are {', '.join(STANDINS)} and null"]
+        problems = []
+        if self.simulator != "bullet":
+            problems.append(
+                f"{named} with benchmark.simulator={self.simulator}: only scenes of "
+                "benchmark.simulator=bullet stand in for another suite's"
+            )
+        if self.renderer == "blender":
+            problems.append(
+                f"{named} with benchmark.renderer=blender, which has no look but its own: give "
+                "benchmark.renderer=bullet or egl"
+            )
+        if self.max_objects > STANDIN_OBJECTS:
+            problems.append(
+                f"{named} with benchmark.max_objects={self.max_objects}: {STANDIN_OBJECTS} at most "
+                "have room in its view"
+            )
+        absent = self.retrieval.counterfactual
+        if absent.train + absent.test > 0:
+            problems.append(
+                f"{named} has no counterfactual scenes: set both quotas of "
+                "benchmark.retrieval.counterfactual to 0"
             )
         return problems
 

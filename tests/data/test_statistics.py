@@ -17,6 +17,9 @@ from data.statistics import (
 )
 from tests.teacher import synthetic
 
+STANDARD = {"config": {"simulator": "bullet"}}
+"""A manifest of standard scenes."""
+
 
 def made(count: int = 24) -> tuple[list, SimpleNamespace]:
     """Items over scenes that move at constant velocity, each with its target at a random letter."""
@@ -35,7 +38,7 @@ def made(count: int = 24) -> tuple[list, SimpleNamespace]:
                 stop=30,
             )
         )  # fmt: skip
-    return items, SimpleNamespace(scene=scenes.__getitem__)
+    return items, SimpleNamespace(scene=scenes.__getitem__, manifest=STANDARD)
 
 
 def test_constant_velocity_foresees_what_moves_so() -> None:
@@ -57,7 +60,7 @@ def test_nearest_and_farthest_go_by_the_frames_after_the_observation() -> None:
 def test_a_tie_counts_its_share() -> None:
     items, _ = made(4)
     still = synthetic.scene([(0, 0)], [(0, 0)])
-    store = SimpleNamespace(scene=lambda _: still)
+    store = SimpleNamespace(scene=lambda _: still, manifest=STANDARD)
     assert strategy_accuracy(items, store)["event"]["nearest"] == pytest.approx(0.25)
 
 
