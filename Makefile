@@ -14,7 +14,9 @@ HAS_NUMA := $(BIN)/python -c "import ctypes; ctypes.CDLL('libnuma.so.1')" 2> /de
 HAS_CHROMIUM := command -v chromium > /dev/null && command -v chromedriver > /dev/null \
 	|| { echo "error: the study's pages are tested in Chromium (apt-get install chromium chromium-driver)"; exit 1; }
 
-.PHONY: help setup vllm-env run test check lint format base constraints clean
+PY := $(BIN)/python -m
+
+.PHONY: help setup vllm-env run paper-tiny paper experiments releases hours test check lint format base constraints clean
 
 help: ## Print this
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -42,6 +44,63 @@ run: setup ## Train and measure the tiny student and the tiny retriever, and rep
 	$(BIN)/python -m train.contrastive
 	$(BIN)/python -m evaluation.retrieve model=checkpoints/contrastive/default
 	$(BIN)/python -m evaluation.report
+
+# The paper's experiments, one after the other, by the commands' own presets: tiny ones, or those of
+# `paper:` below. Each goes on where it was stopped, or is over at once. $(RUNS) begins the names of
+# the students' runs, so that what `make run` has trained is taken as it is.
+REGIMES := answer_only cot cot_no_candidate_analysis cot_no_match_layout
+CONTROLS := candidate_only shuffled_prefix matched_anchor
+RUNS := exp-
+RETRIEVED := default
+SUITES := standin_movi_a standin_physion
+# The tiny base was never asked for a record.
+ZERO_SHOT := modes=[reasoning,answer]
+# An encoder of about a million weights matches nothing before it is trained.
+MATCHER := matcher.model=checkpoints/contrastive/$(RETRIEVED)
+ROUTES := routes=[cot_text,predict_image]
+
+paper-tiny: experiments ## Every experiment of the paper at tiny scale, transfer to stand-in suites, and the report
+
+STUDENT ?= qwen3_vl_8b
+RETRIEVER ?= qwen3_vl_emb_8b
+TEACHER ?= qwen3_32b
+RELEASES ?= /releases
+paper: BENCHMARK := benchmark=dynapix
+paper: TOLD := teacher=$(TEACHER)
+paper: BASE := student=$(STUDENT)
+paper: RUNS := $(STUDENT)-
+paper: EMBEDDER := retriever=$(RETRIEVER)
+paper: RETRIEVED := $(RETRIEVER)
+paper: SUITES := movi_a physion
+paper: FOLDER = benchmark.folder=$(RELEASES)/$$s
+paper: ZERO_SHOT :=
+paper: MATCHER := matcher=$(RETRIEVER)
+paper: ROUTES :=
+paper: releases hours experiments ## The same at the paper's scale, with STUDENT, RETRIEVER and TEACHER, on releases in RELEASES
+
+experiments: setup
+	$(PY) evaluation.select $(BENCHMARK) $(BASE) $(ZERO_SHOT)
+	for r in $(REGIMES); do $(PY) train.sft +exp=$$r $(BENCHMARK) $(TOLD) $(BASE) run=$(RUNS)$$r || exit; done
+	for r in $(REGIMES); do $(PY) evaluation.select $(BENCHMARK) model=checkpoints/sft/$(RUNS)$$r || exit; done
+	for c in $(CONTROLS); do $(PY) evaluation.select +exp=$$c $(BENCHMARK) model=checkpoints/sft/$(RUNS)answer_only || exit; done
+	for c in $(CONTROLS); do $(PY) evaluation.select +exp=$$c $(BENCHMARK) model=checkpoints/sft/$(RUNS)cot || exit; done
+	for s in $(SUITES); do $(PY) data.build benchmark=$$s $(FOLDER) || exit; done
+	for s in $(SUITES); do $(PY) evaluation.select benchmark=$$s $(BASE) $(ZERO_SHOT) || exit; done
+	for s in $(SUITES); do for r in $(REGIMES); do \
+	  $(PY) evaluation.select benchmark=$$s model=checkpoints/sft/$(RUNS)$$r || exit; done; done
+	$(PY) train.contrastive $(BENCHMARK) $(EMBEDDER) run=$(RETRIEVED)
+	$(PY) evaluation.retrieve $(BENCHMARK) model=checkpoints/contrastive/$(RETRIEVED)
+	$(PY) evaluation.similarity $(BENCHMARK) model=checkpoints/contrastive/$(RETRIEVED)
+	$(PY) evaluation.two_stage $(BENCHMARK) $(BASE) $(MATCHER) $(ROUTES)
+	$(PY) evaluation.two_stage $(BENCHMARK) model=checkpoints/sft/$(RUNS)cot $(MATCHER)
+	$(PY) evaluation.report
+
+releases:
+	@test -d "$(RELEASES)/movi_a" && test -d "$(RELEASES)/physion" || { echo "error: make paper measures \
+	transfer on $(RELEASES)/movi_a and $(RELEASES)/physion, which are not both there: give RELEASES=FOLDER"; exit 1; }
+
+hours: setup ## GPU hours of make paper's training, from the rates that cards measured
+	@$(PY) benchmarks.hours --student $(STUDENT) --retriever $(RETRIEVER)
 
 # Servers and ranks that tests start have threads of their own.
 test: setup vllm-env ## Run every test
