@@ -16,6 +16,7 @@ from data.records import FrameRef, RetrievalQuery
 from data.retrieval.checks import check_test
 from data.store import Store
 from evaluation import figures, paper, tables
+from evaluation.formats import Table
 from evaluation.ranking import Ranks, exact_ranks
 
 log = logging.getLogger(__name__)
@@ -46,7 +47,7 @@ def write_report(
     folder: Path,
     rows: Sequence[tables.RetrievalRow],
     curves: Sequence[dict[str, Any]],
-    told: Sequence[str] = (),
+    told: Sequence[Table] = (),
     reference: Sequence[paper.RetrievalReference] = paper.RETRIEVAL_DISTILLED,
     **also: Any,
 ) -> None:
@@ -54,7 +55,7 @@ def write_report(
     more entries."""
     table = f"{tables.retrieval_table(rows, reference)}\n\n{tables.cost_table(rows)}"
     log.info("%s", table)
-    page = "\n\n".join([table, *told, *tables.builder_tables(rows)])
+    page = "\n\n".join(map(str, [table, *told, *tables.builder_tables(rows)]))
     write_text(folder / "report.txt", page + "\n")
     report = {"rows": [r.to_dict() for r in rows], "curves": curves, **also}
     write_text(folder / "report.json", json.dumps(report, indent=1))

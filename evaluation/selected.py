@@ -58,11 +58,11 @@ def write_report(
 
     named = [replace(row, mode=w) for row, w in zip(rows, told, strict=True)]
     parts = [tables.selection_table(named), *([tables.paired_table(apart)] if apart else [])]
-    log.info("%s", "\n\n".join(parts))
+    log.info("%s", "\n\n".join(map(str, parts)))
     parts += [tables.subtype_table(subtypes), tables.reading_table(reasons)]
     parts += [tables.position_table(letters)]
     parts += [tables.calibration_table(w, found) for w, found in confidences.items()]
-    write_text(folder / "report.txt", "\n\n".join(parts) + "\n")
+    write_text(folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")
     report = {
         "rows": [r.to_dict() for r in rows],
         "controls": [{"mode": w, **asdict(p)} for w, found in apart for p in found],

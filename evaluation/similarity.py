@@ -57,9 +57,9 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
             apart.append((name, anchors(items, credits, cfg.seed)))
 
     parts = [tables.selection_table(rows), *([tables.paired_table(apart)] if apart else [])]
-    log.info("%s", "\n\n".join(parts))
+    log.info("%s", "\n\n".join(map(str, parts)))
     parts += [tables.subtype_table(subtypes), tables.position_table(letters)]
-    write_text(run.folder / "report.txt", "\n\n".join(parts) + "\n")
+    write_text(run.folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")
     report = {
         "rows": [r.to_dict() for r in rows],
         "controls": [{"mode": name, **asdict(p)} for name, found in apart for p in found],

@@ -1,14 +1,15 @@
-"""Result rows and the text tables that show them beside the paper's."""
+"""Result rows, and the tables that show them beside the paper's."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from data.records import FAMILIES, LETTERS
 from evaluation import paper
 from evaluation.confidence import Calibration, Positions
+from evaluation.formats import Table
 from evaluation.metrics import Accuracy, Interval
 from evaluation.paired import Paired
 
@@ -22,7 +23,10 @@ UNTRAINED = "untrained"
 SIMILARITY = "similarity"
 """The mode of a retriever that chooses the nearest candidate."""
 
-NAME_WIDTH = 40
+SELECTION_HEAD = (*(f.capitalize() for f in FAMILIES), "Macro", "Micro", "Parsed", "Items")
+_HEADS = (*(f"R@{k}" for k in RECALLS), "MRR", "Median", "Tied")
+RETRIEVAL_HEAD = ("Width", *_HEADS, "Queries", "Frames")
+PAPER = "paper (Qwen3-VL 8B, full benchmark)"
 
 
 @dataclass(frozen=True)
@@ -114,38 +118,53 @@ class RetrievalRow:
         return cls(**{**row, **{name: Interval(**row[name]) for name in names}})
 
 
-def selection_table(rows: Sequence[SelectionRow]) -> str:
-    """The rows, and below them the paper's, in percent; at most 100 columns wide."""
-    own = []
+def selection_table(rows: Sequence[SelectionRow]) -> Table:
+    """The rows, and below them the paper's, in percent."""
+    similar = paper.SELECTION_SIMILARITY if any(r.mode == SIMILARITY for r in rows) else ()
+    reference = (paper.CHANCE, *similar, *paper.SELECTION_DISTILLED, paper.HUMAN_MAJORITY)
+    return Table(
+        "selection",
+        "Selection accuracy (%)",
+        ["Selection accuracy, %", *SELECTION_HEAD],
+        {"": selection_cells(rows), PAPER: selection_references(reference)},
+        (SELECTION_NOTE,),
+    )
+
+
+SELECTION_NOTE = (
+    "Intervals are Wilson's, macro's bootstrapped over scenes; what cannot be parsed is wrong."
+)
+
+
+def selection_cells(rows: Sequence[SelectionRow]) -> list[list[str]]:
+    """Of each row, a line under `SELECTION_HEAD`, one with its intervals, and its time items by how
+    far ahead they ask."""
+    cells = []
     for r in rows:
         found = [*(r.families.get(f) for f in FAMILIES)]
         shares = [*(i and i.value for i in found), r.macro, r.micro.value, r.parse_rate]
-        name = _short(r.name, NAME_WIDTH - len(r.mode) - 3)
-        own.append([f"{name} ({r.mode})", *map(_percent, shares), f"{r.n:,}"])
+        cells.append([f"{r.name} ({r.mode})", *map(_percent, shares), f"{r.n:,}"])
         spans = map(_range, (*found, r.macro_interval, r.micro))
-        own.append(["  95% interval", *spans, "", ""])
+        cells.append(["  95% interval", *spans, "", ""])
         for horizon, of in r.horizons.items():
             label = f"  time, {horizon} ({_range(of)})"
-            own.append([label, "", _percent(of.value), "", "", "", "", f"{of.n:,}"])
-    similar = paper.SELECTION_SIMILARITY if any(r.mode == SIMILARITY for r in rows) else ()
-    reference = []
-    for r in (paper.CHANCE, *similar, *paper.SELECTION_DISTILLED, paper.HUMAN_MAJORITY):
+            cells.append([label, "", _percent(of.value), "", "", "", "", f"{of.n:,}"])
+    return cells
+
+
+def selection_references(rows: Sequence[paper.SelectionReference]) -> list[list[str]]:
+    """The paper's rows under `SELECTION_HEAD`."""
+    cells = []
+    for r in rows:
         shares = (r.event, r.time, r.window, r.macro, r.micro, r.parse_rate)
-        reference.append([r.name, *map(_printed, shares), ""])
-        for seconds, percent in paper.TIME_BY_HORIZON.get(r.name, {}).items():
-            reference.append([f"  time, {seconds} s", "", _printed(percent), *[""] * 5])
-    head = ["Selection accuracy, %", *(f.capitalize() for f in FAMILIES)]
-    table = _table(
-        [*head, "Macro", "Micro", "Parsed", "Items"],
-        {"": own, "paper (Qwen3-VL 8B, full benchmark)": reference},
-    )
-    note = (
-        "Intervals are Wilson's, macro's bootstrapped over scenes; what cannot be parsed is wrong."
-    )
-    return f"{table}\n{note}"
+        cells.append([r.name, *map(_printed, shares), ""])
+        if r in paper.SELECTION_DISTILLED:
+            for seconds, percent in paper.TIME_BY_HORIZON.get(r.name, {}).items():
+                cells.append([f"  time, {seconds} s", "", _printed(percent), *[""] * 5])
+    return cells
 
 
-def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> str:
+def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> Table:
     """Accuracy of each subtype (`family/subtype`) in each mode, with its interval and items."""
     modes = list(subtypes)
     rows = []
@@ -153,11 +172,11 @@ def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> str:
         found = [subtypes[mode][cell] for mode in modes]
         shares = [f"{_percent(i.value)} [{_range(i)}]" for i in found]
         rows.append([cell, *shares, str(found[0].n)])
-    heads = [_short(mode, NAME_WIDTH) for mode in modes]
-    return _table(["Accuracy by subtype, %", *heads, "Items"], {"": rows})
+    head = ["Accuracy by subtype, %", *modes, "Items"]
+    return Table("subtypes", "Selection accuracy by subtype (%)", head, {"": rows})
 
 
-def paired_table(found: Sequence[tuple[str, Sequence[Paired]]]) -> str:
+def paired_table(found: Sequence[tuple[str, Sequence[Paired]]]) -> Table:
     """What two ways of answering the same items are apart, by how these were asked."""
     parts = {
         f"{way}: {of[0].left} (left) less {of[0].right} (right)": [
@@ -175,15 +194,16 @@ def paired_table(found: Sequence[tuple[str, Sequence[Paired]]]) -> str:
         for way, of in found
     }
     head = ["Paired accuracy, %", "Left", "Right", "Apart", "95%", "Only left", "Only right"]
-    table = _table([*head, "p", "Items"], parts)
-    return (
-        f"{table}\nApart: left less right, its interval bootstrapped over scenes. Only left, only "
-        "right: items\nanswered right that way alone; p is McNemar's exact test of the two, which "
-        "takes the items of a\nscene for independent."
+    note = (
+        "Apart: left less right, its interval bootstrapped over scenes. Only left, only right: "
+        "items answered right that way alone; p is McNemar's exact test of the two, which takes "
+        "the items of a scene for independent."
     )
+    caption = "Paired differences of accuracy"
+    return Table("paired", caption, [*head, "p", "Items"], parts, (note,))
 
 
-def position_table(found: dict[str, Positions]) -> str:
+def position_table(found: dict[str, Positions]) -> Table:
     """Of each mode: which letters were chosen, which were right, and how often the model was right
     where each was."""
     cells = []
@@ -199,10 +219,11 @@ def position_table(found: dict[str, Positions]) -> str:
         if of.p is not None:
             told = f"  chi-square {of.chi_square:.1f}, p = {of.p:.2g}"
             cells.append([told, *[""] * (len(LETTERS) + 1)])
-    return _table(["Letters, %", *LETTERS, "Answers"], {"": cells})
+    caption = "Letters that were chosen and that were right (%)"
+    return Table("positions", caption, ["Letters, %", *LETTERS, "Answers"], {"": cells})
 
 
-def calibration_table(mode: str, found: Calibration) -> str:
+def calibration_table(mode: str, found: Calibration) -> Table:
     """How often answers of each reported confidence are right, and what that comes to."""
     cells = [
         [
@@ -215,38 +236,58 @@ def calibration_table(mode: str, found: Calibration) -> str:
         for b in found.bins
     ]
     head = [f"Confidence reported ({mode}), %", "Mean", "Right", "95%", "Answers"]
-    table = _table(head, {"": cells})
-    return (
-        f"{table}\nExpected calibration error {found.ece:.3f}, Brier score {found.brier:.3f}, of "
+    note = (
+        f"Expected calibration error {found.ece:.3f}, Brier score {found.brier:.3f}, of "
         f"{found.n:,} valid records."
     )
+    caption = "How often answers of each reported confidence are right"
+    return Table("calibration", caption, head, {"": cells}, (note,))
 
 
-def reading_table(reasons: dict[str, dict[str, int]], head: str = "Answers") -> str:
+def reading_table(reasons: dict[str, dict[str, int]], head: str = "Answers") -> Table:
     """How the answers of each mode could be read: counts by reason."""
     names = list(dict.fromkeys(name for counts in reasons.values() for name in counts))
     cells = [
         [name, *(f"{counts[name]:,}" if name in counts else "-" for counts in reasons.values())]
         for name in names
     ]
-    return _table([head, *reasons], {"": cells})
+    caption = "Answers that could be read, and why others could not"
+    return Table("readings", caption, [head, *reasons], {"": cells})
 
 
 def retrieval_table(
     rows: Sequence[RetrievalRow],
     reference: Sequence[paper.RetrievalReference] = paper.RETRIEVAL_DISTILLED,
-) -> str:
+) -> Table:
     """The rows over all queries by width, widest first, each width's untrained row on top; then the
     paper's."""
     every = [r for r in rows if r.builder is None]
     ordered = sorted(every, key=lambda r: (-(r.width or 0), not r.untrained))
-    own = []
-    for r in ordered:
+    return Table(
+        "retrieval",
+        "Retrieval (recall in %)",
+        ["Retrieval", *RETRIEVAL_HEAD],
+        {"": retrieval_cells(ordered), PAPER: retrieval_references(reference)},
+        (RETRIEVAL_NOTE,),
+    )
+
+
+RETRIEVAL_NOTE = "Intervals are bootstrapped over scenes; a target that is not found is last."
+
+
+def retrieval_cells(rows: Sequence[RetrievalRow]) -> list[list[str]]:
+    """Of each row, a line under `RETRIEVAL_HEAD` and one with its intervals."""
+    cells = []
+    for r in rows:
         width = "-" if r.width is None else str(r.width)
-        sizes = [f"{r.queries:,}", f"{r.frames:,}"]
-        own.append([_short(r.name, NAME_WIDTH), width, *_values(r), *sizes])
-        own.append(["  95% interval", "", *_ranges(r), "", ""])
-    printed = [
+        cells.append([r.name, width, *_values(r), f"{r.queries:,}", f"{r.frames:,}"])
+        cells.append(["  95% interval", "", *_ranges(r), "", ""])
+    return cells
+
+
+def retrieval_references(rows: Sequence[paper.RetrievalReference]) -> list[list[str]]:
+    """The paper's rows under `RETRIEVAL_HEAD`."""
+    return [
         [
             r.name,
             "",
@@ -257,21 +298,16 @@ def retrieval_table(
             "2,002",
             "10,000",
         ]
-        for r in reference
+        for r in rows
     ]
-    table = _table(
-        ["Retrieval", "Width", *_heads(), "Queries", "Frames"],
-        {"": own, "paper (Qwen3-VL 8B, full benchmark)": printed},
-    )
-    return f"{table}\nIntervals are bootstrapped over scenes; a target that is not found is last."
 
 
-def cost_table(rows: Sequence[RetrievalRow]) -> str:
+def cost_table(rows: Sequence[RetrievalRow]) -> Table:
     """What the rows over all queries cost beside what they give, those that give most first."""
     every = [r for r in rows if r.builder is None]
     cells = [
         [
-            _short(r.name, NAME_WIDTH),
+            r.name,
             "-" if r.width is None else str(r.width),
             _percent(r.recall_10.value),
             f"{r.mrr.value:.3f}",
@@ -280,14 +316,15 @@ def cost_table(rows: Sequence[RetrievalRow]) -> str:
         ]
         for r in sorted(every, key=lambda r: -r.mrr.value)
     ]
-    table = _table(["What it gives and costs", "Width", "R@10", "MRR", "MiB", "s"], {"": cells})
-    return (
-        f"{table}\nMiB: of what stands for the database. s: to rank for all queries; an exact "
-        "search ranks at\nall widths at once."
+    head = ["What it gives and costs", "Width", "R@10", "MRR", "MiB", "s"]
+    note = (
+        "MiB: of what stands for the database. s: to rank for all queries; an exact search ranks "
+        "at all widths at once."
     )
+    return Table("costs", "What retrievers give and cost", head, {"": cells}, (note,))
 
 
-def builder_tables(rows: Sequence[RetrievalRow]) -> list[str]:
+def builder_tables(rows: Sequence[RetrievalRow]) -> list[Table]:
     """A table for each retriever: by builder, at every width, with the intervals."""
     tables = []
     for name in dict.fromkeys(r.name for r in rows):
@@ -297,16 +334,16 @@ def builder_tables(rows: Sequence[RetrievalRow]) -> list[str]:
             pairs = zip(_values(r), _ranges(r), strict=True)
             found = [f"{value} [{span}]" for value, span in pairs]
             cells.append([of, str(r.width), *found, str(r.queries)])
-        head = [f"{_short(name, NAME_WIDTH)} by builder", "Width", *_heads(), "Queries"]
-        tables.append(_table(head, {"": cells}))
+        head = [f"{name} by builder", "Width", *_HEADS, "Queries"]
+        tables.append(Table("builders", f"Retrieval by builder: {name}", head, {"": cells}))
     return tables
 
 
-def index_table(indexes: Sequence[dict[str, Any]]) -> str:
+def index_table(indexes: Sequence[dict[str, Any]]) -> Table:
     """What is told of approximate indexes, as `evaluation.index` gives it, each with its `name`."""
     cells = [
         [
-            _short(told["name"], NAME_WIDTH),
+            told["name"],
             str(told["width"]),
             *(_percent(told[f"recall@{k}"]) for k in RECALLS),
             f"{told['bytes'] / 2**20:,.1f}",
@@ -315,11 +352,14 @@ def index_table(indexes: Sequence[dict[str, Any]]) -> str:
         for told in indexes
     ]
     recalls = [f"R@{k}" for k in RECALLS]
-    table = _table(["Index, held against exact", "Width", *recalls, "MiB", "s"], {"": cells})
-    return f"{table}\nR@k: of the exact first k, what share the index has among its own first k."
+    head = ["Index, held against exact", "Width", *recalls, "MiB", "s"]
+    note = "R@k: of the exact first k, what share the index has among its own first k."
+    return Table(
+        "indexes", "Approximate indexes held against exact ones", head, {"": cells}, (note,)
+    )
 
 
-def human_table(found: dict[str, Any]) -> str:
+def human_table(found: dict[str, Any]) -> Table:
     """What `evaluation.study.agreement.summary` found, beside the paper's study."""
 
     def row(name: str, of: dict[str, Any]) -> list[str]:
@@ -339,15 +379,15 @@ def human_table(found: dict[str, Any]) -> str:
     seconds = [f"{paper.HUMAN_SECONDS[f]:.1f}" for f in FAMILIES]
     reference.append(["Median seconds", *seconds, "", "", ""])
     head = ["Human accuracy, %", *(f.capitalize() for f in FAMILIES), "Macro", "Micro", "Items"]
-    table = _table(head, {"": own, "paper (59 items of three simulators)": reference})
-    return "\n".join([table, *_human_notes(found)])
+    parts = {"": own, "paper (59 items of three simulators)": reference}
+    return Table("human", "Human accuracy (%)", head, parts, _human_notes(found))
 
 
-def _human_notes(found: dict[str, Any]) -> list[str]:
+def _human_notes(found: dict[str, Any]) -> tuple[str, ...]:
     depth = [f"{items} by {votes}" for votes, items in found["depth"].items()]
     kappa, alpha = found["fleiss_kappa"], found["krippendorff_alpha"]
     undecided = found["majority"]["undecided"] if found["majority"] else 0
-    return [
+    return (
         f"{found['judgments']:,} judgments of {found['items']:,} items; items by how many answered "
         f"them: {', '.join(depth)}.",
         f"Majority is more than half of an item's votes; items without one, counted wrong: "
@@ -357,15 +397,11 @@ def _human_notes(found: dict[str, Any]) -> list[str]:
         f"Krippendorff's alpha {_agreed(alpha['value'])} on the {alpha['items']} items of two "
         "votes or more.",
         "Seconds are of pages that were loaded once.",
-    ]
+    )
 
 
 def _agreed(value: float | None) -> str:
     return "undefined" if value is None else f"{value:.2f}"
-
-
-def _heads() -> list[str]:
-    return [*(f"R@{k}" for k in RECALLS), "MRR", "Median", "Tied"]
 
 
 def _values(row: RetrievalRow) -> list[str]:
@@ -393,25 +429,3 @@ def _printed(percent: float | None) -> str:
 
 def _range(found: Interval | None) -> str:
     return "" if found is None else f"{100 * found.low:.0f}-{100 * found.high:.0f}"
-
-
-def _table(head: list[str], parts: dict[str, list[list[str]]]) -> str:
-    """Aligned columns, the first to the left, one part after the other under its label."""
-    cells = [head, *(row for part in parts.values() for row in part)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    lines = [_line(head, widths)]
-    rule = "-" * (sum(widths) + 2 * len(widths) - 2)
-    for label, part in parts.items():
-        lines += [rule, *([label] if label else []), *(_line(row, widths) for row in part)]
-    return "\n".join([*lines, rule])
-
-
-def _line(row: Iterable[str], widths: list[int]) -> str:
-    first, *rest = row
-    cells = [first.ljust(widths[0])]
-    cells += [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
-    return "  ".join(cells).rstrip()
-
-
-def _short(name: str, width: int) -> str:
-    return name if len(name) <= width else name[: width - 1] + "…"

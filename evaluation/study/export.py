@@ -38,7 +38,7 @@ def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
     write_text(run.folder / VOTES, "".join(json.dumps(v.to_row()) + "\n" for v in votes))
     write_text(run.folder / "report.json", json.dumps(found, indent=1))
     table = human_table(found)
-    write_text(run.folder / "report.txt", table + "\n")
+    write_text(run.folder / "report.txt", f"{table}\n")
     log.info("%s\n\nvotes: %s", table, run.folder / VOTES)
     families = {f"majority_{f}": i["value"] for f, i in found["majority"]["families"].items()}
     return {**families, "majority_macro": found["majority"]["macro"]}

@@ -142,6 +142,6 @@ def test_anchors_hold_the_questions_of_a_pair_against_each_other(benchmark_store
 def test_what_is_apart_is_json_and_fits_a_page(items) -> None:
     found = compare(items, drawn(items, 0), drawn(items, 1), ("as they are", "shuffled_prefix"), 0)
     assert [Paired(**asdict(p)) for p in found] == found
-    table = paired_table([("reasoning", found), ("answer, candidate_only", found)])
+    table = str(paired_table([("reasoning", found), ("answer, candidate_only", found)]))
     assert max(map(len, table.splitlines())) <= 100
     assert table.count("\nmacro ") == 2
