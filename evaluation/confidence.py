@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,11 @@ class Calibration:
     brier: float
     n: int
     bins: list[Bin]
+
+    @classmethod
+    def from_dict(cls, told: dict[str, Any]) -> Calibration:
+        bins = [Bin(**{**b, "accuracy": Interval(**b["accuracy"])}) for b in told["bins"]]
+        return cls(**{**told, "bins": bins})
 
 
 def calibration(confidence: Sequence[float], correct: Sequence[float]) -> Calibration | None:

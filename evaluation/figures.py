@@ -61,7 +61,7 @@ def selection_figure(rows: Sequence[SelectionRow], path: Path | str) -> None:
     axes.set_ylim(0, 108)
     axes.set_yticks(range(0, 101, 25))
     axes.set_ylabel("Accuracy (%)")
-    _legend(figure, axes)
+    legend_above(figure, axes)
     figure.savefig(path)
 
 
@@ -104,7 +104,7 @@ def retrieval_figure(rows: Sequence[RetrievalRow], path: Path | str) -> None:
     panels[0].set_ylim(0, None)
     panels[0].set_ylabel("Queries (%)")
     figure.supxlabel("Embedding width", fontsize=10)
-    _legend(figure, panels[0])
+    legend_above(figure, panels[0])
     figure.savefig(path)
 
 
@@ -229,7 +229,7 @@ def _number(axes: Axes, x: float, y: float, value: float) -> None:
     axes.text(x, y + 1.5, f"{value:.0f}", ha="center", va="bottom", fontsize=9, color=INK)
 
 
-def _legend(figure: Figure, axes: Axes) -> None:
+def legend_above(figure: Figure, axes: Axes) -> None:
     """A legend above the plot, where it covers nothing."""
     handles, labels = axes.get_legend_handles_labels()
     # Markers are listed before bars, whatever the order they were drawn in: keep the paper last.

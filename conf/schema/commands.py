@@ -21,6 +21,7 @@ FRAMES_AHEAD = ("named", "all", "none")
 ENGINES = ("loky", "ray")
 INDEXES = ("exact", "faiss")
 SUITES = (None, "matched_anchor")
+CONTROLS = ("candidate_only", "shuffled_prefix")
 DTYPES = ("auto", "bfloat16", "float16", "float32")
 
 
@@ -274,9 +275,9 @@ class SelectCommand(CommandConfig):
     def check(self) -> list[str]:
         problems = super().check() + too_small(self, "", {"batch": 1, "limit": 1})
         problems += suite_problems(self)
-        if self.control not in (None, "candidate_only", "shuffled_prefix"):
+        if self.control not in (None, *CONTROLS):
             problems.append(
-                f"control={self.control}: the options are candidate_only, shuffled_prefix and null"
+                f"control={self.control}: the options are {', '.join(CONTROLS)} and null"
             )
         given = ["record"] if self.modes is None else self.modes
         if not given or len(set(given)) < len(given) or set(given) - set(ASKED):
@@ -346,7 +347,23 @@ class SimilarityCommand(CommandConfig):
 
 @dataclass
 class ReportCommand(CommandConfig):
-    pass
+    runs: list[str] | None = None
+    """Run folders below `checkpoints`, or patterns of them, such as [select/cot,retrieve/*]; null
+    takes every finished one."""
+    items: int = 120
+    """Items of a benchmark that the page shows at most: as many subtypes as there is room for, with
+    right and wrong answers of each."""
+    seed: int = 0
+    """Of the choice of these items."""
+
+    def check(self) -> list[str]:
+        problems = super().check() + too_small(self, "", {"items": 0})
+        if self.runs is not None and (not self.runs or not all(r.strip("/. ") for r in self.runs)):
+            problems.append(
+                f"runs={self.runs}: name folders below {self.checkpoints}, such as "
+                "runs=[select/cot,retrieve/*], or leave it null for every finished run"
+            )
+        return problems
 
 
 def suite_problems(cfg: SelectCommand | SimilarityCommand) -> list[str]:

@@ -1,0 +1,125 @@
+"""What the page needs of items and answers: if runs belong together, and the items that it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from conf.errors import UserError
+from data.controls import MATCHED
+from data.records import SelectionItem
+from data.store import Store, open_store
+from evaluation.page import items, plots
+from evaluation.page.rows import Measured, once
+from evaluation.page.said import Asked, Said, answers_of, check_same_items, control_of
+from evaluation.select import spread
+
+RunAnswers = Mapping[Path, Mapping[Asked, Mapping[str, Said]]]
+"""What was said in each run's folder."""
+
+
+@dataclass
+class Browser:
+    """The items that the page shows, their frames as data addresses by name, and in sentences what
+    it shows of each benchmark and what it cannot.
+
+    `confusions` are of all answered items, by benchmark and model, as `plots.confusion` counts.
+    """
+
+    entries: list[dict[str, Any]] = field(default_factory=list)
+    frames: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    confusions: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+
+
+def browser_of(choices: Sequence[Measured], stores: Path, bound: int, seed: int) -> Browser:
+    """Of each benchmark with answers at most `bound` items, chosen by `seed`.
+
+    Raises:
+        UserError: two runs measured different items of one benchmark.
+    """
+    said = {m.run.folder: answers_of(m.run) for m in choices if m.run.kind == "select"}
+    opened = {name: _open(stores / name) for name in dict.fromkeys(map(_store_name, choices))}
+    ids = [_item_ids(m, said, opened[_store_name(m)]) for m in choices]
+    check_same_items(choices, ids)
+    browser = Browser()
+    for name, store in opened.items():
+        answered = [m for m in once(choices) if _store_name(m) == name and _answers(m, said)]
+        if answered and isinstance(store, str):
+            browser.notes.append(f"The items of {name} cannot be shown: {store}.")
+        elif answered:
+            _add(browser, store, answered, said, bound, seed)
+    return browser
+
+
+def _add(
+    browser: Browser,
+    store: Store,
+    answered: Sequence[Measured],
+    said: RunAnswers,
+    bound: int,
+    seed: int,
+) -> None:
+    """Add a benchmark's items and what `answered` models said to them."""
+    every = {i.item_id: i for suite in (None, MATCHED) for i in store.selection("test", suite)}
+    answers: dict[str, Mapping[str, Said]] = {}
+    for m in answered:
+        label = _label(m, answers)
+        answers[label] = given = _answers(m, said)
+        pairs = [(every[k].letter, s.choice.letter) for k, s in given.items() if k in every]
+        browser.confusions.setdefault(m.benchmark, {})[label] = plots.confusion(pairs)
+    asked = set().union(*answers.values())
+    known = [item for name, item in every.items() if name in asked]
+    shown = items.spread(known, answers, bound, seed)
+    browser.entries += items.entries(shown, answers, store)
+    frames, gone = items.pictures(shown, store)
+    browser.frames |= frames
+    browser.notes.append(
+        f"{store.name}: {len(shown):,} of {len(known):,} answered items, a spread over subtypes "
+        "and over right and wrong answers; items=N shows more or fewer."
+    )
+    if lost := len(asked) - len(known):
+        browser.notes.append(
+            f"{lost:,} answered items are left out: {store.folder} has none of these names, so it "
+            "was built otherwise when they were answered."
+        )
+    browser.notes += [f"Frames are missing: {why}." for why in gone[:1]]
+
+
+def _store_name(m: Measured) -> str:
+    return m.benchmark.split(", ")[0]
+
+
+def _label(m: Measured, taken: Mapping[str, Any]) -> str:
+    label = ", ".join(filter(None, (m.label, control_of(m.benchmark))))
+    return f"{label}, {m.run.name}" if label in taken else label
+
+
+def _answers(m: Measured, said: RunAnswers) -> Mapping[str, Said]:
+    of_run = said.get(m.run.folder, {})
+    return of_run.get((m.row.mode, control_of(m.benchmark)), {})
+
+
+def _item_ids(m: Measured, said: RunAnswers, store: Store | str) -> Set[str] | None:
+    """The items that a row is of; None where neither answers nor a store tell."""
+    if m.run.kind == "select":
+        return _answers(m, said).keys() or None
+    return None if isinstance(store, str) else {i.item_id for i in _chosen(m, store)}
+
+
+def _chosen(m: Measured, store: Store) -> list[SelectionItem]:
+    """The items that a run of evaluation.similarity chose among."""
+    of = m.run.config
+    return spread(store.selection("test", of["suite"]), of["limit"], of["seed"])
+
+
+def _open(folder: Path) -> Store | str:
+    """A benchmark's store, or in a sentence why there is none."""
+    try:
+        return open_store(folder)
+    except UserError as error:
+        return f"{error} benchmark={folder.name}"

@@ -1,0 +1,138 @@
+"""The runs that a report is over, read from their folders."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from conf.errors import UserError
+
+CHOICES, RANKINGS = ("select", "similarity"), ("retrieve", "two_stage")
+STUDIES, TRAININGS = ("export_study",), ("sft", "contrastive")
+KINDS = (*CHOICES, *RANKINGS, *STUDIES, *TRAININGS)
+"""Folders below checkpoints/ that hold runs of which a report tells."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A finished run: its folder, the command's folder that it is in (`kind`), its settings, and
+    its report.json, which a training run has none of."""
+
+    folder: Path
+    kind: str
+    name: str
+    config: dict[str, Any]
+    report: dict[str, Any]
+
+
+def gather(root: Path, patterns: Sequence[str] | None) -> list[Finished]:
+    """The finished runs below `root` that a pattern, such as select/*, names; all where it is null.
+    Oldest first.
+
+    Raises:
+        UserError: nothing is measured, a pattern names no run, or a run cannot be read.
+    """
+    found = [run for kind in KINDS for run in _runs(root, kind)]
+    if patterns is not None:
+        found = [run for pattern in patterns for run in _named(root, pattern, found)]
+    runs = [_read(root, folder) for folder in dict.fromkeys(found)]
+    if all(run.kind in TRAININGS for run in runs):
+        raise UserError(
+            f"nothing is measured below {root}: run python -m evaluation.select "
+            "model=checkpoints/sft/RUN or python -m evaluation.retrieve "
+            "model=checkpoints/contrastive/RUN first"
+        )
+    return sorted(runs, key=lambda run: (run.folder / "metrics.json").stat().st_mtime)
+
+
+def _runs(root: Path, kind: str) -> list[Path]:
+    """A command's finished runs, a sweep's jobs among them."""
+    done = [*root.glob(f"{kind}/*/metrics.json"), *root.glob(f"{kind}/*/*/metrics.json")]
+    return [path.parent for path in sorted(done)]
+
+
+def _named(root: Path, pattern: str, finished: Sequence[Path]) -> list[Path]:
+    """The runs that a pattern names, which are looked for among the `finished` ones."""
+    pattern = pattern.strip("/").removeprefix(f"{root.as_posix().strip('/')}/")
+    folders = [path for path in root.glob(pattern) if path.is_dir()]
+    chosen = [path for path in folders if path in finished]
+    if chosen:
+        return sorted(chosen)
+    if folders:
+        raise UserError(
+            f"runs: {folders[0]} is no finished run of an evaluation or of training: run its "
+            "command again to go on with it, or name another one"
+        )
+    there = [path.relative_to(root).as_posix() for path in finished]
+    near = get_close_matches(pattern, there, 3, 0.3) or there[:3]
+    told = f"; there are {', '.join(near)}" if near else ""
+    raise UserError(f"runs: {pattern} names no run below {root}{told}")
+
+
+def _read(root: Path, folder: Path) -> Finished:
+    kind, *name = folder.relative_to(root).parts
+    config = folder / "config.yaml"
+    try:
+        settings = OmegaConf.to_container(OmegaConf.load(config))
+        if not isinstance(settings, dict):
+            raise YAMLError("it holds no settings")
+    except FileNotFoundError as error:
+        raise UserError(
+            f"{config} is missing, so nobody knows what {folder} measured: delete that folder and "
+            "measure again, or leave it out with runs=[...]"
+        ) from error
+    except (YAMLError, OmegaConfBaseException) as error:
+        raise UserError(f"{config} is damaged: delete {folder} and measure again") from error
+    report = {} if kind in TRAININGS else _report(folder)
+    return Finished(folder, kind, "/".join(name), settings, report)
+
+
+def _report(folder: Path) -> dict[str, Any]:
+    try:
+        found = json.loads((folder / "report.json").read_text())
+        return dict(found)
+    except (OSError, ValueError, TypeError) as error:
+        raise unreadable(folder) from error
+
+
+def unreadable(folder: Path) -> UserError:
+    return UserError(
+        f"{folder / 'report.json'} is missing, damaged or of another version: delete {folder} "
+        "and measure again"
+    )
+
+
+def json_lines(path: Path) -> Iterator[dict[str, Any]]:
+    """The objects in a file of JSON lines, none where it is missing; lines that a kill tore are
+    passed over."""
+    if not path.exists():
+        return
+    with open(path, encoding="utf-8", errors="replace") as file:
+        for line in file:
+            try:
+                row = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(row, dict):
+                yield row
+
+
+def training_of(run: Finished, root: Path) -> dict[str, Any] | None:
+    """The settings that the model of an evaluation was trained by; None where it is as it was
+    released, and empty where its folder is gone."""
+    model = run.config.get("model")
+    if model is None:
+        return None
+    # Where the runs were moved, or are reported from another folder, it is below `root`.
+    for folder in (Path(model), root / Path(*Path(model).parts[1:])):
+        if (folder / "config.yaml").is_file():
+            return OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+    return {}

@@ -1,0 +1,116 @@
+"""The rows of measured models, each with what its table needs of the run that it stands in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evaluation.page.gathering import CHOICES, RANKINGS, Finished, training_of, unreadable
+from evaluation.tables import UNTRAINED, RetrievalRow, SelectionRow
+
+SUITES = {"movi_a": "MoVi-A", "physion": "Physion"}
+"""The paper's transfer suites by their simulator."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A row with what its table needs of the run that it stands in.
+
+    `regime` is how a student was trained, None for a model as it was released. `home` is the
+    benchmark that it was trained on, None where it was not or where that is not known.
+    """
+
+    row: SelectionRow | RetrievalRow
+    run: Finished
+    trained: bool
+    regime: str | None = None
+    home: str | None = None
+
+    @property
+    def benchmark(self) -> str:
+        return self.row.benchmark
+
+    @property
+    def label(self) -> str:
+        return f"{self.row.name} ({self.row.mode})"
+
+    def told(self, kind: str) -> Any:
+        """What else the run reports of a selection row's model, such as its subtypes."""
+        name = self.row.name if self.run.kind == "similarity" else self.row.mode
+        return self.run.report.get(kind, {}).get(name)
+
+    @property
+    def suite(self) -> str:
+        """What a column of this benchmark is called."""
+        simulator = self.run.config.get("benchmark", {}).get("simulator")
+        return SUITES.get(simulator, self.benchmark)
+
+
+def read_rows(runs: Sequence[Finished], root: Path) -> tuple[list[Measured], list[Measured]]:
+    """The selection and the retrieval rows of runs below `root`.
+
+    Raises:
+        UserError: a report is of another version.
+    """
+    choices = [m for run in runs if run.kind in CHOICES for m in _rows(run, root, SelectionRow)]
+    ranks = [m for run in runs if run.kind in RANKINGS for m in _rows(run, root, RetrievalRow)]
+    return choices, ranks
+
+
+def _rows(
+    run: Finished, root: Path, kind: type[SelectionRow] | type[RetrievalRow]
+) -> list[Measured]:
+    training = training_of(run, root)
+    try:
+        rows = [kind.from_dict(row) for row in run.report["rows"]]
+    except (KeyError, TypeError) as error:
+        raise unreadable(run.folder) from error
+    return [_measured(run, row, training) for row in rows]
+
+
+def _measured(
+    run: Finished, row: SelectionRow | RetrievalRow, training: dict[str, Any] | None
+) -> Measured:
+    # A trained retriever's report has a row of what it began from, too.
+    if training is None or row.name.startswith(UNTRAINED):
+        return Measured(row, run, trained=False)
+    regime = training.get("train", {}).get("regime")
+    return Measured(row, run, True, regime, training.get("benchmark", {}).get("name"))
+
+
+def once(rows: Iterable[Measured]) -> list[Measured]:
+    """Each row once: a released model's stands in the reports of several trained from it."""
+    kept: list[Measured] = []
+    for m in rows:
+        if all(m.row != other.row for other in kept):
+            kept.append(m)
+    return kept
+
+
+def by_benchmark(rows: Iterable[Measured]) -> dict[str, list[Measured]]:
+    """What is measured on another benchmark is measured on other items: never in one table."""
+    found: dict[str, list[Measured]] = {}
+    for m in rows:
+        found.setdefault(m.benchmark, []).append(m)
+    return found
+
+
+def transfers(rows: Sequence[Measured]) -> set[str]:
+    """The benchmarks on which models are measured that were trained elsewhere, and none that was
+    trained there."""
+    homes = {m.home for m in rows if m.home}
+    return {m.benchmark for m in rows if m.home not in (None, m.benchmark)} - homes
+
+
+def widest(rows: Sequence[Measured]) -> list[Measured]:
+    """The rows over all queries, of each run's model that of its largest width alone."""
+    best: dict[tuple[Path, str], Measured] = {}
+    for m in rows:
+        key = (m.run.folder, m.row.name)
+        if m.row.builder is None and (
+            key not in best or (m.row.width or 0) > (best[key].row.width or 0)
+        ):
+            best[key] = m
+    return list(best.values())

@@ -1,0 +1,233 @@
+"""What the report tells, section by section: tables in the paper's shape and figures, out of
+finished runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evaluation import figures, paper, tables
+from evaluation.confidence import Calibration, Positions
+from evaluation.formats import Table
+from evaluation.metrics import Interval
+from evaluation.page import plots
+from evaluation.page import tables as shaped
+from evaluation.page.gathering import STUDIES, TRAININGS, Finished, json_lines
+from evaluation.page.rows import Measured, by_benchmark, transfers, widest
+from evaluation.page.tables import REGIMES
+from train.plots import curves_figure
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A drawn figure in an SVG file, and what it shows."""
+
+    path: Path
+    caption: str
+
+
+@dataclass
+class Section:
+    """A part of the report. `details` are tables that the page folds away and that the text leaves
+    out."""
+
+    title: str
+    tables: list[Table] = field(default_factory=list)
+    figures: list[Figure] = field(default_factory=list)
+    details: list[Table] = field(default_factory=list)
+
+
+def sections_of(
+    choices: Sequence[Measured],
+    ranks: Sequence[Measured],
+    runs: Sequence[Finished],
+    confusions: Mapping[str, Mapping[str, np.ndarray]],
+    folder: Path,
+) -> list[Section]:
+    """Every section that has a table, in the paper's order.
+
+    Args:
+        choices, ranks: the selection and the retrieval rows of `runs`.
+        confusions: by benchmark and model, as `plots.confusion` counts.
+        folder: where figures are drawn.
+    """
+    plain = [m for m in choices if ", " not in m.benchmark]
+    every = [m for m in ranks if m.row.builder is None]
+    found = [
+        zero_shot(plain, every, folder),
+        distillation(plain, every),
+        ablation(plain),
+        transfer(plain),
+        controls([m for m in choices if ", " in m.benchmark], runs),
+        *(study(run) for run in runs if run.kind in STUDIES),
+        choices_in_detail(plain, confusions, folder),
+        rankings_in_detail(every, folder),
+        training([run for run in runs if run.kind in TRAININGS], folder),
+    ]
+    return [section for section in found if section.tables or section.details]
+
+
+def zero_shot(choices: Sequence[Measured], ranks: Sequence[Measured], folder: Path) -> Section:
+    section = Section("Zero-shot")
+    for benchmark, rows in by_benchmark(m for m in choices if not m.trained).items():
+        section.tables.append(shaped.selection_zero_shot(benchmark, rows))
+    for benchmark, rows in by_benchmark(m for m in ranks if not m.trained).items():
+        section.tables.append(shaped.retrieval_zero_shot(benchmark, widest(rows)))
+    for benchmark, rows in by_benchmark(choices).items():
+        caption = f"Accuracy by family on {benchmark}, with 95% intervals."
+        drawn = _draw(
+            folder, f"families-{benchmark}", figures.selection_figure, [m.row for m in rows]
+        )
+        section.figures.append(Figure(drawn, caption))
+    return section
+
+
+def distillation(choices: Sequence[Measured], ranks: Sequence[Measured]) -> Section:
+    section = Section("Distillation")
+    abroad = transfers(choices)
+    for benchmark, rows in by_benchmark(choices).items():
+        if benchmark not in abroad and any(m.trained for m in rows):
+            section.tables.append(shaped.selection_distilled(benchmark, rows))
+    for benchmark, rows in by_benchmark(ranks).items():
+        if any(m.trained for m in rows):
+            section.tables.append(shaped.retrieval_distilled(benchmark, widest(rows)))
+    return section
+
+
+def ablation(choices: Sequence[Measured]) -> Section:
+    """The regimes of chain of thought beside each other, in reasoning mode."""
+    told = [m for m in choices if m.row.mode == "reasoning" and m.regime in REGIMES]
+    if not {m.regime for m in told} & {"cot_no_candidate_analysis", "cot_no_match_layout"}:
+        return Section("Ablation")
+    told.sort(key=lambda m: list(REGIMES).index(m.regime))
+    labels = [f"{REGIMES[m.regime]} ({m.row.name})" for m in told]
+    caption = "Ablation: accuracy over all items (%) in reasoning mode"
+    reference = {"paper, Table 12": paper.ABLATION}
+    return Section("Ablation", [shaped.overall_table("ablation", caption, told, labels, reference)])
+
+
+def transfer(choices: Sequence[Measured]) -> Section:
+    """Students on benchmarks that they were not trained on, and the models that they began from."""
+    section = Section("Transfer")
+    if not (abroad := transfers(choices)):
+        return section
+    labels = [m.label for m in choices]
+    caption = "Transfer: accuracy over all items (%)"
+    reference = {"paper, Section 4.3 (answer mode)": paper.TRANSFER}
+    section.tables.append(shaped.overall_table("transfer", caption, choices, labels, reference))
+    for benchmark, rows in by_benchmark(choices).items():
+        if benchmark in abroad:
+            section.tables.append(shaped.selection_transfer(benchmark, rows))
+    return section
+
+
+def controls(choices: Sequence[Measured], runs: Sequence[Finished]) -> Section:
+    section = Section("Controls")
+    told = [
+        (run.report["rows"][0]["name"], found)
+        for run in runs
+        for found in run.report.get("controls", [])
+    ]
+    if told:
+        section.tables.append(shaped.controls_table(told))
+    for benchmark, rows in by_benchmark(choices).items():
+        name = f"control-{benchmark.replace(', ', '-')}"
+        caption = f"Controls: selection accuracy (%) on {benchmark}"
+        section.tables.append(shaped.selection_trained(name, caption, rows, {}))
+    return section
+
+
+def study(run: Finished) -> Section:
+    table = tables.human_table(run.report)
+    caption = f"{table.caption}: study {run.name} on benchmark {run.report['benchmark']}"
+    name = f"human-{run.name.replace('/', '-')}"
+    return Section("Human study", [replace(table, name=name, caption=caption)])
+
+
+def choices_in_detail(
+    choices: Sequence[Measured], confusions: Mapping[str, Mapping[str, np.ndarray]], folder: Path
+) -> Section:
+    section = Section("Selection in detail")
+    for benchmark, rows in by_benchmark(choices).items():
+        cells = {m.label: found for m in rows if (found := m.told("subtypes"))}
+        horizons = {label: by for label, of in cells.items() if (by := plots.by_horizon(of))}
+        if horizons:
+            drawn = _draw(folder, f"horizons-{benchmark}", plots.horizon_figure, horizons)
+            section.figures.append(Figure(drawn, f"Accuracy by horizon on {benchmark}."))
+        if found := confusions.get(benchmark):
+            drawn = _draw(folder, f"positions-{benchmark}", plots.confusion_figure, found)
+            caption = f"What was chosen where each letter was right, on {benchmark} (% of a row)."
+            section.figures.append(Figure(drawn, caption))
+        section.details += [_renamed(table, benchmark) for table in _details(rows, cells)]
+    return section
+
+
+def _details(rows: Sequence[Measured], cells: Mapping[str, Mapping[str, Any]]) -> list[Table]:
+    """The tables of what runs report of their models besides their rows."""
+    intervals = {
+        label: {cell: Interval(**found) for cell, found in of.items()}
+        for label, of in cells.items()
+    }
+    readings = {m.label: found for m in rows if (found := m.told("readings"))}
+    letters = {m.label: Positions(**found) for m in rows if (found := m.told("positions"))}
+    sure = {m.label: Calibration.from_dict(of) for m in rows if (of := m.told("calibration"))}
+    told = [tables.subtype_table(intervals)] if intervals else []
+    told += [tables.reading_table(readings)] if readings else []
+    told += [tables.position_table(letters)] if letters else []
+    for k, (label, found) in enumerate(sure.items()):
+        table = tables.calibration_table(label, found)
+        told.append(replace(table, name=f"{table.name}-{k}"))
+    return told
+
+
+def rankings_in_detail(ranks: Sequence[Measured], folder: Path) -> Section:
+    section = Section("Retrieval in detail")
+    for benchmark, rows in by_benchmark(ranks).items():
+        of_all = [m.row for m in rows]
+        section.tables.append(_renamed(tables.cost_table(of_all), benchmark))
+        section.details.append(_renamed(tables.retrieval_table(of_all), benchmark, "widths"))
+        if any(row.width for row in of_all):
+            drawn = _draw(folder, f"widths-{benchmark}", figures.retrieval_figure, of_all)
+            section.figures.append(Figure(drawn, f"Recall by width on {benchmark}."))
+        curves = {
+            (curve["name"], m.run.folder): curve
+            for m in rows
+            for curve in m.run.report.get("curves", [])
+            if curve["builder"] is None
+        }
+        if curves:
+            drawn = _draw(folder, f"recall-{benchmark}", plots.recall_figure, [*curves.values()])
+            section.figures.append(Figure(drawn, f"Recall by k on {benchmark}, at the widest."))
+    return section
+
+
+def training(runs: Sequence[Finished], folder: Path) -> Section:
+    section = Section("Training")
+    if table := shaped.training_table(runs):
+        section.tables.append(table)
+    for run in runs:
+        if records := [*json_lines(run.folder / "metrics.jsonl")]:
+            name = f"{run.kind}-{run.name.replace('/', '-')}"
+            drawn = _draw(folder, f"training-{name}", curves_figure, records)
+            section.figures.append(Figure(drawn, f"Training of {run.kind}/{run.name}."))
+    return section
+
+
+def _renamed(table: Table, benchmark: str, name: str | None = None) -> Table:
+    caption = f"{table.caption}, on {benchmark}"
+    return replace(table, name=f"{name or table.name}-{benchmark}", caption=caption)
+
+
+def _draw(folder: Path, name: str, draw: Callable[..., None], what: Any) -> Path:
+    """An SVG file with its text as text, the same for the same figure."""
+    import matplotlib
+
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{name}.svg"
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        draw(what, path)
+    return path

@@ -1,0 +1,213 @@
+"""The report's tables in the paper's shape: own rows in its parts, and the paper's rows below."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from conf.sweep import AT_START
+from evaluation import paper
+from evaluation.formats import Table
+from evaluation.page.gathering import Finished
+from evaluation.page.rows import SUITES, Measured
+from evaluation.tables import (
+    RETRIEVAL_HEAD,
+    RETRIEVAL_NOTE,
+    SELECTION_HEAD,
+    SELECTION_NOTE,
+    SIMILARITY,
+    retrieval_cells,
+    retrieval_references,
+    selection_cells,
+    selection_references,
+)
+
+REGIMES = {
+    "answer_only": "answer-only",
+    "cot": "full student",
+    "cot_no_candidate_analysis": "- candidate analysis",
+    "cot_no_match_layout": "- match layout",
+}
+"""What the paper calls the regimes of a student's training."""
+
+
+def selection_zero_shot(benchmark: str, rows: Sequence[Measured]) -> Table:
+    """The paper's Table 2."""
+    reference = {
+        "": (paper.CHANCE, paper.HUMAN_MAJORITY),
+        ": similarity scorers": paper.SELECTION_SIMILARITY,
+        ": open generative VLMs": paper.SELECTION_GENERATIVE,
+    }
+    parts = {
+        "similarity scorers": selection_cells([m.row for m in rows if m.row.mode == SIMILARITY]),
+        "generative models": selection_cells([m.row for m in rows if m.row.mode != SIMILARITY]),
+        **{f"paper, Table 2{k}": selection_references(told) for k, told in reference.items()},
+    }
+    return Table(
+        f"selection-{benchmark}",
+        f"Zero-shot selection accuracy (%) on {benchmark}",
+        [f"Zero-shot, {benchmark}", *SELECTION_HEAD],
+        _told(parts),
+        (SELECTION_NOTE,),
+    )
+
+
+def selection_distilled(benchmark: str, rows: Sequence[Measured]) -> Table:
+    """The paper's Table 4 (a)."""
+    reference = {"paper, Table 4a (Qwen3-VL-8B)": paper.SELECTION_DISTILLED}
+    caption = f"Distillation: selection accuracy (%) on {benchmark}"
+    return selection_trained(f"distillation-selection-{benchmark}", caption, rows, reference)
+
+
+def selection_transfer(benchmark: str, rows: Sequence[Measured]) -> Table:
+    """By family, on a benchmark that no student was trained on; the paper has MoVi-A's."""
+    reference = {"paper, Section 4.3 (MoVi-A, answer mode)": paper.MOVI_A_BY_FAMILY}
+    caption = f"Transfer: selection accuracy (%) on {benchmark}"
+    return selection_trained(f"transfer-{benchmark}", caption, rows, reference)
+
+
+def selection_trained(
+    name: str,
+    caption: str,
+    rows: Sequence[Measured],
+    reference: dict[str, Sequence[paper.SelectionReference]],
+) -> Table:
+    """Selection rows of models as they were released, of trained ones, and of the paper."""
+    parts = {
+        "zero-shot": selection_cells([m.row for m in rows if not m.trained]),
+        "trained": selection_cells([m.row for m in rows if m.trained]),
+        **{label: selection_references(told) for label, told in reference.items()},
+    }
+    head = [f"Selection, {rows[0].benchmark}", *SELECTION_HEAD]
+    return Table(name, caption, head, _told(parts), (SELECTION_NOTE,))
+
+
+def retrieval_zero_shot(benchmark: str, rows: Sequence[Measured]) -> Table:
+    """The paper's Table 3; retrievers at their widest."""
+    return Table(
+        f"retrieval-{benchmark}",
+        f"Zero-shot retrieval (recall in %) on {benchmark}",
+        [f"Zero-shot, {benchmark}", *RETRIEVAL_HEAD],
+        _told(
+            {
+                **_stages(rows),
+                "paper, Table 3: direct embedders": retrieval_references(paper.RETRIEVAL_DIRECT),
+                "paper, Table 3: two-stage": retrieval_references(paper.RETRIEVAL_TWO_STAGE),
+            }
+        ),
+        (RETRIEVAL_NOTE,),
+    )
+
+
+def retrieval_distilled(benchmark: str, rows: Sequence[Measured]) -> Table:
+    """The paper's Table 4 (b); retrievers at their widest."""
+    return Table(
+        f"distillation-retrieval-{benchmark}",
+        f"Distillation: retrieval (recall in %) on {benchmark}",
+        [f"Distilled, {benchmark}", *RETRIEVAL_HEAD],
+        _told(
+            {
+                **_stages(rows),
+                "paper, Table 4b": retrieval_references(paper.RETRIEVAL_DISTILLED),
+            }
+        ),
+        (RETRIEVAL_NOTE,),
+    )
+
+
+def _stages(rows: Sequence[Measured]) -> dict[str, list[list[str]]]:
+    ordered = sorted(rows, key=lambda m: m.trained)
+    direct = [m.row for m in ordered if m.run.kind == "retrieve"]
+    staged = [m.row for m in ordered if m.run.kind == "two_stage"]
+    return {
+        "two-stage predict-then-match": retrieval_cells(staged),
+        "direct embedders": retrieval_cells(direct),
+    }
+
+
+def overall_table(
+    name: str,
+    caption: str,
+    rows: Sequence[Measured],
+    labels: Sequence[str],
+    reference: dict[str, Sequence[paper.OverallReference]],
+) -> Table:
+    """Accuracy over all items of a benchmark, a line a model and a column a benchmark, the one it
+    was trained on first: the paper's Table 12 (ablation), and its figures of transfer.
+
+    Args:
+        labels: what each row's model is called; rows of one label stand in one line.
+    """
+    homes = {m.home for m in rows if m.home}
+    # A model as it was released has no benchmark of its own.
+    columns = [
+        "In domain"
+        if m.benchmark == m.home or (not m.trained and m.benchmark in homes)
+        else m.suite
+        for m in rows
+    ]
+    suites = dict.fromkeys(["In domain", *SUITES.values(), *columns])
+    found: dict[str, dict[str, str]] = {}
+    for m, label, column in zip(rows, labels, columns, strict=True):
+        found.setdefault(label, {})[column] = f"{100 * m.row.micro.value:.1f}"
+    own = [[label, *(of.get(column, "-") for column in suites)] for label, of in found.items()]
+    printed = {
+        told: [_overall(r, len(suites)) for r in references]
+        for told, references in reference.items()
+    }
+    return Table(name, caption, ["Overall accuracy, %", *suites], {"": own, **printed})
+
+
+def _overall(row: paper.OverallReference, columns: int) -> list[str]:
+    shares = [f"{percent:.1f}" for percent in (row.clevrer, row.movi_a, row.physion)]
+    return [row.name, *shares, *["-"] * (columns - len(shares))]
+
+
+def controls_table(found: Sequence[tuple[str, dict[str, Any]]]) -> Table:
+    """What controls are apart from what they are held against; of each, its model's name and what
+    its run reported."""
+    parts: dict[str, list[list[str]]] = {}
+    for model, told in found:
+        label = f"{model}, {told['mode']}: {told['left']} (left) less {told['right']} (right)"
+        counts = [told.get("only_left"), told.get("only_right")]
+        parts.setdefault(label, []).append(
+            [
+                told.get("of", "all"),
+                f"{100 * told['difference']:+.1f}",
+                f"{100 * told['low']:+.1f} to {100 * told['high']:+.1f}",
+                *("-" if count is None else f"{count:,}" for count in counts),
+                "-" if told.get("p") is None else f"{told['p']:.2g}",
+                f"{told['n']:,}",
+            ]
+        )
+    return Table(
+        "controls",
+        "Controls: paired differences of accuracy (%)",
+        ["Controls, %", "Apart", "95%", "Only left", "Only right", "p", "Items"],
+        parts,
+        (
+            "Apart: left less right, its interval bootstrapped over scenes. Only left, only right: "
+            "items that are answered right one way alone; p is McNemar's exact test of the two.",
+        ),
+    )
+
+
+def training_table(runs: Sequence[Finished]) -> Table | None:
+    """What each run measured on held-out training scenes, at its start and at its end."""
+    parts = {}
+    for run in runs:
+        metrics = json.loads((run.folder / "metrics.json").read_text())
+        starts = {name: metrics.get(f"{name}{AT_START}") for name in metrics}
+        parts[f"{run.kind}/{run.name}"] = [
+            [name.replace("_", " "), f"{start:.3f}", f"{metrics[name]:.3f}"]
+            for name, start in starts.items()
+            if start is not None
+        ]
+    head = ["Training (held-out scenes)", "Start", "End"]
+    told = _told(parts)
+    return Table("training", "Training, on held-out scenes", head, told) if told else None
+
+
+def _told(parts: dict[str, list[list[str]]]) -> dict[str, list[list[str]]]:
+    return {label: rows for label, rows in parts.items() if rows}
