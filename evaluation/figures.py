@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 INK, FAINT, RIGHT, WRONG = "#333333", "#bbbbbb", "#228833", "#cc3311"
 STRIP = 6
 """Prefix frames in one line of an item's figure."""
+NUMBERED = 6
+"""Rows at most whose bars have room for their numbers."""
 
 
 def selection_figure(rows: Sequence[SelectionRow], path: Path | str) -> None:
@@ -42,7 +44,8 @@ def selection_figure(rows: Sequence[SelectionRow], path: Path | str) -> None:
             axes.bar(x, value, width * 0.9, color=_color(row.name, i), label=label)
             middle, reach = 50 * (found.high + found.low), 50 * (found.high - found.low)
             axes.errorbar(x, middle, reach, fmt="none", ecolor=INK, capsize=3, elinewidth=1.2)
-            _number(axes, x, 100 * found.high, value)
+            if len(rows) <= NUMBERED:
+                _number(axes, x, 100 * found.high, value)
     for at, family in enumerate(FAMILIES):
         x, value = at + len(rows) / 2 * width, getattr(paper.COT, family)
         label = f"paper: {paper.COT.name}, 8B" if at == 0 else None

@@ -42,8 +42,7 @@ def main(cfg: ReportCommand, run: Run) -> None:
     log.info("%s", text)
     write_text(run.folder / "report.txt", text + "\n")
     page = run.folder / "report.html"
-    about = [f"{len(runs)} runs below {root}: {', '.join(f'{r.kind}/{r.name}' for r in runs)}."]
-    write_page(page, sections, browser, about)
+    write_page(page, sections, browser, [f"{r.kind}/{r.name}" for r in runs])
     log.info("\ntables: %s\npage: %s", tables, page)
 
 

@@ -379,7 +379,7 @@ def human_table(found: dict[str, Any]) -> Table:
     seconds = [f"{paper.HUMAN_SECONDS[f]:.1f}" for f in FAMILIES]
     reference.append(["Median seconds", *seconds, "", "", ""])
     head = ["Human accuracy, %", *(f.capitalize() for f in FAMILIES), "Macro", "Micro", "Items"]
-    parts = {"": own, "paper (59 items of three simulators)": reference}
+    parts = {"": own, "paper, Table 11 (59 items of three simulators)": reference}
     return Table("human", "Human accuracy (%)", head, parts, _human_notes(found))
 
 

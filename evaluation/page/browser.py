@@ -1,4 +1,4 @@
-"""What the page needs of items and answers: if runs belong together, and the items that it shows."""
+"""What the page needs of items and answers: whether runs belong together, and what it shows."""
 
 from __future__ import annotations
 

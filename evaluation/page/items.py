@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from conf.errors import UserError
 from data.frames import Frames
-from data.records import LETTERS, FrameRef, SelectionItem, shown_frames
+from data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, shown_frames
 from data.store import Store
 from evaluation.page.said import Said
 
@@ -34,8 +34,8 @@ def spread(
     items: Sequence[SelectionItem], answers: Answers, bound: int, seed: int
 ) -> list[SelectionItem]:
     """At most `bound` items that show most: each one taken has the subtypes, and in them the right
-    and the wrong answers of each model, that those before it show least of. `seed` orders items
-    that show as much."""
+    and the wrong answers of each model, that those before it show least of; by family and subtype.
+    `seed` chooses among items that show as much."""
     order = np.random.default_rng(seed).permutation(len(items))
     waiting = {items[k].item_id: items[k] for k in order}
     cells = {name: _cells(item, answers) for name, item in waiting.items()}
@@ -45,7 +45,7 @@ def spread(
         best = max(waiting, key=lambda name: sum(1 / (1 + seen[c]) for c in cells[name]))
         seen.update(cells[best])
         chosen.append(waiting.pop(best))
-    return chosen
+    return sorted(chosen, key=lambda item: (FAMILIES.index(item.family), item.subtype))
 
 
 def _cells(item: SelectionItem, answers: Answers) -> list[tuple]:

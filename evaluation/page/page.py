@@ -20,9 +20,9 @@ STYLE, SCRIPT = "page.css", "page.js"
 
 
 def write_page(
-    path: Path, sections: Sequence[Section], browser: Browser, about: Sequence[str]
+    path: Path, sections: Sequence[Section], browser: Browser, runs: Sequence[str]
 ) -> None:
-    """Write the page whole or not at all; `about` are sentences on what it is over."""
+    """Write the page whole or not at all; `runs` are the names of those that it is over."""
     loader = jinja2.PackageLoader("evaluation.page")
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
@@ -34,7 +34,7 @@ def write_page(
     page = environment.get_template("page.html").render(
         sections=sections,
         pictures=pictures,
-        about=about,
+        runs=runs,
         notes=browser.notes,
         has_items=bool(browser.entries),
         data=embedded({"items": browser.entries, "frames": browser.frames}),

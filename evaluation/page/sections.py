@@ -117,7 +117,7 @@ def transfer(choices: Sequence[Measured]) -> Section:
         return section
     labels = [m.label for m in choices]
     caption = "Transfer: accuracy over all items (%)"
-    reference = {"paper, Section 4.3 (answer mode)": paper.TRANSFER}
+    reference = {"paper, Section 5.3 (answer mode)": paper.TRANSFER}
     section.tables.append(shaped.overall_table("transfer", caption, choices, labels, reference))
     for benchmark, rows in by_benchmark(choices).items():
         if benchmark in abroad:

@@ -62,7 +62,7 @@ def selection_distilled(benchmark: str, rows: Sequence[Measured]) -> Table:
 
 def selection_transfer(benchmark: str, rows: Sequence[Measured]) -> Table:
     """By family, on a benchmark that no student was trained on; the paper has MoVi-A's."""
-    reference = {"paper, Section 4.3 (MoVi-A, answer mode)": paper.MOVI_A_BY_FAMILY}
+    reference = {"paper, Section 5.3 (MoVi-A, answer mode)": paper.MOVI_A_BY_FAMILY}
     caption = f"Transfer: selection accuracy (%) on {benchmark}"
     return selection_trained(f"transfer-{benchmark}", caption, rows, reference)
 
