@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Iterator
 
 import pytest
 from selenium import webdriver
-from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
@@ -17,37 +15,18 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from evaluation.study import storage
 from evaluation.study.votes import Vote, votes_of
+from tests.evaluation.chromium import OVERFLOW, chromium_in
 
 pytestmark = pytest.mark.slow
 
-FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-)
 PATIENCE = 60
 SMALLEST = 44
 """Pixels of the least side of what a finger is to hit."""
-OVERFLOW = "return document.documentElement.scrollWidth > document.documentElement.clientWidth"
 
 
 @pytest.fixture(scope="module")
 def chromium(tmp_path_factory) -> Iterator[webdriver.Chrome]:
-    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    assert browser, "the study's pages are tested in Chromium: apt-get install chromium"
-    assert driver, "the study's pages are tested in Chromium: apt-get install chromium-driver"
-    options = webdriver.ChromeOptions()
-    options.binary_location = browser
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
-        options.add_argument(flag)
-    opened = webdriver.Chrome(options=options, service=Service(driver))
-    yield opened
-    opened.quit()
+    yield from chromium_in(tmp_path_factory.mktemp("chromium"))
 
 
 @pytest.fixture(scope="module")

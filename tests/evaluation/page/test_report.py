@@ -1,0 +1,230 @@
+"""The report over finished runs: what it writes, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from conf.entry import Run
+from conf.errors import UserError
+from conf.schema import ReportCommand
+from evaluation import report
+from tests.evaluation.page.measured import (
+    always_a,
+    retrieve_run,
+    right,
+    select_run,
+    trained_student,
+)
+
+HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=alert(1)>\nAnswer: B"
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory, micro, micro_store) -> Path:
+    """checkpoints/ with a base, students of four regimes, one of which says hostile things, and a
+    retriever that is measured directly and in two stages."""
+    root = tmp_path_factory.mktemp("checkpoints")
+    select_run(root, micro_store, micro, "base", always_a, mode="record")
+    for regime in ("answer_only", "cot", "cot_no_candidate_analysis"):
+        trained_student(root, micro, regime, regime)
+        mode = "answer" if regime == "answer_only" else "reasoning"
+        say = right if regime == "cot" else lambda item: HOSTILE
+        select_run(root, micro_store, micro, regime, say, model=regime, mode=mode)
+    retrieve_run(root, micro_store, micro, "emb")
+    retrieve_run(root, micro_store, micro, "emb", kind="two_stage")
+    return root
+
+
+@pytest.fixture
+def runs(measured, tmp_path) -> Path:
+    """A copy to damage."""
+    shutil.copytree(measured, tmp_path / "checkpoints")
+    return tmp_path / "checkpoints"
+
+
+def reported(root: Path, store: Path, **settings) -> Path:
+    folder = root / "report" / "default"
+    folder.mkdir(parents=True, exist_ok=True)
+    cfg = ReportCommand(checkpoints=str(root), store=str(store), **settings)
+    report.main.__wrapped__(cfg, Run("default", folder))
+    return folder
+
+
+def page_data(folder: Path) -> dict:
+    page = (folder / "report.html").read_text()
+    return json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])
+
+
+def test_everything_is_written_in_the_papers_shape(runs, micro_store):
+    folder = reported(runs, micro_store.folder.parent, items=12)
+    names = {path.stem for path in (folder / "tables").glob("*.tex")}
+    assert names == {path.stem for path in (folder / "tables").glob("*.md")}
+    assert names == {
+        "selection-micro", "retrieval-micro", "distillation-selection-micro",
+        "distillation-retrieval-micro", "ablation", "costs-micro", "widths-micro",
+        "subtypes-micro", "readings-micro", "positions-micro", "training",
+    }  # fmt: skip
+    table = (folder / "tables" / "distillation-selection-micro.md").read_text()
+    assert "| cot (reasoning) | 100.0 | 100.0 | 100.0 | 100.0 | 100.0 | 100.0 |" in table
+    assert "| Physics-grounded CoT | 92.4 | 45.4 | 96.7 | 78.2 | 87.5 | - |" in table
+    ablation = (folder / "tables" / "ablation.tex").read_text()
+    assert r"full student (cot) & 100.0 & - & - \\" in ablation
+    assert r"- match layout & 86.8 & 40.3 & 68.9 \\" in ablation
+    text = (folder / "report.txt").read_text()
+    assert "paper, Table 2" in text
+    assert max(map(len, text.splitlines())) <= 100
+    assert {path.stem for path in (folder / "figures").glob("*.svg")} >= {
+        "families-micro", "horizons-micro", "positions-micro", "widths-micro", "recall-micro",
+        "training-sft-cot",
+    }  # fmt: skip
+    data = page_data(folder)
+    assert len(data["items"]) == 12
+    assert all(len(item["said"]) == 4 for item in data["items"])
+
+
+def test_the_page_holds_all_that_it_shows(runs, micro_store):
+    page = (reported(runs, micro_store.folder.parent, items=4) / "report.html").read_text()
+    markup = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    addresses = re.findall(r'(?:src|href)="([^"]*)"', markup)
+    assert all(address.startswith(("#", "data:")) for address in addresses)
+    assert "url(http" not in page
+    assert "@import" not in page
+    assert "document.title='taken'</script>" not in page
+    # A figure's names are its own.
+    ids = re.findall(r'\bid="([^"]+)"', markup)
+    assert len(ids) == len(set(ids))
+    for name in re.findall(r'(?:url\(#|href="#)([^")]+)', markup):
+        assert name in ids
+
+
+def test_the_same_runs_give_the_same_page(runs, micro_store):
+    page = reported(runs, micro_store.folder.parent, items=3) / "report.html"
+    whole = page.read_bytes()
+    assert (
+        reported(runs, micro_store.folder.parent, items=3).joinpath(page.name).read_bytes() == whole
+    )
+    reported(runs, micro_store.folder.parent, items=3, seed=1)
+    assert page.read_bytes() != whole
+
+
+def test_runs_are_chosen_by_name_and_pattern(runs, micro_store):
+    folder = reported(runs, micro_store.folder.parent, runs=["select/cot*", "select/base"], items=1)
+    said = page_data(folder)["items"][0]["said"]
+    assert {s["by"].split(" (")[0] for s in said} == {
+        "cot", "cot_no_candidate_analysis", "small base",
+    }  # fmt: skip
+    assert "retrieval" not in (folder / "report.txt").read_text().lower()
+    named = f"{runs}/select/cot"
+    folder = reported(runs, micro_store.folder.parent, runs=[named], items=1)
+    assert len(page_data(folder)["items"][0]["said"]) == 1
+
+
+def test_what_was_said_before_a_model_changed_is_left_out(runs, micro_store):
+    log = runs / "select" / "cot" / "answers.jsonl"
+    lines = log.read_text().splitlines()
+    stale = [json.loads(line) for line in lines]
+    for row in stale:
+        row["key"] = "0" * 16
+        if "text" in row:
+            row["text"] = "stale"
+    before = "".join(json.dumps(row) + "\n" for row in stale)
+    log.write_text(before + "\n".join(lines) + '\n{"item_id": "torn')
+    folder = reported(runs, micro_store.folder.parent, runs=["select/cot"], items=5)
+    assert all(s["text"] != "stale" for i in page_data(folder)["items"] for s in i["said"])
+
+
+def test_controls_are_gathered_with_their_differences(runs, micro_store):
+    path = runs / "select" / "cot" / "report.json"
+    told = json.loads(path.read_text())
+    row = dict(told["rows"][0], benchmark="micro, candidate_only")
+    told["rows"].append(row)
+    told["controls"] = [
+        {"mode": "reasoning", "left": "items as they are", "right": "candidate_only", "n": 63,
+         "difference": 0.25, "low": 0.1, "high": 0.375, "p": 0.001, "only_left": 20,
+         "only_right": 4},
+    ]  # fmt: skip
+    path.write_text(json.dumps(told))
+    folder = reported(runs, micro_store.folder.parent, items=1)
+    table = (folder / "tables" / "controls.md").read_text()
+    assert "| all | +25.0 | +10.0 to +37.5 | 20 | 4 | 0.001 | 63 |" in table
+    assert (folder / "tables" / "control-micro-candidate_only.md").exists()
+
+
+def test_a_model_on_a_benchmark_that_it_was_not_trained_on_is_transfer(runs, micro_store):
+    for name in ("base", "cot"):
+        shutil.copytree(runs / "select" / name, runs / "select" / f"{name}-abroad")
+        path = runs / "select" / f"{name}-abroad" / "report.json"
+        path.write_text(path.read_text().replace('"micro"', '"elsewhere"', 1))
+    folder = reported(runs, micro_store.folder.parent, items=1)
+    table = (folder / "tables" / "transfer.md").read_text()
+    assert "| Overall accuracy, % | In domain | MoVi-A | Physion | elsewhere |" in table
+    assert re.search(r"\| cot \(reasoning\) \| 100\.0 \| - \| - \| 100\.0 \|", table)
+    assert (folder / "tables" / "transfer-elsewhere.tex").exists()
+    assert not (folder / "tables" / "distillation-selection-elsewhere.tex").exists()
+    # Nobody built that benchmark here.
+    page = (folder / "report.html").read_text()
+    assert "python -m data.build benchmark=elsewhere" in page
+
+
+def test_without_the_benchmark_the_tables_still_stand(runs, tmp_path):
+    folder = reported(runs, tmp_path / "nowhere")
+    assert (folder / "tables" / "selection-micro.md").exists()
+    page = (folder / "report.html").read_text()
+    assert "The items of micro cannot be shown" in page
+    assert 'id="data"' not in page
+
+
+def test_two_item_sets_are_told_apart(runs, micro, micro_store):
+    items = micro_store.selection("test")
+    few = select_run(runs, micro_store, micro, "few", right, items[3:])
+    with pytest.raises(UserError) as told:
+        reported(runs, micro_store.folder.parent)
+    assert str(few) in str(told.value)
+    assert f"3 only in {runs / 'select' / 'base'} (such as " in str(told.value)
+    for item in items[:3]:
+        assert item.item_id in str(told.value)
+    assert reported(runs, micro_store.folder.parent, runs=["select/few"], items=1)
+
+
+def test_two_databases_are_told_apart(runs, micro, micro_store):
+    retrieve_run(runs, micro_store, micro, "larger", frames=70)
+    with pytest.raises(UserError, match=r"ranked 60 frames of micro .* and .*larger 70 for"):
+        reported(runs, micro_store.folder.parent)
+
+
+@pytest.mark.parametrize(
+    ("damage", "settings", "said"),
+    [
+        (lambda runs: (runs / "select/cot/config.yaml").unlink(), {}, "config.yaml is missing"),
+        (
+            lambda runs: (runs / "select/cot/config.yaml").write_text("a: [1"),
+            {},
+            "config.yaml is damaged",
+        ),
+        (lambda runs: (runs / "select/cot/report.json").unlink(), {}, "report.json is missing"),
+        (lambda runs: (runs / "select/cot/report.json").write_text("[]"), {}, "another version"),
+        (lambda runs: (runs / "select/cot/metrics.json").unlink(), {"runs": ["select/cot"]},
+         "no finished run"),
+        (lambda runs: None, {"runs": ["select/cto"]}, "names no run .*; there are .*select/cot"),
+        (lambda runs: None, {"runs": ["sft/*"]}, "nothing is measured"),
+        (lambda runs: shutil.rmtree(runs / "select"), {"runs": ["select/*"]}, "names no run"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_read_is_named(runs, micro_store, damage, settings, said):
+    damage(runs)
+    with pytest.raises(UserError, match=said) as told:
+        reported(runs, micro_store.folder.parent, **settings)
+    assert "\n" not in str(told.value)
+    assert not (runs / "report" / "default" / "report.html").exists()
+
+
+def test_patterns_are_checked_before_anything_is_read():
+    assert ReportCommand(runs=[]).check()
+    assert ReportCommand(runs=["", "select/*"]).check()
+    assert ReportCommand(items=-1).check()
+    assert not ReportCommand(runs=["select/*"]).check()
