@@ -16,7 +16,7 @@ from evaluation.formats import Table
 from evaluation.metrics import Interval
 from evaluation.page import plots
 from evaluation.page import tables as shaped
-from evaluation.page.gathering import STUDIES, TRAININGS, Finished, json_lines
+from evaluation.page.gathering import STUDIES, TRAININGS, Finished, json_lines, unreadable
 from evaluation.page.rows import Measured, by_benchmark, transfers, widest
 from evaluation.page.tables import REGIMES
 from train.plots import curves_figure
@@ -142,8 +142,15 @@ def controls(choices: Sequence[Measured], runs: Sequence[Finished]) -> Section:
 
 
 def study(run: Finished) -> Section:
-    table = tables.human_table(run.report)
-    caption = f"{table.caption}: study {run.name} on benchmark {run.report['benchmark']}"
+    """
+    Raises:
+        UserError: what the study exported is of another version.
+    """
+    try:
+        table = tables.human_table(run.report)
+        caption = f"{table.caption}: study {run.name} on benchmark {run.report['benchmark']}"
+    except (KeyError, TypeError) as error:
+        raise unreadable(run.folder) from error
     name = f"human-{run.name.replace('/', '-')}"
     return Section("Human study", [replace(table, name=name, caption=caption)])
 

@@ -13,31 +13,7 @@ from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import ReportCommand
 from evaluation import report
-from tests.evaluation.page.measured import (
-    always_a,
-    retrieve_run,
-    right,
-    select_run,
-    trained_student,
-)
-
-HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=alert(1)>\nAnswer: B"
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory, micro, micro_store) -> Path:
-    """checkpoints/ with a base, students of four regimes, one of which says hostile things, and a
-    retriever that is measured directly and in two stages."""
-    root = tmp_path_factory.mktemp("checkpoints")
-    select_run(root, micro_store, micro, "base", always_a, mode="record")
-    for regime in ("answer_only", "cot", "cot_no_candidate_analysis"):
-        trained_student(root, micro, regime, regime)
-        mode = "answer" if regime == "answer_only" else "reasoning"
-        say = right if regime == "cot" else lambda item: HOSTILE
-        select_run(root, micro_store, micro, regime, say, model=regime, mode=mode)
-    retrieve_run(root, micro_store, micro, "emb")
-    retrieve_run(root, micro_store, micro, "emb", kind="two_stage")
-    return root
+from tests.evaluation.page.measured import retrieve_run, right, select_run
 
 
 @pytest.fixture

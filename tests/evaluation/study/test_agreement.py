@@ -136,6 +136,7 @@ def test_the_report_shows_an_exported_study_alone_too(tmp_path) -> None:
     exported = tmp_path / "export_study" / "pilot"
     exported.mkdir(parents=True)
     (exported / "metrics.json").write_text("{}")
+    (exported / "config.yaml").write_text("run: pilot\n")
     votes = [vote(name, k, k % 3, FAMILIES[k % 3]) for k in range(6) for name in ("A1", "A2")]
     found = {"benchmark": "tiny", **summary(votes, 6, ["A1", "A2"])}
     (exported / "report.json").write_text(json.dumps(found))
@@ -143,7 +144,8 @@ def test_the_report_shows_an_exported_study_alone_too(tmp_path) -> None:
     run.folder.mkdir()
     report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path)), run)
     page = (run.folder / "report.txt").read_text()
-    assert page == f"study pilot on benchmark tiny\n{human_table(found)}\n"
+    assert page == f"Human accuracy (%): study pilot on benchmark tiny\n\n{human_table(found)}\n"
+    assert (run.folder / "tables" / "human-pilot.tex").exists()
 
     (exported / "report.json").write_text('{"benchmark": "tiny"}')
     with pytest.raises(UserError, match="damaged or of another version"):
