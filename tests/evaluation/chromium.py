@@ -23,13 +23,13 @@ OVERFLOW = "return document.documentElement.scrollWidth > document.documentEleme
 
 
 def chromium_in(profile: Path) -> Iterator[webdriver.Chrome]:
-    """One that keeps its profile in a folder, notes what it requests, and is closed at the end."""
+    """One that keeps its profile in a folder and what its console says, and is closed at the end."""
     browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
     assert browser, "pages are tested in Chromium: apt-get install chromium"
     assert driver, "pages are tested in Chromium: apt-get install chromium-driver"
     options = webdriver.ChromeOptions()
     options.binary_location = browser
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     for flag in (*FLAGS, f"--user-data-dir={profile}"):
         options.add_argument(flag)
     opened = webdriver.Chrome(options=options, service=Service(driver))

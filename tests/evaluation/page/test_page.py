@@ -26,6 +26,10 @@ LUMINANCE = """
 const [r, g, b] = getComputedStyle(arguments[0])[arguments[1]].match(/[\\d.]+/g).map(Number);
 return (0.2126 * r + 0.7152 * g + 0.0722 * b) / 255
 """
+REQUESTED = """
+const found = performance.getEntriesByType("resource").map((entry) => entry.name);
+return found.filter((name) => !name.startsWith("data:"));
+"""
 SHOWN = "return [...document.querySelectorAll('article')].map(a => a.dataset.id)"
 
 
@@ -38,7 +42,7 @@ def chromium(tmp_path_factory) -> Iterator[webdriver.Chrome]:
 def page(measured, micro_store, tmp_path_factory) -> Path:
     """The report's page alone, moved away from all that it was made of."""
     folder = tmp_path_factory.mktemp("report")
-    cfg = ReportCommand(checkpoints=str(measured), store=str(micro_store.folder.parent), items=40)
+    cfg = ReportCommand(checkpoints=str(measured), store=str(micro_store.folder.parent), items=24)
     report.main.__wrapped__(cfg, Run("default", folder))
     moved = tmp_path_factory.mktemp("elsewhere") / "page.html"
     shutil.move(folder / "report.html", moved)
@@ -59,7 +63,7 @@ def choose(browser: webdriver.Chrome, **values: str) -> list[str]:
         Select(browser.find_element(By.NAME, name)).select_by_value(value)
     more = browser.find_element(By.ID, "more")
     while more.is_displayed():
-        more.click()
+        more.send_keys(Keys.ENTER)
     return browser.execute_script(SHOWN)
 
 
@@ -69,7 +73,7 @@ def items_of(browser: webdriver.Chrome) -> list[dict]:
     ]
 
 
-@pytest.mark.parametrize("width", [360, 768, 1280])
+@pytest.mark.parametrize("width", [360, 1280])
 @pytest.mark.parametrize("light", ["light", "dark"])
 def test_it_fits_and_can_be_read(chromium, page, width, light):
     look(chromium, page, width, light)
@@ -86,25 +90,23 @@ def test_it_fits_and_can_be_read(chromium, page, width, light):
 
 
 def test_it_asks_nobody_for_anything_and_complains_of_nothing(chromium, page):
-    chromium.get_log("performance")
     chromium.get_log("browser")
     look(chromium, page, 1280)
     choose(chromium)
-    events = [json.loads(e["message"])["message"] for e in chromium.get_log("performance")]
-    asked = [
-        e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"
-    ]
-    assert page.as_uri() in asked
-    assert {url for url in asked if not url.startswith("data:")} == {page.as_uri()}
+    assert chromium.execute_script(REQUESTED) == []
+    # What the page forbids itself would be told here, too.
     assert chromium.get_log("browser") == []
+    chromium.execute_script("new Image().src = 'http://127.0.0.1:9/x.png'")
+    [refused] = chromium.get_log("browser")
+    assert "Content Security Policy" in refused["message"]
 
 
 def test_what_a_model_said_is_text(chromium, page):
     look(chromium, page, 1280)
     choose(chromium)
     assert chromium.title == "DynaPix report"
-    said = {pre.get_attribute("textContent") for pre in chromium.find_elements(By.TAG_NAME, "pre")}
-    assert HOSTILE in said
+    said = "return [...document.querySelectorAll('pre')].map((pre) => pre.textContent)"
+    assert HOSTILE in chromium.execute_script(said)
     assert chromium.find_elements(By.CSS_SELECTOR, "pre *") == []
 
 
@@ -123,7 +125,7 @@ def test_an_item_shows_its_frames_and_which_is_right(chromium, page):
 def test_filters_show_what_they_say(chromium, page):
     look(chromium, page, 1280)
     items = items_of(chromium)
-    assert len(choose(chromium)) == len(items) == 40
+    assert len(choose(chromium)) == len(items) == 24
     for family in ("event", "time", "window"):
         assert choose(chromium, family=family) == [i["id"] for i in items if i["family"] == family]
     options = Select(chromium.find_element(By.NAME, "subtype")).options
@@ -141,7 +143,7 @@ def test_filters_show_what_they_say(chromium, page):
         wanted = [name for name, given in of_base.items() if given == verdict]
         assert choose(chromium, family="any", by=label, verdict=verdict) == wanted
     assert choose(chromium, by="cot (reasoning)", verdict="wrong") == []
-    assert chromium.find_element(By.ID, "count").text == "0 of 40 items"
+    assert chromium.find_element(By.ID, "count").text == "0 of 24 items"
 
 
 def test_it_can_be_used_by_keyboard_alone(chromium, page):
