@@ -73,8 +73,10 @@ def sections_of(
 
 def zero_shot(choices: Sequence[Measured], ranks: Sequence[Measured], folder: Path) -> Section:
     section = Section("Zero-shot")
+    abroad = transfers(choices)
     for benchmark, rows in by_benchmark(m for m in choices if not m.trained).items():
-        section.tables.append(shaped.selection_zero_shot(benchmark, rows))
+        if benchmark not in abroad:
+            section.tables.append(shaped.selection_zero_shot(benchmark, rows))
     for benchmark, rows in by_benchmark(m for m in ranks if not m.trained).items():
         section.tables.append(shaped.retrieval_zero_shot(benchmark, widest(rows)))
     for benchmark, rows in by_benchmark(choices).items():
