@@ -41,7 +41,7 @@ def selection_figure(rows: Sequence[SelectionRow], path: Path | str) -> None:
                 continue
             x, value = at + (i - len(rows) / 2) * width, 100 * found.value
             label = f"{row.name} ({row.mode})" if family == next(iter(row.families)) else None
-            axes.bar(x, value, width * 0.9, color=_color(row.name, i), label=label)
+            axes.bar(x, value, width * 0.9, color=color_of(row.name, i), label=label)
             middle, reach = 50 * (found.high + found.low), 50 * (found.high - found.low)
             axes.errorbar(x, middle, reach, fmt="none", ecolor=INK, capsize=3, elinewidth=1.2)
             if len(rows) <= NUMBERED:
@@ -83,7 +83,7 @@ def retrieval_figure(rows: Sequence[RetrievalRow], path: Path | str) -> None:
     for axes, k in zip(panels, RECALLS, strict=True):
         for i, name in enumerate(names):
             points = [(r.width, r.measures[f"recall@{k}"]) for r in rows if r.name == name]
-            untrained, color = name.startswith(UNTRAINED), _color(name, i)
+            untrained, color = name.startswith(UNTRAINED), color_of(name, i)
             across = [width for width, _ in points]
             spans = [
                 [100 * found.low for _, found in points],
@@ -224,7 +224,7 @@ def item_figure(
     figure.savefig(path)
 
 
-def _color(name: str, index: int) -> str:
+def color_of(name: str, index: int) -> str:
     return "#999999" if name.startswith(UNTRAINED) else COLORS[index % len(COLORS)]
 
 

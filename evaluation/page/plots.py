@@ -12,8 +12,9 @@ import numpy as np
 
 from data.records import LETTERS
 from evaluation import paper
-from evaluation.figures import FAINT, INK, legend_above
+from evaluation.figures import FAINT, INK, color_of, legend_above
 from evaluation.metrics import Interval, wilson
+from evaluation.tables import UNTRAINED
 from train.plots import COLORS, empty_figure
 
 HORIZONS = {"time/in_1s": "1 s", "time/in_2s": "2 s"}
@@ -97,11 +98,10 @@ def recall_figure(curves: Sequence[Mapping[str, Any]], path: Path) -> None:
     axes = figure.add_subplot()
     axes.spines[["top", "right"]].set_visible(False)
     for k, curve in enumerate(curves):
-        dashed = curve["name"].startswith("untrained")
-        axes.plot(
-            curve["ks"], [100 * recall for recall in curve["recalls"]], linewidth=1.8,
-            color=COLORS[k % len(COLORS)], linestyle="--" if dashed else "-", label=curve["name"],
-        )  # fmt: skip
+        name, recalls = curve["name"], [100 * recall for recall in curve["recalls"]]
+        line = "--" if name.startswith(UNTRAINED) else "-"
+        color = color_of(name, k)
+        axes.plot(curve["ks"], recalls, linewidth=1.8, color=color, linestyle=line, label=name)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.grid(axis="y", color="#eeeeee")

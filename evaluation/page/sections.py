@@ -117,10 +117,12 @@ def transfer(choices: Sequence[Measured]) -> Section:
     section = Section("Transfer")
     if not (abroad := transfers(choices)):
         return section
-    labels = [m.label for m in choices]
+    travelled = {m.label for m in choices if m.benchmark in abroad}
+    told = [m for m in choices if m.label in travelled]
+    labels = [m.label for m in told]
     caption = "Transfer: accuracy over all items (%)"
     reference = {"paper, Section 5.3 (answer mode)": paper.TRANSFER}
-    section.tables.append(shaped.overall_table("transfer", caption, choices, labels, reference))
+    section.tables.append(shaped.overall_table("transfer", caption, told, labels, reference))
     for benchmark, rows in by_benchmark(choices).items():
         if benchmark in abroad:
             section.tables.append(shaped.selection_transfer(benchmark, rows))

@@ -23,7 +23,7 @@ OVERFLOW = "return document.documentElement.scrollWidth > document.documentEleme
 
 
 def chromium_in(profile: Path) -> Iterator[webdriver.Chrome]:
-    """One with its profile in a folder; it keeps what its console says, and is closed at the end."""
+    """One with its profile in a folder, which keeps what its console says; closed at the end."""
     browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
     assert browser, "pages are tested in Chromium: apt-get install chromium"
     assert driver, "pages are tested in Chromium: apt-get install chromium-driver"
