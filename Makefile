@@ -12,7 +12,7 @@ VLLM_READY := .venv-vllm/.ready
 HAS_NUMA := $(BIN)/python -c "import ctypes; ctypes.CDLL('libnuma.so.1')" 2> /dev/null \
 	|| { echo "error: vLLM on a CPU needs the system's libnuma (apt-get install libnuma1)"; exit 1; }
 HAS_CHROMIUM := command -v chromium > /dev/null && command -v chromedriver > /dev/null \
-	|| { echo "error: the study's pages are tested in Chromium (apt-get install chromium chromium-driver)"; exit 1; }
+	|| { echo "error: pages are tested in Chromium (apt-get install chromium chromium-driver)"; exit 1; }
 
 PY := $(BIN)/python -m
 

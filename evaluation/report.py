@@ -4,6 +4,7 @@ with figures and a browser of items, which opens without a network."""
 from __future__ import annotations
 
 import logging
+import shutil
 from pathlib import Path
 
 from conf.entry import Run, command
@@ -29,11 +30,12 @@ def main(cfg: ReportCommand, run: Run) -> None:
     choices, ranks = read_rows(runs, root)
     check_same_rankings(ranks)
     browser = browser_of(choices, Path(cfg.store), cfg.items, cfg.seed)
-    figures = run.folder / "figures"
+    figures, tables = run.folder / "figures", run.folder / "tables"
+    for earlier in (figures, tables):
+        shutil.rmtree(earlier, ignore_errors=True)
     sections = sections_of(once(choices), once(ranks), runs, browser.confusions, figures)
 
-    tables = run.folder / "tables"
-    tables.mkdir(exist_ok=True)
+    tables.mkdir()
     for section in sections:
         for table in (*section.tables, *section.details):
             write_text(tables / f"{table.name}.md", table.as_markdown())

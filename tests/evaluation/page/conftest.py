@@ -11,6 +11,7 @@ from tests.evaluation.page.measured import (
     retrieve_run,
     right,
     select_run,
+    similarity_run,
     trained_student,
 )
 
@@ -19,8 +20,8 @@ HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=al
 
 @pytest.fixture(scope="session")
 def measured(tmp_path_factory, micro, micro_store) -> Path:
-    """checkpoints/ with a base, students of three regimes, two of which say hostile things, and a
-    retriever that is measured directly and in two stages."""
+    """checkpoints/ with a base, students of three regimes, two of which say hostile things, a
+    retriever that chooses, and one that is measured directly and in two stages."""
     root = tmp_path_factory.mktemp("checkpoints")
     select_run(root, micro_store, micro, "base", always_a, mode="record")
     for regime in ("answer_only", "cot", "cot_no_candidate_analysis"):
@@ -28,6 +29,7 @@ def measured(tmp_path_factory, micro, micro_store) -> Path:
         mode = "answer" if regime == "answer_only" else "reasoning"
         say = right if regime == "cot" else lambda item: HOSTILE
         select_run(root, micro_store, micro, regime, say, model=regime, mode=mode)
+    similarity_run(root, micro_store, micro, "clip")
     retrieve_run(root, micro_store, micro, "emb")
     retrieve_run(root, micro_store, micro, "emb", kind="two_stage")
     return root

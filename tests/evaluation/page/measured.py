@@ -16,6 +16,7 @@ from conf.schema import (
     RetrieverConfig,
     SelectCommand,
     SftCommand,
+    SimilarityCommand,
     StudentConfig,
     TeacherConfig,
 )
@@ -26,7 +27,8 @@ from evaluation.confidence import positions
 from evaluation.measures import recall_curves, retrieval_rows
 from evaluation.metrics import accuracy_by, accuracy_table
 from evaluation.ranking import Ranks
-from evaluation.tables import SelectionRow
+from evaluation.select import spread
+from evaluation.tables import SIMILARITY, SelectionRow
 from train.choice import parse
 
 STUDENT = StudentConfig(name="small")
@@ -101,6 +103,23 @@ def select_run(
     lines += [{**told, "item_id": i.item_id, "text": say(i), "cut": False} for i in items]
     (folder / "answers.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     return folder
+
+
+def similarity_run(
+    root: Path, store: Store, benchmark, name: str, limit: int | None = None
+) -> Path:
+    """A run of evaluation.similarity that always chooses the first candidate."""
+    items = spread(store.selection("test"), limit, 0)
+    settings = SimilarityCommand(
+        benchmark=benchmark, retriever=RetrieverConfig(name=name), limit=limit
+    )
+    credits = [float(i.answer == 0) for i in items]
+    accuracy = accuracy_table([i.family for i in items], credits)
+    row = SelectionRow.of(store.name, f"untrained {name}", SIMILARITY, accuracy, None)
+    cells = accuracy_by([f"{i.family}/{i.subtype}" for i in items], credits)
+    told = {f"untrained {name}": {cell: vars(found) for cell, found in cells.items()}}
+    finish(root / "similarity" / name, settings, {"rows": [row.to_dict()], "subtypes": told})
+    return root / "similarity" / name
 
 
 def retrieve_run(

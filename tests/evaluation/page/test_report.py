@@ -13,7 +13,7 @@ from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import ReportCommand
 from evaluation import report
-from tests.evaluation.page.measured import retrieve_run, right, select_run
+from tests.evaluation.page.measured import retrieve_run, right, select_run, similarity_run
 
 
 @pytest.fixture
@@ -52,7 +52,8 @@ def test_everything_is_written_in_the_papers_shape(runs, micro_store):
     assert r"full student (cot) & 100.0 & - & - \\" in ablation
     assert r"- match layout & 86.8 & 40.3 & 68.9 \\" in ablation
     text = (folder / "report.txt").read_text()
-    assert "paper, Table 2" in text
+    scorers = text.partition("similarity scorers")[2].partition("generative models")[0]
+    assert "untrained clip (similarity)" in scorers
     assert max(map(len, text.splitlines())) <= 100
     assert {path.stem for path in (folder / "figures").glob("*.svg")} >= {
         "families-micro", "horizons-micro", "positions-micro", "widths-micro", "recall-micro",
@@ -89,12 +90,14 @@ def test_the_same_runs_give_the_same_page(runs, micro_store):
 
 
 def test_runs_are_chosen_by_name_and_pattern(runs, micro_store):
+    assert list(reported(runs, micro_store.folder.parent, items=0).glob("tables/*retrieval*"))
     folder = reported(runs, micro_store.folder.parent, runs=["select/cot*", "select/base"], items=1)
     said = page_data(folder)["items"][0]["said"]
     assert {s["by"].split(" (")[0] for s in said} == {
         "cot", "cot_no_candidate_analysis", "small base",
     }  # fmt: skip
     assert "retrieval" not in (folder / "report.txt").read_text().lower()
+    assert not list(folder.glob("tables/*retrieval*"))
     named = f"{runs}/select/cot"
     folder = reported(runs, micro_store.folder.parent, runs=[named], items=1)
     assert len(page_data(folder)["items"][0]["said"]) == 1
@@ -165,6 +168,17 @@ def test_two_item_sets_are_told_apart(runs, micro, micro_store):
     for item in items[:3]:
         assert item.item_id in str(told.value)
     assert reported(runs, micro_store.folder.parent, runs=["select/few"], items=1)
+
+
+def test_a_retrievers_items_are_told_from_its_settings(runs, micro, micro_store, tmp_path):
+    similarity_run(runs, micro_store, micro, "few", limit=9)
+    of = ["select/base", "similarity/few"]
+    with pytest.raises(UserError, match=r"\d+ only in .*base \(such as"):
+        reported(runs, micro_store.folder.parent, runs=of)
+    # Without the benchmark, their number has to do.
+    with pytest.raises(UserError, match=r"\d+ and 9 of them|9 and \d+ of them"):
+        reported(runs, tmp_path / "nowhere", runs=of)
+    assert reported(runs, micro_store.folder.parent, runs=["similarity/few"])
 
 
 def test_two_databases_are_told_apart(runs, micro, micro_store):
