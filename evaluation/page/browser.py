@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,11 @@ import numpy as np
 
 from conf.errors import UserError
 from data.controls import MATCHED
-from data.records import SelectionItem
 from data.store import Store, open_store
 from evaluation.page import items, plots
 from evaluation.page.rows import Measured, once
 from evaluation.page.said import Asked, Said, answers_of, check_same_items, control_of
-from evaluation.select import spread
+from evaluation.select import chosen_items
 
 RunAnswers = Mapping[Path, Mapping[Asked, Mapping[str, Said]]]
 """What was said in each run's folder."""
@@ -104,17 +103,14 @@ def _answers(m: Measured, said: RunAnswers) -> Mapping[str, Said]:
     return of_run.get((m.row.mode, control_of(m.benchmark)), {})
 
 
-def _item_ids(m: Measured, said: RunAnswers, store: Store | str) -> Set[str] | None:
+def _item_ids(m: Measured, said: RunAnswers, store: Store | str) -> Mapping[str, object] | None:
     """The items that a row is of; None where neither answers nor a store tell."""
     if m.run.kind == "select":
-        return _answers(m, said).keys() or None
-    return None if isinstance(store, str) else {i.item_id for i in _chosen(m, store)}
-
-
-def _chosen(m: Measured, store: Store) -> list[SelectionItem]:
-    """The items that a run of evaluation.similarity chose among."""
+        return _answers(m, said) or None
+    if isinstance(store, str):
+        return None
     of = m.run.config
-    return spread(store.selection("test", of["suite"]), of["limit"], of["seed"])
+    return {i.item_id: i for i in chosen_items(store, of["suite"], of["limit"], of["seed"])}
 
 
 def _open(folder: Path) -> Store | str:

@@ -3,7 +3,7 @@ measured the same items."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,10 +11,8 @@ from conf.errors import UserError
 from conf.schema.commands import CONTROLS
 from evaluation.page.gathering import Finished, json_lines
 from evaluation.page.rows import Measured
+from evaluation.paired import same_items
 from train.choice import Choice, parse
-
-NAMED = 3
-"""Items that are named of those that one run alone measured."""
 
 Asked = tuple[str, str | None]
 """How a model was asked: the mode, and the control by which the items were shown."""
@@ -52,7 +50,7 @@ def answers_of(run: Finished) -> dict[Asked, dict[str, Said]]:
     return {(mode, controls.get(key, plain)): said for (mode, key), said in by_key.items()}
 
 
-def check_same_items(rows: Sequence[Measured], ids: Sequence[Set[str] | None]) -> None:
+def check_same_items(rows: Sequence[Measured], ids: Sequence[Mapping[str, object] | None]) -> None:
     """Rows of one benchmark stand in one table, so they must be of the same items.
 
     Args:
@@ -64,22 +62,15 @@ def check_same_items(rows: Sequence[Measured], ids: Sequence[Set[str] | None]) -
     first: dict[str, int] = {}
     for k, m in enumerate(rows):
         j = first.setdefault(m.benchmark, k)
-        pair = (rows[j].run.folder, m.run.folder)
-        counts = (rows[j].row.n, m.row.n)
-        if ids[j] is None or ids[k] is None:
-            told = "" if counts[0] == counts[1] else f"{counts[0]:,} and {counts[1]:,} of them"
-        else:
-            apart = (ids[j] - ids[k], ids[k] - ids[j])
-            told = " and ".join(
-                f"{len(only):,} only in {folder} (such as {', '.join(sorted(only)[:NAMED])})"
-                for folder, only in zip(pair, apart, strict=True)
-                if only
-            )
-        if told:
-            raise UserError(
-                f"{pair[0]} and {pair[1]} measured different items of {m.benchmark}, which do "
-                f"not belong into one table: {told}. Name the runs of one item set with runs=[...]"
-            )
+        names = (str(rows[j].run.folder), str(m.run.folder))
+        try:
+            if ids[j] is not None and ids[k] is not None:
+                same_items(ids[j], ids[k], names)
+            elif rows[j].row.n != m.row.n:
+                told = f"{names[0]} and {names[1]} answered {rows[j].row.n:,} and {m.row.n:,} items"
+                raise UserError(f"{told}: compare runs of the same items")
+        except UserError as error:
+            raise UserError(f"{error}, which runs=[...] chooses") from error
 
 
 def check_same_rankings(rows: Sequence[Measured]) -> None:

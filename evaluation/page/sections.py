@@ -19,6 +19,7 @@ from evaluation.page import tables as shaped
 from evaluation.page.gathering import STUDIES, TRAININGS, Finished, json_lines, unreadable
 from evaluation.page.rows import Measured, by_benchmark, transfers, widest
 from evaluation.page.tables import REGIMES
+from evaluation.paired import Paired
 from train.plots import curves_figure
 
 
@@ -130,19 +131,34 @@ def transfer(choices: Sequence[Measured]) -> Section:
 
 
 def controls(choices: Sequence[Measured], runs: Sequence[Finished]) -> Section:
+    """What controls are apart from what they are held against, and the controls' own rows.
+
+    Raises:
+        UserError: what a run reports is of another version.
+    """
     section = Section("Controls")
-    told = [
-        (run.report["rows"][0]["name"], found)
-        for run in runs
-        for found in run.report.get("controls", [])
-    ]
-    if told:
-        section.tables.append(shaped.controls_table(told))
+    apart: dict[tuple[str, str, str], list[Paired]] = {}
+    for run in runs:
+        for told in run.report.get("controls", []):
+            try:
+                pair = Paired(**{key: value for key, value in told.items() if key != "mode"})
+                ways = [told["mode"]] if run.kind == "similarity" else [_model(run), told["mode"]]
+            except (KeyError, TypeError) as error:
+                raise unreadable(run.folder) from error
+            apart.setdefault((", ".join(ways), pair.left, pair.right), []).append(pair)
+    if apart:
+        table = tables.paired_table([(way, of) for (way, _, _), of in apart.items()])
+        caption = "Controls: paired differences of accuracy (%)"
+        section.tables.append(replace(table, name="controls", caption=caption))
     for benchmark, rows in by_benchmark(choices).items():
         name = f"control-{benchmark.replace(', ', '-')}"
         caption = f"Controls: selection accuracy (%) on {benchmark}"
         section.tables.append(shaped.selection_trained(name, caption, rows, {}))
     return section
+
+
+def _model(run: Finished) -> str:
+    return run.report["rows"][0]["name"]
 
 
 def study(run: Finished) -> Section:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any
 
 from conf.sweep import AT_START
 from evaluation import paper
@@ -162,35 +161,6 @@ def overall_table(
 def _overall(row: paper.OverallReference, columns: int) -> list[str]:
     shares = [f"{percent:.1f}" for percent in (row.clevrer, row.movi_a, row.physion)]
     return [row.name, *shares, *["-"] * (columns - len(shares))]
-
-
-def controls_table(found: Sequence[tuple[str, dict[str, Any]]]) -> Table:
-    """What controls are apart from what they are held against; of each, its model's name and what
-    its run reported."""
-    parts: dict[str, list[list[str]]] = {}
-    for model, told in found:
-        label = f"{model}, {told['mode']}: {told['left']} (left) less {told['right']} (right)"
-        counts = [told.get("only_left"), told.get("only_right")]
-        parts.setdefault(label, []).append(
-            [
-                told.get("of", "all"),
-                f"{100 * told['difference']:+.1f}",
-                f"{100 * told['low']:+.1f} to {100 * told['high']:+.1f}",
-                *("-" if count is None else f"{count:,}" for count in counts),
-                "-" if told.get("p") is None else f"{told['p']:.2g}",
-                f"{told['n']:,}",
-            ]
-        )
-    return Table(
-        "controls",
-        "Controls: paired differences of accuracy (%)",
-        ["Controls, %", "Apart", "95%", "Only left", "Only right", "p", "Items"],
-        parts,
-        (
-            "Apart: left less right, its interval bootstrapped over scenes. Only left, only right: "
-            "items that are answered right one way alone; p is McNemar's exact test of the two.",
-        ),
-    )
 
 
 def training_table(runs: Sequence[Finished]) -> Table | None:

@@ -124,13 +124,13 @@ def test_controls_are_gathered_with_their_differences(runs, micro_store):
     told["rows"].append(row)
     told["controls"] = [
         {"mode": "reasoning", "left": "items as they are", "right": "candidate_only", "n": 63,
-         "difference": 0.25, "low": 0.1, "high": 0.375, "p": 0.001, "only_left": 20,
+         "of": "all", "left_accuracy": 0.75, "right_accuracy": 0.5, "difference": 0.25, "low": 0.1, "high": 0.375, "p": 0.001, "only_left": 20,
          "only_right": 4},
     ]  # fmt: skip
     path.write_text(json.dumps(told))
     folder = reported(runs, micro_store.folder.parent, items=1)
     table = (folder / "tables" / "controls.md").read_text()
-    assert "| all | +25.0 | +10.0 to +37.5 | 20 | 4 | 0.001 | 63 |" in table
+    assert "| all | 75.0 | 50.0 | +25.0 | +10.0 to +37.5 | 20 | 4 | 0.001 | 63 |" in table
     assert (folder / "tables" / "control-micro-candidate_only.md").exists()
 
 
@@ -176,7 +176,7 @@ def test_a_retrievers_items_are_told_from_its_settings(runs, micro, micro_store,
     with pytest.raises(UserError, match=r"\d+ only in .*base \(such as"):
         reported(runs, micro_store.folder.parent, runs=of)
     # Without the benchmark, their number has to do.
-    with pytest.raises(UserError, match=r"\d+ and 9 of them|9 and \d+ of them"):
+    with pytest.raises(UserError, match=r"answered (\d+ and 9|9 and \d+) items"):
         reported(runs, tmp_path / "nowhere", runs=of)
     assert reported(runs, micro_store.folder.parent, runs=["similarity/few"])
 
