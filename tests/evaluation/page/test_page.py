@@ -42,7 +42,7 @@ def chromium(tmp_path_factory) -> Iterator[webdriver.Chrome]:
 def page(measured, micro_store, tmp_path_factory) -> Path:
     """The report's page alone, moved away from all that it was made of."""
     folder = tmp_path_factory.mktemp("report")
-    cfg = ReportCommand(checkpoints=str(measured), store=str(micro_store.folder.parent), items=24)
+    cfg = ReportCommand(checkpoints=str(measured), store=str(micro_store.folder.parent), items=60)
     report.main.__wrapped__(cfg, Run("default", folder))
     moved = tmp_path_factory.mktemp("elsewhere") / "page.html"
     shutil.move(folder / "report.html", moved)
@@ -125,7 +125,7 @@ def test_an_item_shows_its_frames_and_which_is_right(chromium, page):
 def test_filters_show_what_they_say(chromium, page):
     look(chromium, page, 1280)
     items = items_of(chromium)
-    assert len(choose(chromium)) == len(items) == 24
+    assert len(choose(chromium)) == len(items) == 60
     for family in ("event", "time", "window"):
         assert choose(chromium, family=family) == [i["id"] for i in items if i["family"] == family]
     options = Select(chromium.find_element(By.NAME, "subtype")).options
@@ -143,7 +143,7 @@ def test_filters_show_what_they_say(chromium, page):
         wanted = [name for name, given in of_base.items() if given == verdict]
         assert choose(chromium, family="any", by=label, verdict=verdict) == wanted
     assert choose(chromium, by="cot (reasoning)", verdict="wrong") == []
-    assert chromium.find_element(By.ID, "count").text == "0 of 24 items"
+    assert chromium.find_element(By.ID, "count").text == "0 of 60 items"
 
 
 def test_it_can_be_used_by_keyboard_alone(chromium, page):

@@ -124,7 +124,8 @@ def test_controls_are_gathered_with_their_differences(runs, micro_store):
     told["rows"].append(row)
     told["controls"] = [
         {"mode": "reasoning", "left": "items as they are", "right": "candidate_only", "n": 63,
-         "of": "all", "left_accuracy": 0.75, "right_accuracy": 0.5, "difference": 0.25, "low": 0.1, "high": 0.375, "p": 0.001, "only_left": 20,
+         "of": "all", "left_accuracy": 0.75, "right_accuracy": 0.5, "difference": 0.25,
+         "low": 0.1, "high": 0.375, "p": 0.001, "only_left": 20,
          "only_right": 4},
     ]  # fmt: skip
     path.write_text(json.dumps(told))
