@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.jobs import run, run_all
 from conf.runs import write_text
-from evaluation.tables import RetrievalRow
+from evaluation.rows import RetrievalRow
 
 WAYS: dict[str, list[str]] = {
     "in-batch": ["train.hard_negatives=0"],

@@ -22,7 +22,7 @@ from data.frames import Frames, resized
 from data.records import FrameRef
 from data.store import Store
 from evaluation.cache import Embeddings
-from evaluation.tables import UNTRAINED
+from evaluation.rows import UNTRAINED
 from train.compatible import (
     check_base,
     check_pooling,

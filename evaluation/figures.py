@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from data.records import FAMILIES
 from evaluation import paper
-from evaluation.tables import RECALLS, UNTRAINED, RetrievalRow, SelectionRow
+from evaluation.rows import RECALLS, UNTRAINED, RetrievalRow, SelectionRow
 from train.plots import COLORS, empty_figure
 
 if TYPE_CHECKING:

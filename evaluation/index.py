@@ -23,7 +23,7 @@ from conf.errors import UserError
 from conf.runs import held, write_json
 from evaluation.cache import Embeddings
 from evaluation.ranking import Cut, Ranks, block_scores, least_of_top
-from evaluation.tables import RECALLS
+from evaluation.rows import RECALLS
 
 log = logging.getLogger(__name__)
 

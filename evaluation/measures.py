@@ -21,7 +21,7 @@ from evaluation.metrics import (
     summary,
 )
 from evaluation.ranking import Ranks
-from evaluation.tables import RECALLS, RetrievalRow, SelectionRow
+from evaluation.rows import RECALLS, RetrievalRow, SelectionRow
 
 
 def selection_row(

@@ -18,6 +18,7 @@ from data.store import Store
 from evaluation import figures, paper, tables
 from evaluation.formats import Table
 from evaluation.ranking import Ranks, exact_ranks
+from evaluation.rows import RetrievalRow
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +46,7 @@ def ranks_of(
 
 def write_report(
     folder: Path,
-    rows: Sequence[tables.RetrievalRow],
+    rows: Sequence[RetrievalRow],
     curves: Sequence[dict[str, Any]],
     told: Sequence[Table] = (),
     reference: Sequence[paper.RetrievalReference] = paper.RETRIEVAL_DISTILLED,

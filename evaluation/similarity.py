@@ -33,6 +33,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from evaluation.confidence import positions
     from evaluation.measures import by_subtype, selection_row
     from evaluation.paired import anchors
+    from evaluation.rows import SIMILARITY
     from evaluation.select import chosen_items
     from train.precision import settled
 
@@ -49,7 +50,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         scores = nearest.candidate_scores(items, asked, shown, preset)
         right = nearest.credits(scores, [item.answer for item in items])
         name = embedder.name
-        rows.append(selection_row(asked_of, name, tables.SIMILARITY, items, right, None, cfg.seed))
+        rows.append(selection_row(asked_of, name, SIMILARITY, items, right, None, cfg.seed))
         subtypes[name] = by_subtype(items, right)
         letters[name] = positions(nearest.letters(scores), [item.letter for item in items])
         if cfg.suite == MATCHED:

@@ -43,6 +43,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from evaluation import foreseen, matching, measures, paper, ranked, tables
     from evaluation.asked import asked_model
     from evaluation.embedding import embedders
+    from evaluation.rows import UNTRAINED
     from train.conversation import told_sample
     from train.precision import settled
 
@@ -65,7 +66,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         route = foreseen.ROUTES[key]
         log.info("matching %s with %s", route.title, matcher.name)
         ranks = matching.ranks(cfg, route, matcher, texts, queries, database, store)
-        title = f"{name} {route.title}, {matcher.name.removeprefix(tables.UNTRAINED).strip()}"
+        title = f"{name} {route.title}, {matcher.name.removeprefix(UNTRAINED).strip()}"
         found = measures.retrieval_rows(store.name, title, ranks, queries, cfg.seed)
         rows += found
         curves += measures.recall_curves(title, ranks, queries)

@@ -14,7 +14,7 @@ from data.records import LETTERS
 from evaluation import paper
 from evaluation.figures import FAINT, INK, color_of, legend_above
 from evaluation.metrics import Interval, wilson
-from evaluation.tables import UNTRAINED
+from evaluation.rows import UNTRAINED
 from train.plots import COLORS, empty_figure
 
 HORIZONS = {"time/in_1s": "1 s", "time/in_2s": "2 s"}

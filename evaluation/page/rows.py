@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.page.gathering import CHOICES, RANKINGS, Finished, training_of, unreadable
-from evaluation.tables import UNTRAINED, RetrievalRow, SelectionRow
+from evaluation.rows import UNTRAINED, RetrievalRow, SelectionRow
 
 SUITES = {"movi_a": "MoVi-A", "physion": "Physion"}
 """The paper's transfer suites by their simulator."""

@@ -10,12 +10,12 @@ from evaluation import paper
 from evaluation.formats import Table
 from evaluation.page.gathering import Finished
 from evaluation.page.rows import SUITES, Measured
+from evaluation.rows import SIMILARITY
 from evaluation.tables import (
     RETRIEVAL_HEAD,
     RETRIEVAL_NOTE,
     SELECTION_HEAD,
     SELECTION_NOTE,
-    SIMILARITY,
     retrieval_cells,
     retrieval_references,
     selection_cells,

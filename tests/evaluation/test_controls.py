@@ -12,8 +12,8 @@ from conf.schema import BenchmarkConfig, SelectCommand, ServerConfig, StudentCon
 from data.controls import MATCHED, pairs
 from evaluation import select
 from evaluation.answers import judge
+from evaluation.rows import SelectionRow
 from evaluation.selected import write_report
-from evaluation.tables import SelectionRow
 from train.generate import Written
 
 STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)

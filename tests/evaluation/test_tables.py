@@ -23,11 +23,8 @@ from evaluation.metrics import (
     wilson,
 )
 from evaluation.ranking import Ranks
+from evaluation.rows import RECALLS, UNTRAINED, RetrievalRow, SelectionRow
 from evaluation.tables import (
-    RECALLS,
-    UNTRAINED,
-    RetrievalRow,
-    SelectionRow,
     builder_tables,
     cost_table,
     index_table,

@@ -27,8 +27,8 @@ from evaluation.confidence import positions
 from evaluation.measures import recall_curves, retrieval_rows
 from evaluation.metrics import accuracy_by, accuracy_table
 from evaluation.ranking import Ranks
+from evaluation.rows import SIMILARITY, SelectionRow
 from evaluation.select import spread
-from evaluation.tables import SIMILARITY, SelectionRow
 from train.choice import parse
 
 STUDENT = StudentConfig(name="small")
