@@ -3,9 +3,9 @@ write before it is ever asked to choose.
 
 A frame is described by its objects and their places, alone and among four candidates, one after the
 other; an object is looked for in each of four candidates; a clip is told by the built-in narrator,
-with the frame that comes of it shown or not; a clip is told and then an object looked for in its
-item's candidates; of several frames the one is named that is the later, or that fits a description.
-None of it is the selection task itself.
+with the frame that comes of it shown or not; after a clip and what is told of it, an object is
+looked for in its item's candidates; of several frames the one is named that is the later, or that
+fits a description. None of it is the selection task itself.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ FRAME = "Describe the frame."
 CANDIDATES = "Describe each candidate."
 WHERE = "Where does each candidate show the {}?"
 CLIP = "Describe the scene, how its objects move, and what will come of it."
-COMPARED = f"{CLIP} {WHERE}"
 LATER = 'Which candidate comes later? End with a line "Answer:" and the letter.'
 MATCH = (
     "Which candidate shows {}? Say of each candidate, in a line of its own, whether it matches and "
     'why. End with a line "Answer:" and the letter.'
 )
-ASKED = (FRAME, CANDIDATES, WHERE, CLIP, COMPARED, LATER, MATCH)
+ASKED = (FRAME, CANDIDATES, WHERE, CLIP, LATER, MATCH)
 FRAMES = 2
 """Frames described for each item in an epoch."""
-SETS = 3
-"""Sets of candidates for each item in an epoch, each of those described, looked through, and looked
-through after a clip."""
+SETS = 2
+"""Sets of candidates for each item in an epoch, of those described and of those looked through."""
+COMPARED = 6
+"""Objects looked for after a clip, for each item in an epoch: the hardest to learn of all."""
 MOVED = 0.08
 """Share of the view's width by which an object has moved in the later of two frames, at least."""
 CLEAR = 0.3
@@ -62,7 +62,9 @@ def kinds(
         "candidates": [make.candidates(item, items, k) for item in items for k in range(SETS)],
         "where": [make.where(item, items, k) for item in items for k in range(SETS)],
         "clip": [clip for item in items for clip in make.clip(item)],
-        "compared": [one for item in items for k in range(SETS) for one in make.compared(item, k)],
+        "compared": [
+            one for item in items for k in range(COMPARED) for one in make.compared(item, k)
+        ],
         "later": [later for item in items for later in make.later(item)],
         "match": [match for item in items for match in make.matched(item)],
     }
@@ -200,11 +202,12 @@ class _Maker:
         return self._after_prefix(item, [*later, CLIP], text, images)
 
     def compared(self, item: SelectionItem, k: int) -> Iterator[Planned]:
-        """The clip, and where its item's candidates show an object. As in a rationale, what is
-        foreseen stands before what is to be seen, and must not be taken for it."""
+        """A clip, what is told of it, and where its item's candidates show an object. As in a
+        rationale, what is foreseen stands before what is to be seen, and must not be taken for it;
+        it is not learnt here, or the few words that are seen would weigh next to nothing."""
         if (text := self._told(item)) is not None:
             phrase = self.store.scene(item.scene_id).objects[0].phrase
-            long = f"{COMPARED.format(phrase)} {text} {self._everywhere(phrase)}"
+            long = f"{text} {WHERE.format(phrase)} {self._everywhere(phrase)}"
             media = self.cfg.frames // 2 + len(LETTERS)
             yield Planned(long, media, partial(self._compared, item, text, k))
 
@@ -213,8 +216,8 @@ class _Maker:
         own = [(c.scene_id, c.frame) for c in item.candidates]
         shown = lettered([own[place] for place in rng.permutation(len(own))])
         phrase, told = self._sought(item, shown, rng)
-        parts = [*self._labelled(shown), f"\n{COMPARED.format(phrase)}"]
-        return self._after_prefix(item, parts, f"{text}\n{told}", shown)
+        parts = [*self._labelled(shown), f"\n{text}\n{WHERE.format(phrase)}"]
+        return self._after_prefix(item, parts, told, shown)
 
     def later(self, item: SelectionItem) -> Iterator[Planned]:
         """Two frames that can be told apart, where something still moves after the prefix."""

@@ -81,7 +81,7 @@ def test_an_object_is_where_it_is_said_to_be_in_each_candidate(
             asked = re.search(
                 r"Where does each candidate show the (.+)\?$", sample.content[-1]["text"]
             )[1]
-            assert (sample.clip is not None) == ("Scene parse: " in sample.response)
+            assert (sample.clip is not None) == ("Scene parse: " in sample.content[-1]["text"])
             assert (sample.clip is not None) == (kind == "compared")
             said = re.findall(
                 r"Candidate (\w) (lacks|shows) the (.+?)(?: (near [^.]+))?\.", sample.response
