@@ -112,6 +112,7 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
     assert len(kept) == 15
     rights = {i.item_id: i.letter for i in items}
     assert all(a.right == (a.letter == rights[a.item_id]) for a in kept.values())
+    log.write_text(whole)
 
     # Answers of other weights are not taken for these.
     others = {mode: {**what, "model": "another"} for mode, what in known.items()}
