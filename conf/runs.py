@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import logging
 import os
 import platform
 import re
@@ -20,6 +21,8 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from conf.errors import SettingsError, UserError
+
+log = logging.getLogger(__name__)
 
 ELSEWHERE = ("run", "store", "checkpoints", "workers", "host", "port", "public")
 """Keys that say where and how fast a run goes, not what comes out of it."""
@@ -140,6 +143,16 @@ def held(folder: Path, otherwise: str) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+def wait_to_hold(handle: int, busy: str) -> None:
+    """Hold an open file or folder against other processes, once the one that has it is done; `busy`
+    says that one has. It is held until it is closed."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        log.info("%s; waiting for it", busy)
+        fcntl.flock(handle, fcntl.LOCK_EX)
 
 
 def differences(folder: Path, settings: dict[str, Any]) -> list[str]:

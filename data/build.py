@@ -81,6 +81,8 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
     check_names(cfg)
     log.info("building benchmark %s in %s", cfg.name, folder)
     with growing_folder(cfg, folder) as growing:
+        if growing is None:
+            return
         scene_ids, unread = make_scenes(cfg, growing, workers, strict)
         items, queries, dropped = make_items_and_queries(cfg, growing, scene_ids, workers)
         scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(growing, name)))

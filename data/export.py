@@ -30,7 +30,6 @@ from conf.runs import held, write_text
 from conf.schema import ExportCommand
 from data.columns import Rows, features
 from data.controls import MATCHED
-from data.growing import being_built
 from data.parallel import Workers
 from data.records import POOLS, SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from data.store import DATABASES, Store, digest, sealed, write_atomically
@@ -128,7 +127,8 @@ def export(store: Store, folder: Path, plan: dict[str, Any]) -> None:
 
     growing = folder.with_name(f".{folder.name}.partial")
     growing.mkdir(parents=True, exist_ok=True)
-    with held(growing, being_built(folder)):
+    busy = f"{folder} is being written by another process; run this again when it is done"
+    with held(growing, busy):
         _begin(growing, plan)
         columns = features(plan["images"])
         rows = Rows(store, plan["images"])

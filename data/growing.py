@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from conf.errors import UserError
-from conf.runs import held
+from conf.runs import wait_to_hold
 from conf.schema import BenchmarkConfig
 from data.records import SPLITS
 from data.standins import generator_version
@@ -17,22 +19,31 @@ from data.store import PLAN, write_atomically
 
 
 @contextmanager
-def growing_folder(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path]:
-    """The folder beside `folder` that a build fills, held by this process alone.
+def growing_folder(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | None]:
+    """The folder beside `folder` that a build fills, held by this process alone; while another
+    process holds it, this one waits. None where that one has built `folder` meanwhile.
 
     Raises:
-        UserError: another process is building there, or a build of other settings was left there.
+        UserError: a build of other settings was left there.
     """
     growing = folder.with_name(f".{folder.name}.partial")
     growing.mkdir(parents=True, exist_ok=True)
     plan = _plan(cfg)
-    with held(growing, being_built(folder)):
+    handle = os.open(growing, os.O_RDONLY)
+    try:
+        wait_to_hold(handle, f"{folder} is being built by another process")
+        if folder.exists():
+            shutil.rmtree(growing, ignore_errors=True)
+            yield None
+            return
         if (growing / PLAN).exists():
             _check_same_plan(json.loads((growing / PLAN).read_text()), plan, growing)
         for leftover in growing.rglob(".*.partial"):
             leftover.unlink()
         write_atomically(growing / PLAN, json.dumps(plan).encode())
         yield growing
+    finally:
+        os.close(handle)
 
 
 def _plan(cfg: BenchmarkConfig) -> dict[str, Any]:
@@ -53,11 +64,6 @@ def _plan(cfg: BenchmarkConfig) -> dict[str, Any]:
         "config": {key: getattr(cfg, key) for key in keys},
         "counterfactual scenes": absent,
     }
-
-
-def being_built(folder: Path) -> str:
-    """What a second process is told that would make `folder` at the same time."""
-    return f"{folder} is being built by another process; run this again when it is done"
 
 
 def _check_same_plan(there: dict[str, Any], plan: dict[str, Any], growing: Path) -> None:

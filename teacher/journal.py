@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import io
 import json
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from conf.errors import UserError
+from conf.runs import wait_to_hold
 from data.records import Rationale
 from data.store import write_atomically
 from teacher.validate import SECTIONS
@@ -27,21 +27,17 @@ UNREADABLE = (ValueError, TypeError, KeyError, AttributeError)
 class Journal:
     """An open rationales.jsonl; `rationales` are the answers that it held when it was opened.
 
-    A torn last line, left by a kill, is ended or taken back; the answer it lost is asked for
-    again.
+    While another process writes it, opening waits. A torn last line, left by a kill, is ended or
+    taken back; the answer it lost is asked for again.
 
     Raises:
-        UserError: another process is writing it, or a line before the last cannot be read.
+        UserError: a line before the last cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.file = open(path, "ab+")  # noqa: SIM115  closed by __exit__
-        try:
-            fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            self.file.close()
-            raise UserError(f"{path} is being written by another run; wait for it") from error
+        wait_to_hold(self.file.fileno(), f"{path} is being written by another process")
         self._end_torn_line()
         self.rationales = read_rationales(path)
 

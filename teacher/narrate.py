@@ -119,7 +119,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
     into the store's rationales.parquet too.
 
     Raises:
-        UserError: rationales.jsonl is damaged, in use or of another benchmark, or the servers fail
+        UserError: rationales.jsonl is damaged or of another benchmark, or the servers fail
             for good.
     """
     items = store.selection("train")

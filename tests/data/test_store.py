@@ -123,12 +123,26 @@ def test_a_build_of_other_scenes_is_not_thrown_away(tmp_path) -> None:
     assert {p.name: p.stat().st_mtime_ns for p in kept.iterdir()} == first
 
 
-def test_a_build_is_one_process_own(tmp_path) -> None:
-    with (
-        growing_folder(small(), tmp_path / "small"),
-        pytest.raises(UserError, match="another process"),
-    ):
-        build(small(), tmp_path / "small", Workers(1))
+@pytest.mark.slow
+def test_builds_at_once_make_one_store(tmp_path, built) -> None:
+    """As the jobs of a sweep do that start together: one builds, and the others wait for it."""
+    stores = []
+    others = [
+        threading.Thread(
+            target=lambda: stores.append(ensure_items(small(), tmp_path, Workers(1))), daemon=True
+        )
+        for _ in range(2)
+    ]
+    with growing_folder(small(), tmp_path / "small"):
+        for other in others:
+            other.start()
+        time.sleep(0.5)
+        assert all(other.is_alive() for other in others)
+    for other in others:
+        other.join(timeout=300)
+    assert len(stores) == 2
+    assert digests(tmp_path / "small") == digests(built)
+    assert os.listdir(tmp_path) == ["small"]
 
 
 @pytest.mark.parametrize("scenes", [10, 12, 100])

@@ -1,5 +1,7 @@
 """Runs of the command on a store in memory: resuming, damage, and what servers answer."""
 
+import threading
+import time
 from dataclasses import replace
 
 import pyarrow.parquet as pq
@@ -68,9 +70,18 @@ def test_answers_under_other_settings_are_not_taken(store):
     assert lines(store) == before
 
 
-def test_only_one_writer(store):
-    with Journal(store.folder / "rationales.jsonl"), pytest.raises(UserError, match="another run"):
-        narrate_store(store, TEMPLATE)
+def test_one_writes_and_the_others_wait(store):
+    """As the jobs of a sweep do that start together."""
+    narrations = []
+    other = threading.Thread(
+        target=lambda: narrations.append(narrate_store(store, TEMPLATE)), daemon=True
+    )
+    with Journal(store.folder / "rationales.jsonl"):
+        other.start()
+        time.sleep(0.3)
+        assert other.is_alive()
+    other.join(timeout=120)
+    assert narrations[0].rationales == narrate_store(store, TEMPLATE).rationales
 
 
 def test_rejected_answers_are_kept_and_set_aside(store):
