@@ -78,7 +78,8 @@ def model_here(
     def loaded() -> tuple[nn.Module, ProcessorMixin]:
         room.keep_big_blocks()
         if weights is None:
-            return backbone.load_base(student, precision, list)
+            model, processor = backbone.load_base(student, precision, list)
+            return backbone.at_work(model), processor
         return backbone.load_trained(student, precision, weights)
 
     def say(mode: str, sample_of: SampleOf) -> Say:

@@ -224,7 +224,7 @@ def load_trained(
         base, processor = load_base(cfg, precision, list)
         try:
             check_adapters(folder, base, cfg)
-            return peft.PeftModel.from_pretrained(base, folder).eval(), processor
+            return at_work(peft.PeftModel.from_pretrained(base, folder)), processor
         except UNREADABLE as error:
             raise damaged(folder, error) from error
     if (folder / EXPORT).exists():
@@ -233,7 +233,7 @@ def load_trained(
         cfg, model=str(folder), architecture=None, quantization="none", lora=LoraConfig(rank=0)
     )
     model, processor = load_base(whole, precision, list)
-    return model.eval(), processor
+    return at_work(model), processor
 
 
 def merged(
@@ -268,7 +268,13 @@ def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
     except UNREADABLE as error:
         raise damaged(folder, error, "delete it and export again") from error
     processor.tokenizer.padding_side = "left"
-    return model.to("cuda" if torch.cuda.is_available() else "cpu").eval(), processor
+    return at_work(model), processor
+
+
+def at_work(model: nn.Module) -> nn.Module:
+    """A model ready to answer, on the GPU where there is one: unlike a 4-bit model, one that is not
+    quantised is loaded beside the CPU."""
+    return model.to("cuda" if torch.cuda.is_available() else "cpu").eval()
 
 
 def save(

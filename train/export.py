@@ -24,7 +24,7 @@ from pathlib import Path
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import run_below, runs_of, write_json, write_text
+from conf.runs import held, run_below, runs_of, write_json, write_text
 from conf.schema import (
     ContrastiveCommand,
     ExportModelCommand,
@@ -133,11 +133,9 @@ def find(cfg: ExportModelCommand) -> Trained:
 def renamed_when_whole(folder: Path) -> Iterator[Path]:
     """A folder beside `folder` to write into. It takes that name in the end; what a kill or a full
     disk left of an earlier one is thrown away."""
-    from data.growing import held
-
     partial = folder.with_name(f".{folder.name}.partial")
     partial.mkdir(exist_ok=True)
-    with held(partial, folder):
+    with held(partial, f"{folder} is being written by another process"):
         for leftover in partial.iterdir():
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         try:
