@@ -3,14 +3,14 @@ write before it is ever asked to choose.
 
 A frame is described by its objects and their places, alone and among four candidates, one after the
 other; an object is looked for in each of four candidates; a clip is told by the built-in narrator,
-with the frame that comes of it shown or not; after a clip and what is told of it, an object is
-looked for in its item's candidates; of several frames the one is named that is the later, or that
-fits a description. None of it is the selection task itself.
+with the frame that comes of it shown or not; after a clip and what is told of it, its item's
+candidates are compared with that by where they show an object; of several frames the one is named
+that is the later, or that fits a description. None of it is the selection task itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -28,19 +28,20 @@ from train.planned import Planned, rng_of
 FRAME = "Describe the frame."
 CANDIDATES = "Describe each candidate."
 WHERE = "Where does each candidate show the {}?"
+COMPARE = "Compare each candidate with the prediction by the {}."
 CLIP = "Describe the scene, how its objects move, and what will come of it."
 LATER = 'Which candidate comes later? End with a line "Answer:" and the letter.'
 MATCH = (
     "Which candidate shows {}? Say of each candidate, in a line of its own, whether it matches and "
     'why. End with a line "Answer:" and the letter.'
 )
-ASKED = (FRAME, CANDIDATES, WHERE, CLIP, LATER, MATCH)
+ASKED = (FRAME, CANDIDATES, WHERE, COMPARE, CLIP, LATER, MATCH)
 FRAMES = 2
 """Frames described for each item in an epoch."""
 SETS = 2
 """Sets of candidates for each item in an epoch, of those described and of those looked through."""
 COMPARED = 6
-"""Objects looked for after a clip, for each item in an epoch: the hardest to learn of all."""
+"""Objects to compare by after a clip, for each item in an epoch: the hardest to learn of all."""
 MOVED = 0.08
 """Share of the view's width by which an object has moved in the later of two frames, at least."""
 CLEAR = 0.3
@@ -130,27 +131,29 @@ class _Maker:
     ) -> Sample:
         rng = rng_of(self.seed, epoch, item.item_id, "where", k)
         shown = self._four(item, others, rng)
-        phrase, told = self._sought(item, shown, rng)
+        seen = self._seen(shown)
+        phrase = self._telling(item, {p for objects in seen for p in objects}, seen, rng)
+        told = " ".join(
+            f"{_shows(letter, phrase, objects.get(phrase))}."
+            for (*_, letter), objects in zip(shown, seen, strict=True)
+        )
         return self._of_four(f"{item.item_id} (where {k})", shown, WHERE.format(phrase), [told])
 
-    def _sought(
-        self, item: SelectionItem, shown: list[Picture], rng: np.random.Generator
-    ) -> tuple[str, str]:
-        """An object that some of the candidates show, one whose place tells them apart where there
-        is such, and where each of them has it."""
-        seen = [seen_in(self.store.scene(scene_id), frame) for scene_id, frame, _ in shown]
-        there = sorted({phrase for objects in seen for phrase in objects})
-        if not there:
-            there = [o.phrase for o in self.store.scene(item.scene_id).objects]
-        apart = [p for p in there if len({objects.get(p) for objects in seen}) > 1] or there
-        phrase = apart[rng.integers(len(apart))]
-        told = [
-            f"Candidate {letter} shows the {phrase} {objects[phrase]}."
-            if phrase in objects
-            else f"Candidate {letter} lacks the {phrase}."
-            for (*_, letter), objects in zip(shown, seen, strict=True)
-        ]
-        return phrase, " ".join(told)
+    def _seen(self, shown: list[Picture]) -> list[dict[str, str]]:
+        return [seen_in(self.store.scene(scene_id), frame) for scene_id, frame, _ in shown]
+
+    def _telling(
+        self,
+        item: SelectionItem,
+        there: Collection[str],
+        seen: list[dict[str, str]],
+        rng: np.random.Generator,
+    ) -> str:
+        """One of the objects that are there, by whose place candidates are told apart where there
+        is such."""
+        some = sorted(there) or [o.phrase for o in self.store.scene(item.scene_id).objects]
+        apart = [p for p in some if len({objects.get(p) for objects in seen}) > 1] or some
+        return apart[rng.integers(len(apart))]
 
     @staticmethod
     def _everywhere(phrase: str) -> str:
@@ -202,12 +205,14 @@ class _Maker:
         return self._after_prefix(item, [*later, CLIP], text, images)
 
     def compared(self, item: SelectionItem, k: int) -> Iterator[Planned]:
-        """A clip, what is told of it, and where its item's candidates show an object. As in a
-        rationale, what is foreseen stands before what is to be seen, and must not be taken for it;
-        it is not learnt here, or the few words that are seen would weigh next to nothing."""
+        """A clip, what is told of it, and by an object's place whether its item's candidates agree
+        with that. As in a rationale, what is foreseen stands before what is to be seen, and must
+        not be taken for it; it is not learnt here, or the few words that are seen would weigh next
+        to nothing."""
         if (text := self._told(item)) is not None:
             phrase = self.store.scene(item.scene_id).objects[0].phrase
-            long = f"{text} {WHERE.format(phrase)} {self._everywhere(phrase)}"
+            differs = f", not {REGIONS[0][0]}" * len(LETTERS)
+            long = f"{text} {COMPARE.format(phrase)} {self._everywhere(phrase)}{differs}"
             media = self.cfg.frames // 2 + len(LETTERS)
             yield Planned(long, media, partial(self._compared, item, text, k))
 
@@ -215,8 +220,14 @@ class _Maker:
         rng = rng_of(self.seed, epoch, item.item_id, "compared", k)
         own = [(c.scene_id, c.frame) for c in item.candidates]
         shown = lettered([own[place] for place in rng.permutation(len(own))])
-        phrase, told = self._sought(item, shown, rng)
-        parts = [*self._labelled(shown), f"\n{text}\n{WHERE.format(phrase)}"]
+        seen = self._seen(shown)
+        expected = seen_in(self.store.scene(item.scene_id), item.target_frame)
+        phrase = self._telling(item, expected, seen, rng)
+        told = " ".join(
+            _compared(letter, phrase, objects.get(phrase), expected.get(phrase))
+            for (*_, letter), objects in zip(shown, seen, strict=True)
+        )
+        parts = [*self._labelled(shown), f"\n{text}\n{COMPARE.format(phrase)}"]
         return self._after_prefix(item, parts, told, shown)
 
     def later(self, item: SelectionItem) -> Iterator[Planned]:
@@ -273,6 +284,21 @@ class _Maker:
 
     def _prefix(self, item: SelectionItem) -> list[int]:
         return shown_frames(item.prefix_start, item.prefix_stop, self.cfg.frames)
+
+
+def _shows(letter: str, phrase: str, place: str | None) -> str:
+    if place is None:
+        return f"Candidate {letter} lacks the {phrase}"
+    return f"Candidate {letter} shows the {phrase} {place}"
+
+
+def _compared(letter: str, phrase: str, place: str | None, expected: str | None) -> str:
+    """Where a candidate shows an object, None where it does not, and whether that is where it was
+    to be."""
+    if place == expected:
+        return f"{_shows(letter, phrase, place)} and agrees."
+    differs = f", not {expected}" if place and expected else ""
+    return f"{_shows(letter, phrase, place)}{differs}."
 
 
 def seen_in(scene: Scene, frame: int) -> dict[str, str]:

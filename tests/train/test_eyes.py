@@ -69,31 +69,62 @@ def test_each_candidate_is_told_under_its_letter(micro_store, frames, kinds) -> 
     assert told_apart > 24
 
 
-@pytest.mark.parametrize("kind", ["where", "compared"])
-def test_an_object_is_where_it_is_said_to_be_in_each_candidate(
-    micro_store, frames, kinds, kind
+def test_an_object_is_where_it_is_said_to_be_in_each_candidate(micro_store, frames, kinds) -> None:
+    every = all_shown(micro_store, frames)
+    answers = set()
+    for planned in kinds["where"][:16]:
+        for epoch in range(4):
+            sample = planned.make(epoch)
+            asked = sample.content[-1]["text"]
+            assert sample.clip is None
+            phrase = re.search(r"Where does each candidate show the (.+)\?$", asked)[1]
+            places = said_of_each(sample.response, phrase, r"\.")
+            for image, (place, _) in zip(sample.images, places, strict=True):
+                assert any(objects.get(phrase) == place for objects in every[image.tobytes()])
+            answers.add(tuple(places))
+    assert len(answers) > 16
+
+
+def test_candidates_are_compared_with_what_is_foreseen_of_an_object(
+    micro_store, frames, kinds
 ) -> None:
     every = all_shown(micro_store, frames)
     answers = set()
-    for planned in kinds[kind][:16]:
+    for planned in kinds["compared"][:16]:
         for epoch in range(4):
             sample = planned.make(epoch)
-            asked = re.search(
-                r"Where does each candidate show the (.+)\?$", sample.content[-1]["text"]
-            )[1]
-            assert (sample.clip is not None) == ("Scene parse: " in sample.content[-1]["text"])
-            assert (sample.clip is not None) == (kind == "compared")
-            said = re.findall(
-                r"Candidate (\w) (lacks|shows) the (.+?)(?: (near [^.]+))?\.", sample.response
-            )
-            assert [(letter, phrase) for letter, _, phrase, _ in said] == [
-                (letter, asked) for letter in LETTERS
-            ]
-            for image, (_, verb, _, place) in zip(sample.images, said, strict=True):
-                assert (verb == "lacks") == (not place)
-                assert any(objects.get(asked, "") == place for objects in every[image.tobytes()])
-            answers.add(tuple(place for *_, place in said))
+            asked = sample.content[-1]["text"]
+            assert sample.clip is not None
+            phrase = re.search(r"Compare each .+ with the prediction by the (.+)\.$", asked)[1]
+            expected = foreseen(asked, phrase)
+            verdicts = said_of_each(sample.response, phrase, r"( and agrees|, not (near .+?)|)\.")
+            for image, (place, verdict) in zip(sample.images, verdicts, strict=True):
+                assert any(objects.get(phrase) == place for objects in every[image.tobytes()])
+                if place == expected:
+                    assert verdict == " and agrees"
+                else:
+                    assert verdict == ((place and f", not {expected}") or "")
+            assert " and agrees" in {verdict for _, verdict in verdicts}
+            answers.add(tuple(verdicts))
     assert len(answers) > 16
+
+
+def said_of_each(response: str, phrase: str, end: str) -> list[tuple[str | None, str]]:
+    """The place in which each candidate is said to show an object, None where it lacks it, and what
+    is said of that."""
+    each = rf"Candidate (\w) (?:lacks|shows) the {phrase}(?: (near the [\w-]+))?{end}"
+    found = list(re.finditer(each, response))
+    assert [one[1] for one in found] == list(LETTERS)
+    assert " ".join(one[0] for one in found) == response
+    return [(one[2], one[3] if len(one.groups()) > 2 else "") for one in found]
+
+
+def foreseen(text: str, phrase: str) -> str | None:
+    """The place in which a narrator says that an object will be."""
+    prediction = text[text.index("Prediction: ") : text.index("Outcome: ")]
+    will = rf"{phrase} (?:will be|should be|remains|stays)(?: hidden)? (near the [\w-]+)"
+    found = re.search(will, prediction)
+    return found and found[1]
 
 
 def test_one_candidate_alone_fits_a_description(micro_store, kinds) -> None:
