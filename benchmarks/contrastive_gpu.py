@@ -33,7 +33,7 @@ from benchmarks.sft_runs import SEED, device_name
 from conf.compose import compose
 from conf.schema import ArchitectureConfig, ContrastiveCommand
 from data.records import FrameRef, RetrievalQuery
-from train import loop, retriever, room, towers
+from train import retriever, room, towers
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "plain sentence-transformers": {"plain": True},
@@ -64,7 +64,8 @@ def main() -> None:
     args = parser.parse_args()
     warnings.simplefilter("ignore", FutureWarning)
     logging.disable(logging.WARNING)
-    loop.keep_to_one_gpu()
+    if torch.cuda.device_count() > 1:
+        parser.error("one card is measured: set CUDA_VISIBLE_DEVICES=0")
     room.keep_big_blocks()
     measure(args.retriever, args.base, args.batch, args.steps)
 

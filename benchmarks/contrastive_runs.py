@@ -32,6 +32,7 @@ from train.contrast import ByName, RetrieverTrainer, arguments, loss_of, named
 from train.inputs import Inputs
 from train.mining import HardNegatives
 from train.precision import settled
+from train.ranking_loss import RankingLoss
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ NEVER = {"eval_strategy": "no", "eval_on_start": False, "save_strategy": "no"}
 def ours(cfg, model, queries, frames, store, folder, order) -> Trainer:
     """The trainer as `train.contrastive` makes it, without evaluations and checkpoints."""
     inputs = Inputs(model, frames, cfg.retriever, cfg.train.precision)
-    negatives = HardNegatives(queries, cfg.train, model, inputs, store, folder)
+    negatives = HardNegatives(queries, cfg.train, model, inputs, RankingLoss, store, folder)
     return RetrieverTrainer(
         model=model,
         args=settings(cfg, folder),

@@ -42,10 +42,11 @@ from conf.compose import compose
 from conf.errors import UserError
 from conf.schema import SftCommand, StudentConfig
 from data.records import LETTERS
-from train import backbone, loop, memory, room, towers
+from train import backbone, memory, room, towers
 from train.attention import choose_attention, flash_attention
 from train.collate import Collator
 from train.conversation import Clip, Sample, answer_line, conversation, instruction
+from train.packing import PackingCollator, rope_of
 from train.sft_trainer import token_mean
 from train.tiny import SPECIAL_TOKENS, build_processor
 
@@ -108,7 +109,8 @@ def main() -> None:
     args = parser.parse_args()
     warnings.simplefilter("ignore", FutureWarning)
     logging.disable(logging.WARNING)
-    loop.keep_to_one_gpu()
+    if torch.cuda.device_count() > 1:
+        parser.error("one card is measured: set CUDA_VISIBLE_DEVICES=0")
     room.keep_big_blocks()
     for base in args.base or ["nf4", "bf16"]:
         measure(args.student, base, args.steps)
@@ -134,13 +136,14 @@ def measure(name: str, base: str, steps: int) -> None:
         hours.add("sft_gpu", name, base, settings.train.batch / chosen, device_name())
     found.append(("ours", chosen))
     fastest = {
-        trainer: min(seconds for by, seconds in found if by == trainer and seconds is not None)
-        for trainer in {by for by, _ in found}
+        trainer: min((s for by, s in found if by == trainer and s is not None), default=None)
+        for trainer in ("ours", "trl")
     }
-    if "trl" in fastest:
-        print(f"at its best {fastest['trl'] / fastest['ours']:.2f} times TRL's best")
+    if None in fastest.values():
+        lacking = [trainer for trainer, seconds in fastest.items() if seconds is None]
+        print(f"no line of {' or '.join(lacking)} was run, so there is no ratio")
     else:
-        print("TRL is not installed, so ours stands alone")
+        print(f"at its best {fastest['trl'] / fastest['ours']:.2f} times TRL's best")
 
 
 @dataclass
@@ -159,18 +162,20 @@ class Bench:
     def chosen(self, shown: list[Sample]) -> Variant:
         """What the trainer takes where the settings leave both to it."""
         self.renew()
-        collator = Collator(self.work.processor, self.work.max_length)
+        work = self.work
+        collator = Collator(work.processor, work.max_length)
         lengths = [collator([sample])["input_ids"].shape[1] for sample in shown]
-        auto = replace(self.work.train, micro_batch="auto", gradient_checkpointing="auto")
+        rope = rope_of(work.model, work.train.packing)
+        packs = PackingCollator(work.processor, work.max_length, rope) if rope else collator
+        auto = replace(work.train, micro_batch="auto", gradient_checkpointing="auto")
         started = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder:
-            found = memory.settle(auto, Path(folder), self.work.model, collator, shown, lengths)
+            found = memory.settle(auto, Path(folder), work.model, packs, shown, lengths)
         told = "recomputed" if found.gradient_checkpointing else "kept"
         return Variant(
             f"ours, auto: {found.micro_batch}, {told}, in {time.perf_counter() - started:.0f} s",
             micro_batch=found.micro_batch,
             recompute=found.gradient_checkpointing,
-            packing="false",
         )
 
     def line(self, variant: Variant, steps: int) -> float | None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import subprocess
 import time
 from itertools import takewhile
 from pathlib import Path
+
+log = logging.getLogger(__name__)
 
 LOOK_EVERY = 0.05
 """Seconds between two looks at whether a child has ended."""
@@ -31,6 +34,18 @@ def visible_gpus() -> list[str]:
         return []
     count = sum(line.startswith("GPU ") for line in listed.stdout.splitlines())
     return [str(number) for number in range(count)]
+
+
+def keep_to_one_gpu() -> None:
+    """See the first GPU alone where no launcher has started several ranks: a trainer would spread
+    each micro-batch over all of them, and train on more samples a step than the settings say.
+
+    Takes effect only before anything looks for GPUs, as bitsandbytes does when it is imported.
+    """
+    gpus = visible_gpus()
+    if len(gpus) > 1 and "LOCAL_RANK" not in os.environ:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[0]
+        log.info("training on GPU %s of %d; several take accelerate launch", gpus[0], len(gpus))
 
 
 def start(command: list[str], output: Path, gpu: str | None = None) -> subprocess.Popen:

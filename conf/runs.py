@@ -63,6 +63,11 @@ def ranks() -> int:
     return int(os.environ["WORLD_SIZE"]) if "LOCAL_RANK" in os.environ else 1
 
 
+def ranks_here() -> int:
+    """How many of the ranks share this machine."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", 1)) if "LOCAL_RANK" in os.environ else 1
+
+
 def run_name(run: str | None, overrides: Sequence[str]) -> str:
     """The given name, or one made of the overrides in the order they were typed."""
     if run is not None:

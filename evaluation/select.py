@@ -21,16 +21,13 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.select", SelectCommand)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
-    from train.trained import measured
+    from train.trained import check_modes, measured
 
     folder, trained = measured(cfg, SftCommand, "student")
     student, regime = trained.student, trained.train.regime
     modes = cfg.modes or default_modes(cfg, regime)
-    if folder is not None and regime == "answer_only" and "reasoning" in modes:
-        raise UserError(
-            f"model={folder} was trained in answer mode alone (train.regime=answer_only): give "
-            "modes=[answer]"
-        )
+    if folder is not None:
+        check_modes(folder, regime, modes)
 
     from data.build import ensure_benchmark
 
@@ -65,8 +62,10 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 
 def default_modes(cfg: SelectCommand, regime: str) -> list[str]:
     """The modes that a student was trained in; of a base, the record."""
+    from train.trained import modes_of
+
     if cfg.model is not None:
-        return ["answer"] if regime == "answer_only" else ["reasoning", "answer"]
+        return modes_of(regime) or ["answer"]
     return ["record"] if cfg.server.url is None else ["record", "constrained"]
 
 

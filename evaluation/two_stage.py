@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.two_stage", TwoStageCommand)
 def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
-    from train.trained import measured
+    from train.trained import measured, modes_of
 
     folder, trained = measured(cfg, SftCommand, "student")
     matched_by, frozen = measured(cfg.matcher, ContrastiveCommand, "retriever", "matcher.model")
@@ -29,11 +29,13 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
             "alone, and cannot match a text: give another matcher"
         )
     routes = cfg.routes or default_routes(cfg)
-    if folder is not None and trained.train.regime == "answer_only" and "cot_text" in routes:
-        raise UserError(
-            f"model={folder} was trained in answer mode alone (train.regime=answer_only) and "
-            "writes no rationale: leave cot_text out of routes"
-        )
+    if folder is not None and "cot_text" in routes:
+        regime = trained.train.regime
+        if "reasoning" not in modes_of(regime):
+            raise UserError(
+                f"model={folder} writes no rationale (train.regime={regime}): leave cot_text out "
+                "of routes"
+            )
 
     from data.build import ensure_benchmark
 

@@ -34,6 +34,8 @@ else:
     import torch
     print(json.dumps([version, torch.cuda.device_count()]))
 """
+LORA_RANKS = (1, 8, 16, 32, 64, 128, 256, 320, 512)
+"""The highest ranks of adapters that vLLM can be told to make room for."""
 STRICT_JSON = '{"backend": "xgrammar", "disable_any_whitespace": true}'
 
 
@@ -163,7 +165,7 @@ def vllm_arguments(
         # Without the second, a model that is held to a JSON schema may write spaces without end.
         arguments += ["--trust-request-mm-kwargs", "--structured-outputs-config", STRICT_JSON]
     if cfg.adapter is not None:
-        rank = adapter_rank(cfg.adapter)
+        rank = next((r for r in LORA_RANKS if r >= adapter_rank(cfg.adapter)), LORA_RANKS[-1])
         arguments += ["--enable-lora", "--max-lora-rank", str(rank)]
         arguments += ["--lora-modules", f"adapter={Path(cfg.adapter).absolute()}"]
     if not machine.cards:

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from safetensors import safe_open
 
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 BASE = "base.json"
 PEFT = "base_model.model."
 """What peft puts before the names of the modules that it adapts."""
-MEBIBYTE = 1 << 20
+BLOCK = 1 << 12
+"""Bytes that a hash takes of a tensor."""
 PROCESSOR = (
     "*processor_config.json",
     "*token*.json",
@@ -33,6 +35,8 @@ PROCESSOR = (
     "vocab.*",
 )
 """Files, beside the weights, that say how text and pixels become a model's input."""
+METADATA = "__metadata__"
+"""What stands among the tensors in a file's head and is none."""
 POOLING = "lasttoken"
 """How the library calls what makes a retriever's one vector."""
 
@@ -146,18 +150,35 @@ def check_widths(cfg: RetrieverConfig, entries: int) -> None:
 
 
 def weights_digest(*models: str | Path | None) -> str:
-    """A short hash of the safetensors of models in folders, by each file's name, size and last
-    mebibyte, which training changes, wherever the folder is; a hub's name stands for itself."""
+    """A short hash of the safetensors of models in folders, wherever the folder is, by each file's
+    name and size, the names and shapes of its tensors, and a block of each tensor's middle: what is
+    trained, or merged, changes all of a tensor. A hub's name stands for itself."""
     whole = hashlib.sha256()
     for k, model in enumerate(models):
         folder = model is not None and Path(model).is_dir()
         whole.update(f"{k} {'' if folder else model}".encode())
         for path in sorted(Path(model).rglob("*.safetensors")) if folder else []:
-            size = path.stat().st_size
+            whole.update(f"{path.name} {path.stat().st_size}".encode())
             with open(path, "rb") as file:
-                file.seek(max(0, size - MEBIBYTE))
-                whole.update(f"{path.name} {size}".encode() + file.read())
+                _hash_tensors(file, whole)
     return whole.hexdigest()[:16]
+
+
+def _hash_tensors(file: BinaryIO, whole: Any) -> None:
+    """Add the head of a file of safetensors to a hash, and a block of each of its tensors."""
+    size = os.fstat(file.fileno()).st_size
+    head = file.read(min(size, int.from_bytes(file.read(8), "little")))
+    whole.update(head)
+    try:
+        tensors = [told for name, told in sorted(json.loads(head).items()) if name != METADATA]
+        places = [told["data_offsets"] for told in tensors]
+    except (ValueError, TypeError, KeyError, AttributeError):
+        # What loads the file tells that it is damaged.
+        places = []
+    for first, last in places:
+        size = min(BLOCK, last - first)
+        file.seek(8 + len(head) + (first + last - size) // 2)
+        whole.update(file.read(size))
 
 
 def processor_digest(model: str | Path | None) -> str:

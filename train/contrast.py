@@ -40,7 +40,7 @@ from train.negatives import Weighing
 from train.precision import settled
 from train.ranking import HeldOutRanking, LateHeldOutRanking
 from train.ranking_loss import RankingLoss
-from train.retriever import Retriever
+from train.retriever import ADAPTERS, Retriever
 from train.samples import held_out_scenes, shuffled
 
 log = logging.getLogger(__name__)
@@ -52,7 +52,6 @@ def train_retriever(
     """Train a retriever in its run's folder and give what it measured there. `share` is a rank's
     part of a step's queries."""
     room.keep_big_blocks()
-    loop.keep_to_one_gpu()
     cfg.train.precision = settled(cfg.train.precision)
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
@@ -61,12 +60,13 @@ def train_retriever(
     if rank() == 0:
         compatible.note_base(run.folder, cfg.retriever.model)
     frames = Frames(store, cfg.retriever.image_size)
-    model = retriever.load_retriever(
-        cfg.retriever,
-        cfg.train.precision,
-        corpus=retriever.corpus(store.retrieval("train"), cfg.retriever),
-        folder=run.folder / "untrained",
-    )
+    with loop.loading(run.folder, "retriever"):
+        model = retriever.load_retriever(
+            cfg.retriever,
+            cfg.train.precision,
+            corpus=retriever.corpus(store.retrieval("train"), cfg.retriever),
+            folder=run.folder / "untrained",
+        )
     longest = retriever.longest_query(training, model.tokenizer)
     log.info(audit_retriever(model, cfg.retriever, longest, frames))
 
@@ -99,7 +99,11 @@ def train_retriever(
         ),
     )
     best = loop.train_and_log(
-        trainer, run, checkpoint, "train.mini_batch, which changes no gradient"
+        trainer,
+        run,
+        checkpoint,
+        "lower train.mini_batch, which changes no gradient, or set "
+        "train.gradient_checkpointing=true, in a run of its own (run=NAME)",
     )
     if rank() == 0:
         model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)
@@ -206,6 +210,15 @@ class NamedBatches:
 
     def get_batch_sampler(self, *_: Any, **__: Any) -> Composed:
         return self._sampler
+
+    def _load_from_checkpoint(self, checkpoint_path: str) -> None:
+        """Adapters are read into those that there are: the library would read the base again, not
+        quantised, and find that the weights do not fit."""
+        folder = Path(checkpoint_path)
+        if (folder / ADAPTERS).exists():
+            retriever.take_adapters(self.model, folder)
+        else:
+            super()._load_from_checkpoint(checkpoint_path)
 
     def collect_features(self, inputs: dict[str, list[int]]) -> tuple[list[Batch], None]:
         return [self._batch_of(inputs["places"])], None

@@ -19,6 +19,7 @@ from torch import nn
 from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
 
 from conf.errors import UserError
+from conf.runs import ranks_here
 from conf.schema import SftTrainConfig
 from train.collate import Collator
 from train.conversation import Sample
@@ -86,9 +87,9 @@ class Features:
 
     @classmethod
     def of(cls, model: nn.Module, train: SftTrainConfig) -> Features:
-        """For a student, in half of the machine's free memory."""
+        """For a student, in this rank's part of half of the machine's free memory."""
         base = model.get_base_model() if isinstance(model, peft.PeftModel) else model
-        return cls(base, train.precision, available(torch.device("cpu")) // 2)
+        return cls(base, train.precision, available(torch.device("cpu")) // 2 // ranks_here())
 
     def give(self, inputs: dict[str, Any]) -> None:
         """Put a batch's outputs, as `mm_encoder_outputs`, in the place of its pixels."""

@@ -6,8 +6,8 @@ import json
 import logging
 import math
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -26,13 +26,13 @@ from transformers.trainer_callback import TrainerState
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.processes import visible_gpus
 from conf.runs import rank
 from conf.schema import TrainConfig
 from train.backbone import unwritten
 from train.checkpoints import STATE
 from train.journal import Bar, Journal, NamedMeasure, read_journal
 from train.plots import curves_figure
+from train.ranks import sharded
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +40,8 @@ PROJECT = "dynapix"
 """Under which trackers file a run."""
 TOLD = f"{UserError.__module__}.{UserError.__qualname__}: "
 """Stands in a traceback before what a user can mend."""
+TOO_LITTLE = ("can't allocate memory", "CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED")
+"""What torch says of too little memory in errors of no kind of their own."""
 SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
 
 
@@ -102,27 +104,18 @@ def prefetched(workers: int, batches: int) -> int | None:
     return max(2, math.ceil(batches / workers)) if workers else None
 
 
-def keep_to_one_gpu() -> None:
-    """See the first GPU alone where no launcher has started several ranks: the trainer would spread
-    each micro-batch over all of them, and train on more samples a step than the settings say."""
-    gpus = visible_gpus()
-    if len(gpus) > 1 and "LOCAL_RANK" not in os.environ:
-        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[0]
-        log.info("training on GPU %s of %d; several take accelerate launch", gpus[0], len(gpus))
-
-
 def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: str) -> int | None:
     """Train from the start or a checkpoint, writing the journal and the curves. Where train.best
     names a measure, the trainer's model is the best checkpoint's in the end, whose step is given.
 
     Raises:
-        UserError: memory runs out (`lower` says by which key less of it is taken), the disk takes
+        UserError: memory runs out (`lower` says by which keys less of it is taken), the disk takes
             no checkpoint, no evaluation has the named measure, or whatever else a user can mend,
             also where a worker process found it.
     """
     watch(trainer, run)
     check_fsdp(trainer, checkpoint)
-    with explained(trainer, run.folder, lower):
+    with explained(run.folder, lambda: f"after step {trainer.state.global_step}", lower):
         fit(trainer, checkpoint)
     if rank() == 0:
         curves_figure(read_journal(run.folder), run.folder / "curves.png")
@@ -162,8 +155,9 @@ def fit(trainer: Trainer, checkpoint: Path | None) -> None:
 
 
 @contextmanager
-def explained(trainer: Trainer, folder: Path, lower: str) -> Iterator[None]:
-    """Turn what the libraries raise at a user's machine into what its user can do."""
+def explained(folder: Path, when: Callable[[], str], lower: str) -> Iterator[None]:
+    """Turn what the libraries raise at a user's machine into what its user can do: `when` tells how
+    far it came, and `lower` by which keys less memory is taken."""
     try:
         yield
     except SafetensorError as error:
@@ -176,12 +170,15 @@ def explained(trainer: Trainer, folder: Path, lower: str) -> Iterator[None]:
             raise UserError(sentence(error)) from error
         if not is_out_of_memory(error):
             raise
-        raise UserError(
-            f"out of memory after step {trainer.state.global_step}: lower {lower}, or set "
-            "train.gradient_checkpointing=true, in a run of its own (run=NAME)"
-        ) from error
+        raise UserError(f"out of memory {when()}: {lower}") from error
     except UserError as error:
         raise UserError(sentence(error)) from error
+
+
+def loading(folder: Path, group: str) -> AbstractContextManager[None]:
+    """As `explained`, where a student or retriever is loaded."""
+    less = f"set {group}.quantization=nf4, or give a smaller {group}.model"
+    return explained(folder, lambda: f"as the {group} was loaded", less)
 
 
 def sentence(error: Exception) -> str:
@@ -199,7 +196,7 @@ def check_fsdp(trainer: Trainer, checkpoint: Path | None) -> None:
     """Raises UserError where the FSDP that a launcher was told of is none that trains here, or a
     run was begun with it and goes on without, or the reverse."""
     fsdp = trainer.is_fsdp_enabled
-    if os.environ.get("ACCELERATE_USE_FSDP") == "true" and not fsdp:
+    if sharded() and not fsdp:
         raise UserError(
             "accelerate has FSDP for several GPUs only, and would train without a word about it: "
             "leave --use_fsdp away (and give --multi_gpu, on CPUs too)"
@@ -234,7 +231,9 @@ def gathered(trainer: Trainer) -> dict[str, torch.Tensor] | None:
 
 def is_out_of_memory(error: RuntimeError) -> bool:
     """Whether a card's or the machine's memory was too small."""
-    return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
+    return isinstance(error, torch.OutOfMemoryError) or any(
+        sign in str(error) for sign in TOO_LITTLE
+    )
 
 
 def is_unwritten(error: RuntimeError) -> bool:

@@ -27,6 +27,7 @@ from conf.schema import SftTrainConfig
 from train.collate import Collator
 from train.loop import is_out_of_memory
 from train.planned import ByLength, Samples
+from train.ranks import sharded
 from train.room import available, peak, start_peak
 from train.sft_trainer import token_mean
 
@@ -93,6 +94,10 @@ def decide(
     takes of a step of `batch` samples, and `named` is how its parts are called."""
     if "auto" not in (asked.micro_batch, asked.gradient_checkpointing):
         return asked
+    if sharded():
+        # What is to be sharded may not fit a rank before it is.
+        least_of = {"micro_batch": 1, "gradient_checkpointing": True}
+        return Choice(**{k: least_of[k] if v == "auto" else v for k, v in vars(asked).items()})
     state = PartialState(cpu=not torch.cuda.is_available())
     share = batch // state.num_processes
     noted = read_note(folder)
@@ -276,10 +281,13 @@ def switch(model: nn.Module, recompute: bool) -> None:
 
 
 def lower(train: SftTrainConfig) -> str:
-    """By which key a run that was out of memory takes less of it."""
+    """By which keys a run that was out of memory takes less of it."""
+    named = "student.image_size or student.frames"
     if train.micro_batch != 1:
-        return f"train.micro_batch, which is {train.micro_batch}"
-    return "student.image_size or student.frames"
+        named = f"train.micro_batch, which is {train.micro_batch}"
+    return (
+        f"lower {named}, or set train.gradient_checkpointing=true, in a run of its own (run=NAME)"
+    )
 
 
 def gib(size: int) -> str:

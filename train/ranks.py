@@ -64,9 +64,14 @@ def share(batch: int) -> int:
     return batch // ranks()
 
 
+def sharded() -> bool:
+    """Whether a launcher was told to give each rank a part of the model."""
+    return os.environ.get("ACCELERATE_USE_FSDP") == "true"
+
+
 def check_unsharded() -> None:
     """Raises UserError where a launcher was told to shard what it cannot: a retriever."""
-    if os.environ.get("ACCELERATE_USE_FSDP") == "true":
+    if sharded():
         raise UserError(
             "FSDP does not shard a retriever: sentence-transformers reads each checkpoint as a "
             "whole model; leave --use_fsdp away (and give --multi_gpu, on CPUs too)"

@@ -7,12 +7,14 @@ generation prompt at the end, and the last token's state, normalised, as the emb
 
 from __future__ import annotations
 
+import json
 import re
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import load_file
 from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
 from transformers import AutoConfig
@@ -32,7 +34,7 @@ from train.backbone import (
     nothing_adapted,
     pin_sizes,
 )
-from train.compatible import check_pooling, check_processor, check_tower
+from train.compatible import PEFT, check_pooling, check_processor, check_tower
 from train.late import keep_projection_exact, late_modules, load_late
 from train.ranks import from_main
 from train.tiny import build_model, build_processor
@@ -41,6 +43,8 @@ from train.trained import EXPORT
 Retriever = SentenceTransformer | MultiVectorEncoder
 """With one vector, or with many."""
 
+ADAPTERS = "adapter_model.safetensors"
+"""Where adapters over a frozen base are saved."""
 PROCESSING = {
     # The library's default cuts a long input, through its frames if need be; the audit refuses it.
     "text": {"truncation": False},
@@ -125,6 +129,22 @@ def add_adapters(model: Retriever, lora: LoraConfig) -> None:
     for weight in model[0].parameters():
         if weight.requires_grad:
             weight.data = weight.data.float()
+
+
+def take_adapters(model: Retriever, folder: Path) -> None:
+    """Give a retriever the adapters, and the weights of its modules after the backbone, that were
+    saved of it in a folder."""
+    import peft
+
+    named = load_file(folder / ADAPTERS)
+    adapters = {name.removeprefix(PEFT): weight for name, weight in named.items()}
+    found = peft.set_peft_model_state_dict(model[0].model, adapters)
+    if found.unexpected_keys:
+        raise ValueError(f"{folder} has adapters of other layers: {found.unexpected_keys[:2]}")
+    for part in json.loads((folder / "modules.json").read_text())[1:]:
+        weights = folder / part["path"] / "model.safetensors"
+        if weights.exists():
+            model[part["idx"]].load_state_dict(load_file(weights))
 
 
 def built(cfg: RetrieverConfig, corpus: list[str], folder: Path) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from conf.entry import Run, command
+from conf.processes import keep_to_one_gpu
 from conf.runs import finished
 from conf.schema import SftCommand
 from conf.trackers import check_trackers
@@ -26,6 +27,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         return metrics
 
     check_trackers(cfg.train.report_to)
+    keep_to_one_gpu()
 
     from train import ranks
 

@@ -9,6 +9,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+import torch
+from accelerate import PartialState
 from torch import nn
 from transformers import ProcessorMixin, TrainingArguments, set_seed
 
@@ -47,16 +49,19 @@ def train_student(
 ) -> dict[str, float]:
     """Train a student in its run's folder and give what it measured there."""
     room.keep_big_blocks()
-    loop.keep_to_one_gpu()
     cfg.train.precision = settled(cfg.train.precision)
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
     log.info("loading student %s, to compute in %s", cfg.student.name, cfg.train.precision)
     if rank() == 0:
         compatible.note_base(run.folder, cfg.student.model)
-    model, processor = backbone.load_student(
-        cfg.student, cfg.train.precision, lambda: samples.corpus(store, rationales)
-    )
+    with loop.loading(run.folder, "student"):
+        model, processor = backbone.load_student(
+            cfg.student, cfg.train.precision, lambda: samples.corpus(store, rationales)
+        )
+        if not ranks.sharded():
+            # The trainer would only now find that it does not fit.
+            model.to(PartialState(cpu=not torch.cuda.is_available()).device)
     training, validation = split(cfg, store, rationales)
     ways = ways_of(cfg, model, processor)
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -91,6 +92,28 @@ def measured(
         return None, cfg
     folder = Path(cfg.model)
     return folder, settings_of(folder, schema, product, key)
+
+
+def modes_of(regime: str) -> list[str]:
+    """The modes in which students of a regime are trained to answer."""
+    return {"describe": [], "answer_only": ["answer"]}.get(regime, ["reasoning", "answer"])
+
+
+def check_modes(folder: Path, regime: str, modes: Sequence[str]) -> None:
+    """Raises UserError where a student is asked in a mode that it was not trained in."""
+    trained = modes_of(regime)
+    if set(modes) <= set(trained):
+        return
+    if not trained:
+        raise UserError(
+            f"model={folder} was trained to describe, as a base is, and never to choose: ask it as "
+            f"a base with student.model={product_folder(folder, 'student')}"
+        )
+    raise UserError(
+        f"model={folder} was trained in {' and '.join(trained)} mode alone "
+        f"(train.regime={regime}), and is asked in {' and '.join(modes)} mode: give "
+        f"modes=[{','.join(trained)}]"
+    )
 
 
 def _finished(folder: Path, product: str) -> bool:

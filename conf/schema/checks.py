@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -12,6 +13,15 @@ def is_url(text: str) -> bool:
         return parts.scheme in ("http", "https") and parts.port != 0 and " " not in text
     except ValueError:
         return False
+
+
+def no_share(cfg: Any, above: str, names: Sequence[str]) -> list[str]:
+    """A sentence for each setting that is no share of a whole."""
+    return [
+        f"{above}{name}={getattr(cfg, name)} must be 0 or more and below 1"
+        for name in names
+        if not 0 <= getattr(cfg, name) < 1
+    ]
 
 
 def too_small(cfg: Any, above: str, least: dict[str, float]) -> list[str]:

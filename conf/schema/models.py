@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from omegaconf import MISSING
 
-from conf.schema.checks import too_small
+from conf.schema.checks import no_share, too_small
 
 
 @dataclass
@@ -155,7 +155,8 @@ class RetrieverConfig:
 
 def _backbone_problems(group: str, cfg: StudentConfig | RetrieverConfig) -> list[str]:
     problems = too_small(cfg, f"{group}.", {"image_size": 32, "frames": 2, "max_length": 1})
-    problems += too_small(cfg.lora, f"{group}.lora.", {"rank": 0, "dropout": 0})
+    problems += too_small(cfg.lora, f"{group}.lora.", {"rank": 0})
+    problems += no_share(cfg.lora, f"{group}.lora.", ["dropout"])
     if (cfg.model is None) == (cfg.architecture is None):
         problems.append(
             f"{group}.model and {group}.architecture: give exactly one, a model to load or sizes "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from conf.schema.checks import too_small
+from conf.schema.checks import no_share, too_small
 
 REGIMES = ("cot", "cot_no_candidate_analysis", "cot_no_match_layout", "answer_only", "describe")
 
@@ -51,7 +51,6 @@ class TrainConfig:
             self,
             "train.",
             {
-                "warmup": 0,
                 "weight_decay": 0,
                 "max_grad_norm": 0,
                 "evaluations": 1,
@@ -59,6 +58,7 @@ class TrainConfig:
                 "workers": 0,
             },
         )
+        problems += no_share(self, "train.", ["warmup", "adam_beta2"])
         if self.gradient_checkpointing not in (True, False, "auto"):
             problems.append(
                 f"train.gradient_checkpointing={self.gradient_checkpointing}: the options are "
@@ -66,8 +66,6 @@ class TrainConfig:
             )
         if self.lr <= 0:
             problems.append(f"train.lr={self.lr} must be above 0")
-        if not 0 <= self.adam_beta2 < 1:
-            problems.append(f"train.adam_beta2={self.adam_beta2} must be 0 or more and below 1")
         if self.schedule not in ("cosine", "linear", "constant"):
             problems.append(
                 f"train.schedule={self.schedule}: the options are cosine, linear and constant"

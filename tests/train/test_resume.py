@@ -13,7 +13,7 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import LateConfig, SftCommand
+from conf.schema import LateConfig, LoraConfig, SftCommand
 from train import contrastive, samples, sft
 from train.checkpoints import newest_checkpoint
 from train.compatible import check_base, note_base
@@ -21,10 +21,14 @@ from train.journal import read_journal
 from train.planned import ByLength, Samples
 from train.sft_trainer import Epochs
 
+DRAWING = LoraConfig(rank=4, dropout=0.1)
+"""Adapters that draw numbers in each pass, as a run that goes on must too."""
+
 
 @pytest.fixture
 def sft_settings(few_steps) -> SftCommand:
-    return few_steps(batch=4, validation_items=4, generated_items=8, permute_candidates=True)
+    settings = few_steps(batch=4, validation_items=4, generated_items=8, permute_candidates=True)
+    return replace(settings, student=replace(settings.student, lora=DRAWING))
 
 
 def train_twice(main, settings, folder: Path, step: int = 2) -> tuple[Path, Path]:
@@ -180,5 +184,23 @@ def test_a_retriever_goes_on_as_if_undisturbed(contrastive_settings, tmp_path, l
     weights = load_file(whole / "retriever" / "model.safetensors")
     assert all(torch.equal(kept[name], weight) for name, weight in weights.items())
     for name in ("model.safetensors", *(["1_Dense/model.safetensors"] if late else [])):
+        same_weights(*(f / "retriever" / name for f in (whole, killed)))
+    same_journals(whole, killed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [None, LateConfig(width=24)], ids=["one vector", "many"])
+def test_a_retriever_of_adapters_goes_on_as_if_undisturbed(
+    contrastive_settings, saved_base, tmp_path, late
+) -> None:
+    train = replace(contrastive_settings.train, best="mrr")
+    over = {"architecture": None, "model": saved_base, "quantization": "nf4", "lora": DRAWING}
+    cfg = replace(contrastive_settings.retriever, late=late, **over)
+    settings = replace(contrastive_settings, retriever=cfg, train=train)
+    whole, killed = train_twice(contrastive.main, settings, tmp_path)
+    measured = {r["step"]: r["eval_mrr"] for r in read_journal(whole) if "eval_mrr" in r}
+    best = whole / f"checkpoint-{max((2, 4), key=measured.get)}"
+    for name in ("adapter_model.safetensors", *(["1_Dense/model.safetensors"] if late else [])):
+        same_weights(best / name, whole / "retriever" / name)
         same_weights(*(f / "retriever" / name for f in (whole, killed)))
     same_journals(whole, killed)

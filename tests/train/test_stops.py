@@ -10,12 +10,13 @@ from typing import Any
 import pytest
 import torch
 
+from conf import processes
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import SftCommand
 from data.records import SelectionItem
 from data.store import Store
-from train import loop, samples, sft
+from train import samples, sft
 from train.samples import shows_only, splits
 
 
@@ -85,5 +86,5 @@ def test_a_run_keeps_to_one_gpu_unless_ranks_were_started(monkeypatch, visible, 
     monkeypatch.delenv("LOCAL_RANK", raising=False)
     if rank is not None:
         monkeypatch.setenv("LOCAL_RANK", rank)
-    loop.keep_to_one_gpu()
+    processes.keep_to_one_gpu()
     assert os.environ["CUDA_VISIBLE_DEVICES"] == kept
