@@ -222,6 +222,14 @@ def _record(
     }
 
 
+def run_id(run: Run) -> str:
+    """A name of a run that no other has, and that it keeps when it goes on: by its folder and when
+    it was first started."""
+    record = json.loads((run.folder / "run.json").read_text(encoding="utf-8"))
+    first = [*record["earlier_starts"], record["started"]][0]
+    return hashlib.sha256(f"{run.folder.resolve()} {first}".encode()).hexdigest()[:16]
+
+
 def _version(package: str) -> str | None:
     try:
         return version(package)

@@ -59,6 +59,7 @@ _ONE = re.compile(
 _STANDALONE = re.compile(
     r"(?<![\w'])(?!I\b)[A-Z](?![\w'])(?!(?<=A)\s+(?!or\b|and\b|vs\b|to\b)[a-z])"
 )
+_SMALL = re.compile(r"(?<![\w'])[b-d](?![\w'])")
 _BETWEEN = frozenset(
     ("or", "and", "vs", "to", "either", "both", "but", "maybe", "possibly", "perhaps", "option")
 )
@@ -73,6 +74,10 @@ _REFUSAL = re.compile(
     r"(?:answer|option|choice|candidate|image)",
     re.IGNORECASE,
 )
+_DENIAL = re.compile(
+    r"none of|no (?:correct|valid|suitable) (?:answer|option|choice|candidate|image)", re.IGNORECASE
+)
+"""Takes back a letter that was said before it."""
 
 
 def parse_choice(raw: str) -> str | None:
@@ -237,17 +242,20 @@ def _read(value: str, letters: str) -> Choice:
         return Choice(None, Reason.SEVERAL)
     if one:
         letter = one["letter"].upper()
+        if _DENIAL.search(one["rest"]):
+            return Choice(None, Reason.REFUSAL)
         return Choice(letter) if letter in letters else Choice(None, Reason.BAD_LETTER)
     return Choice(None, Reason.REFUSAL if _REFUSAL.search(value) else Reason.NO_ANSWER)
 
 
 def _letters_named(value: str) -> set[str]:
-    """Every letter that stands alone; lower case ones only where nothing but letters is said."""
+    """Every letter that stands alone; of lower case ones, those that may be words only where
+    nothing but letters is said."""
     words = re.findall(r"\w+", value.lower())
     letters = {w.upper() for w in words if len(w) == 1}
     if all(len(w) == 1 or w in _BETWEEN for w in words):
         return letters
-    return set(_STANDALONE.findall(value))
+    return {*_STANDALONE.findall(value), *map(str.upper, _SMALL.findall(value))}
 
 
 def _lone(text: str, letters: str) -> Choice:

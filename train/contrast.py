@@ -77,6 +77,15 @@ def train_retriever(
     cfg = replace(cfg, train=train)
     checkpoint = checkpoints.newest_checkpoint(run.folder)
     negatives = HardNegatives(training, cfg.train, model, inputs, ranking, store, run.folder)
+    order = Composed(
+        training,
+        cfg.train.hard_negatives,
+        cfg.train.batch,
+        cfg.train.batches,
+        cfg.train.scene_queries,
+        cfg.seed,
+        ranks.ranks(),
+    )
     trainer = (LateTrainer if late else RetrieverTrainer)(
         model=model,
         args=arguments(cfg, run, checkpoint, share),
@@ -86,17 +95,9 @@ def train_retriever(
         ),
         loss=loss_of(cfg, model, inputs, store),
         data_collator=ByName(preprocess_fn=model.preprocess),
-        callbacks=[negatives],
+        callbacks=[negatives, loop.Epochs(order)],
         batch_of=partial(named, cfg.train, training, negatives),
-        sampler=Composed(
-            training,
-            cfg.train.hard_negatives,
-            cfg.train.batch,
-            cfg.train.batches,
-            cfg.train.scene_queries,
-            cfg.seed,
-            ranks.ranks(),
-        ),
+        sampler=order,
     )
     best = loop.train_and_log(
         trainer,

@@ -34,7 +34,7 @@ class Inputs:
         self._model, self._frames, self._cfg = model, frames, cfg
         self._bf16 = precision == "bf16"
         self._device = model.device
-        self._shown = (cfg.image_size // TOKEN) ** 2 + STAMP
+        self._shown = round(cfg.image_size / TOKEN) ** 2 + STAMP
         model[0].register_forward_pre_hook(give_seen)
         model[0].register_forward_hook(partial(give_own, last=cfg.late is None))
 

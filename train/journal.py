@@ -12,10 +12,12 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 from conf.errors import UserError
 from conf.runs import write_text
 from conf.sweep import AT_START
+from train.plots import curves_figure
 
 JOURNAL = "metrics.jsonl"
 WRITTEN = "samples.jsonl"
 """What a student wrote at each evaluation of its run, one JSON line an answer."""
+CURVES = "curves.png"
 BEST_STEP = "best_step"
 """Name of the step whose checkpoint a run kept, among what it evaluated."""
 UNSHARED = ("_runtime", "_per_second", "total_flos", "train_loss")
@@ -35,7 +37,8 @@ SHOWN = {
 
 class Journal(TrainerCallback):
     """Appends what the trainer logs to the run's metrics.jsonl, and on resuming drops the lines
-    past the checkpoint from it and from samples.jsonl, so that both are an undisturbed run's."""
+    past the checkpoint from it and from samples.jsonl, so that both are an undisturbed run's. The
+    curves are drawn with each checkpoint."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / JOURNAL
@@ -53,6 +56,9 @@ class Journal(TrainerCallback):
             return
         with open(self._path, "a") as file:
             file.write(json.dumps({"step": state.global_step, **values}) + "\n")
+
+    def on_save(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        curves_figure(read_journal(self._path.parent), self._path.with_name(CURVES))
 
 
 class NamedMeasure(TrainerCallback):

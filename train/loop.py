@@ -20,18 +20,18 @@ from transformers import (
     PrinterCallback,
     ProgressCallback,
     Trainer,
+    TrainerCallback,
     TrainingArguments,
 )
-from transformers.trainer_callback import TrainerState
+from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.runs import rank
+from conf.runs import rank, run_id
 from conf.schema import TrainConfig
 from train.backbone import unwritten
 from train.checkpoints import STATE
-from train.journal import Bar, Journal, NamedMeasure, read_journal
-from train.plots import curves_figure
+from train.journal import Bar, Journal, NamedMeasure
 from train.ranks import sharded
 
 log = logging.getLogger(__name__)
@@ -117,8 +117,6 @@ def train_and_log(trainer: Trainer, run: Run, checkpoint: Path | None, lower: st
     check_fsdp(trainer, checkpoint)
     with explained(run.folder, lambda: f"after step {trainer.state.global_step}", lower):
         fit(trainer, checkpoint)
-    if rank() == 0:
-        curves_figure(read_journal(run.folder), run.folder / "curves.png")
     best = trainer.state.best_global_step
     if best:
         named = f"{trainer.args.metric_for_best_model} is best, {trainer.state.best_metric:.4g}"
@@ -134,9 +132,25 @@ def watch(trainer: Trainer, run: Run) -> None:
     if rank() == 0:
         trainer.add_callback(Journal(run.folder))
     trainer.add_callback(NamedMeasure())
-    # What a tracker keeps on disk belongs to the run; TensorBoard's is there by itself.
-    os.environ.setdefault("WANDB_DIR", str(run.folder))
-    os.environ.setdefault("WANDB_PROJECT", PROJECT)
+    if "wandb" in trainer.args.report_to:
+        # What it keeps on disk belongs to the run, and a run that goes on is the same run there;
+        # TensorBoard's files are there by themselves.
+        wandb = {"DIR": run.folder, "PROJECT": PROJECT, "RUN_ID": run_id(run), "RESUME": "allow"}
+        for name, value in wandb.items():
+            os.environ.setdefault(f"WANDB_{name}", str(value))
+
+
+class Epochs(TrainerCallback):
+    """Tells each of those that follow it which epoch it is: what a run that goes on within an epoch
+    skips hides the sampler from the library, which would tell it nothing."""
+
+    def __init__(self, *followers: Any) -> None:
+        self._followers = followers
+
+    def on_epoch_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        # A resumed run goes on within an epoch.
+        for follower in self._followers:
+            follower.set_epoch(int(state.epoch or 0))
 
 
 def fit(trainer: Trainer, checkpoint: Path | None) -> None:

@@ -33,12 +33,15 @@ class Planned:
 
 
 class Samples(Dataset):
-    """Planned samples as a trainer reads them, as they are in `epoch`. At ~index, below 0, is the
+    """Planned samples as a trainer reads them, as they are in an epoch. At ~index, below 0, is the
     sample of that index with nothing supervised."""
 
     def __init__(self, planned: Sequence[Planned]) -> None:
         self._planned = planned
-        self.epoch = 0
+        self._epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        self._epoch = epoch
 
     def __len__(self) -> int:
         return len(self._planned)
@@ -46,7 +49,7 @@ class Samples(Dataset):
     def __getitem__(self, index: int) -> Sample:
         if index < 0:
             return replace(self[~index], supervised=False)
-        return self._planned[index].make(self.epoch)
+        return self._planned[index].make(self._epoch)
 
     @property
     def families(self) -> list[str | None]:
@@ -56,7 +59,7 @@ class Samples(Dataset):
         """About how many tokens each sample has, without making it."""
         texts = [p.text for p in self._planned]
         ids = tokenizer(texts, add_special_tokens=False).input_ids
-        each = (image_size // TOKEN) ** 2 + STAMP
+        each = round(image_size / TOKEN) ** 2 + STAMP
         return [len(i) + p.media * each for i, p in zip(ids, self._planned, strict=True)]
 
 

@@ -13,8 +13,7 @@ from torch.distributed.fsdp import register_fsdp_forward_method
 from torch.nn import Module
 from torch.nn.functional import cross_entropy
 from torch.utils.data import DataLoader
-from transformers import EvalPrediction, Trainer, TrainerCallback
-from transformers.trainer_callback import TrainerControl, TrainerState
+from transformers import EvalPrediction, Trainer
 
 from conf.errors import UserError
 from conf.runs import rank, write_json
@@ -150,19 +149,6 @@ class StudentTrainer(Trainer):
                 "checkpoint is kept"
             )
         return found
-
-
-class Epochs(TrainerCallback):
-    """Tells the training samples and their order which epoch it is."""
-
-    def __init__(self, training: Samples, order: ByLength) -> None:
-        self._training, self._order = training, order
-
-    def on_epoch_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
-        # A resumed run goes on within an epoch.
-        epoch = int(state.epoch or 0)
-        self._training.epoch = epoch
-        self._order.set_epoch(epoch)
 
 
 class TokenChoice:

@@ -15,6 +15,7 @@ from torch import nn
 from transformers import ProcessorMixin, TrainingArguments, set_seed
 
 from conf.entry import Run
+from conf.errors import UserError
 from conf.runs import rank
 from conf.schema import SftCommand, SftTrainConfig
 from data.frames import Frames
@@ -38,7 +39,7 @@ from train.generate import HeldOutAnswers
 from train.packing import PackingCollator, rope_of
 from train.planned import ByLength, Samples
 from train.precision import settled
-from train.sft_trainer import Epochs, LetterChoice, StudentTrainer, TokenChoice, token_mean
+from train.sft_trainer import LetterChoice, StudentTrainer, TokenChoice, token_mean
 from train.sights import SightCollator, SightTrainer, seen_words
 
 log = logging.getLogger(__name__)
@@ -73,6 +74,11 @@ def train_student(
     if checkpoint is not None:
         compatible.check_adapters(checkpoint, model, cfg.student)
 
+    if train.reuse_features and ranks.sharded():
+        raise UserError(
+            "train.reuse_features=true cannot be had with FSDP, which leaves no rank a whole "
+            "vision tower: leave one of the two away"
+        )
     features = Features.of(model, train) if train.reuse_features else None
     made = Keyed if features else attrgetter("named")
     trainer = ways.trainer(
@@ -83,7 +89,7 @@ def train_student(
         train_dataset=training,
         eval_dataset=validation,
         compute_loss_func=token_mean,
-        callbacks=[Epochs(training, order)],
+        callbacks=[loop.Epochs(training, order)],
         order=order,
         choice=ways.choice,
         features=features,

@@ -14,7 +14,14 @@ from data.controls import MATCHED
 from data.store import Store, open_store
 from evaluation.page import items, plots
 from evaluation.page.rows import Measured, once
-from evaluation.page.said import Asked, Said, answers_of, check_same_items, control_of
+from evaluation.page.said import (
+    Asked,
+    Said,
+    answers_of,
+    check_same_build,
+    check_same_items,
+    control_of,
+)
 from evaluation.select import chosen_items
 
 RunAnswers = Mapping[Path, Mapping[Asked, Mapping[str, Said]]]
@@ -39,12 +46,13 @@ def browser_of(choices: Sequence[Measured], stores: Path, bound: int, seed: int)
     """Of each benchmark with answers at most `bound` items, chosen by `seed`.
 
     Raises:
-        UserError: two runs measured different items of one benchmark.
+        UserError: two runs measured different items, or builds, of one benchmark.
     """
     said = {m.run.folder: answers_of(m.run) for m in choices if m.run.kind == "select"}
     opened = {name: _open(stores / name) for name in dict.fromkeys(map(_store_name, choices))}
     ids = [_item_ids(m, said, opened[_store_name(m)]) for m in choices]
     check_same_items(choices, ids)
+    check_same_build([m.run for m in once(choices) if m.run.kind == "select"])
     browser = Browser()
     for name, store in opened.items():
         answered = [m for m in once(choices) if _store_name(m) == name and _answers(m, said)]

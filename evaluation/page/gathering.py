@@ -79,20 +79,24 @@ def _named(root: Path, pattern: str, finished: Sequence[Path]) -> list[Path]:
 
 def _read(root: Path, folder: Path) -> Finished:
     kind, *name = folder.relative_to(root).parts
-    config = folder / "config.yaml"
+    if not (folder / "config.yaml").exists():
+        raise UserError(
+            f"{folder / 'config.yaml'} is missing, so nobody knows what {folder} measured: delete "
+            "that folder and measure again, or leave it out with runs=[...]"
+        )
+    settings = _settings(folder / "config.yaml", f"delete {folder} and measure again")
+    report = {} if kind in TRAININGS else _report(folder)
+    return Finished(folder, kind, "/".join(name), settings, report)
+
+
+def _settings(config: Path, mend: str) -> dict[str, Any]:
     try:
         settings = OmegaConf.to_container(OmegaConf.load(config))
         if not isinstance(settings, dict):
             raise YAMLError("it holds no settings")
-    except FileNotFoundError as error:
-        raise UserError(
-            f"{config} is missing, so nobody knows what {folder} measured: delete that folder and "
-            "measure again, or leave it out with runs=[...]"
-        ) from error
     except (YAMLError, OmegaConfBaseException) as error:
-        raise UserError(f"{config} is damaged: delete {folder} and measure again") from error
-    report = {} if kind in TRAININGS else _report(folder)
-    return Finished(folder, kind, "/".join(name), settings, report)
+        raise UserError(f"{config} is damaged: {mend}") from error
+    return settings
 
 
 def _report(folder: Path) -> dict[str, Any]:
@@ -126,13 +130,17 @@ def json_lines(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def training_of(run: Finished, root: Path) -> dict[str, Any] | None:
-    """The settings that the model of an evaluation was trained by; None where it is as it was
-    released, and empty where its folder is gone."""
-    model = run.config.get("model")
+    """The settings that the model of an evaluation was trained by, or else its matcher; None where
+    both are as they were released, and empty where the folder is gone.
+
+    Raises:
+        UserError: they cannot be read.
+    """
+    model = run.config.get("model") or (run.config.get("matcher") or {}).get("model")
     if model is None:
         return None
     # Where the runs were moved, or are reported from another folder, it is below `root`.
     for folder in (Path(model), root / Path(*Path(model).parts[1:])):
         if (folder / "config.yaml").is_file():
-            return OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+            return _settings(folder / "config.yaml", "train again")
     return {}

@@ -50,6 +50,26 @@ def answers_of(run: Finished) -> dict[Asked, dict[str, Said]]:
     return {(mode, controls.get(key, plain)): said for (mode, key), said in by_key.items()}
 
 
+def check_same_build(runs: Sequence[Finished]) -> None:
+    """A benchmark that was built anew under its name may have other items by the same ids.
+
+    Raises:
+        UserError: two runs answered different builds of a benchmark.
+    """
+    first: dict[str, tuple[str, Finished]] = {}
+    for run in runs:
+        told = [row["asked"] for row in json_lines(run.folder / "answers.jsonl") if "asked" in row]
+        if not told:
+            continue
+        name, build = run.config["benchmark"]["name"], told[-1].get("benchmark")
+        known, other = first.setdefault(name, (build, run))
+        if known != build:
+            raise UserError(
+                f"{other.folder} and {run.folder} answered different builds of benchmark {name}: "
+                "measure one of them again (run=NAME), or leave it out with runs=[...]"
+            )
+
+
 def check_same_items(rows: Sequence[Measured], ids: Sequence[Mapping[str, object] | None]) -> None:
     """Rows of one benchmark stand in one table, so they must be of the same items.
 

@@ -3,6 +3,7 @@ finished runs."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -69,7 +70,7 @@ def sections_of(
         rankings_in_detail(every, folder),
         training([run for run in runs if run.kind in TRAININGS], folder),
     ]
-    return [section for section in found if section.tables or section.details]
+    return [s for s in found if s.tables or s.figures or s.details]
 
 
 def zero_shot(choices: Sequence[Measured], ranks: Sequence[Measured], folder: Path) -> Section:
@@ -137,7 +138,7 @@ def controls(choices: Sequence[Measured], runs: Sequence[Finished]) -> Section:
         UserError: what a run reports is of another version.
     """
     section = Section("Controls")
-    apart: dict[tuple[str, str, str], list[Paired]] = {}
+    apart: dict[tuple[Path, str, str, str], list[Paired]] = {}
     for run in runs:
         for told in run.report.get("controls", []):
             try:
@@ -145,9 +146,16 @@ def controls(choices: Sequence[Measured], runs: Sequence[Finished]) -> Section:
                 ways = [told["mode"]] if run.kind == "similarity" else [_model(run), told["mode"]]
             except (KeyError, TypeError) as error:
                 raise unreadable(run.folder) from error
-            apart.setdefault((", ".join(ways), pair.left, pair.right), []).append(pair)
+            way = ", ".join([run.report["rows"][0]["benchmark"].partition(",")[0], *ways])
+            apart.setdefault((run.folder, way, pair.left, pair.right), []).append(pair)
     if apart:
-        table = tables.paired_table([(way, of) for (way, _, _), of in apart.items()])
+        ways = Counter(key[1:] for key in apart)
+        table = tables.paired_table(
+            [
+                (way if ways[way, left, right] == 1 else f"{way}, {folder.name}", of)
+                for (folder, way, left, right), of in apart.items()
+            ]
+        )
         caption = "Controls: paired differences of accuracy (%)"
         section.tables.append(replace(table, name="controls", caption=caption))
     for benchmark, rows in by_benchmark(choices).items():

@@ -38,12 +38,16 @@ HEADERS = {
 }
 
 
+PORTS = {"http": 80, "https": 443}
+"""Which browsers leave away."""
+
+
 class Guard:
     """Wraps an application; `public` is its address behind a proxy, if it is behind one."""
 
     def __init__(self, app: ASGIApp, public: str | None) -> None:
         self._app = app
-        self._public = urlsplit(public).netloc if public else None
+        self._public = _site(public) if public else None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def guarded(message: Message) -> None:
@@ -66,4 +70,15 @@ class Guard:
         origin = headers.get("origin")
         if origin is None:
             return headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none")
-        return urlsplit(origin).netloc not in {headers.get("host"), self._public} - {None, ""}
+        asked = f"{urlsplit(origin).scheme}://{headers.get('host', '')}"
+        return _site(origin) not in {_site(asked), self._public} - {None}
+
+
+def _site(url: str) -> tuple[str, int | None] | None:
+    """The host and the port of an address, however they are written; None where it has none."""
+    try:
+        parts = urlsplit(url)
+        port = parts.port or PORTS.get(parts.scheme)
+    except ValueError:
+        return None
+    return (parts.hostname, port) if parts.hostname else None

@@ -6,6 +6,7 @@ server writes; an export may read beside it.
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -67,6 +68,9 @@ def create(
 ) -> sqlite3.Connection:
     """A new study, still without media. `links` holds each annotator's first link; `plan` covers
     the items of practice too."""
+    # SQLite gives the files that it keeps beside a database the mode of that.
+    os.close(os.open(path, os.O_CREAT | os.O_WRONLY, 0o600))
+    path.chmod(0o600)
     db = _connect(path)
     db.execute("PRAGMA journal_mode = WAL")
     with transaction(db):
@@ -81,7 +85,6 @@ def create(
         db.executemany("INSERT INTO plan VALUES (?, ?, ?, ?)", planned)
         db.execute(f"PRAGMA application_id = {APPLICATION}")
         db.execute(f"PRAGMA user_version = {VERSION}")
-    path.chmod(0o600)
     return db
 
 

@@ -83,7 +83,9 @@ CASES = [
     ('{"forced_choice": nul', None, CUT),
     ('{"rationales": {"choice": "C"', None, CUT),
     (PROSE + "Answer:", None, CUT),
+    ("Answer: B? No, none of these are right.", None, Reason.REFUSAL),
     # several
+    ("Answer: b, possibly also c", None, Reason.SEVERAL),
     ("B or C", None, SEV),
     ("a, b", None, SEV),
     ("Answer: A and D", None, SEV),

@@ -73,8 +73,8 @@ def planned(settings: SftCommand, folder: Path, **changes: Any) -> dict[str, Any
         *(f"student.{key}={getattr(student, key)}" for key in ("image_size", "max_length")),
         f"student.max_new_tokens={student.max_new_tokens}",
         f"student.lora.rank={student.lora.rank}",
-        *(f"train.{key}={value}" for key, value in asdict(train).items()
-          if key not in ("report_to", "best")),
+        *(f"train.{key}={'null' if value is None else value}"
+          for key, value in asdict(train).items() if key != "report_to"),
     ]  # fmt: skip
     return {"trainer": "sft", **UNLESS, "overrides": overrides, "folder": folder, **changes}
 
@@ -91,7 +91,7 @@ def ranking(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]:
           for key, value in asdict(retriever.architecture).items()),
         f"retriever.image_size={retriever.image_size}", f"retriever.widths={retriever.widths}",
         *(f"train.{key}={'null' if value is None else value}"
-          for key, value in asdict(settings.train).items() if key not in ("report_to", "best")),
+          for key, value in asdict(settings.train).items() if key != "report_to"),
     ]  # fmt: skip
     return {"trainer": "contrastive", **UNLESS, "overrides": overrides, "folder": folder}
 
@@ -140,11 +140,16 @@ def said(ended: subprocess.CompletedProcess[str]) -> list[str]:
 @pytest.mark.slow
 def test_two_ranks_are_one(settings, contrastive_settings, few, tmp_path) -> None:
     """A student's are one with twice the accumulation, a retriever's one with the whole batch; so
-    are a student's where FSDP gives each a part of the adapters, after a kill, and where one rank
+    are a student's where FSDP gives each a part of the weights, after a kill, and where one rank
     began and two go on, or the reverse. What goes wrong on one rank ends both with one sentence.
     """
     runs = tmp_path / "sft"
     one = alone(settings, runs / "one")
+    # Unlike 4-bit weights, those of such a base are parted too.
+    unquantised = replace(settings.student, quantization="none")
+    best = replace(settings.train, best="eval_answer_loss")
+    plain = replace(settings, student=unquantised, train=best)
+    alone(plain, runs / "plain")
     # Near frames are told by names of both ranks.
     train = replace(contrastive_settings.train, mask_near=20.0, batches="scenes")
     near_masked = replace(contrastive_settings, train=train)
@@ -161,6 +166,7 @@ def test_two_ranks_are_one(settings, contrastive_settings, few, tmp_path) -> Non
         planned(settings, runs / "on", fsdp=True, after=runs / "parts" / "checkpoint-2"),
         planned(settings, runs / "done", fsdp=True, after=runs / "parts" / "checkpoint-4"),
         *(ranking(cfg, tmp_path / "contrastive" / f"{name}-two") for name, cfg in wholes.items()),
+        planned(plain, runs / "plain-parts", fsdp=True),
         planned(settings, runs / "lost", fails_on=1),
     ]
     file = tmp_path / "runs.json"
@@ -171,6 +177,7 @@ def test_two_ranks_are_one(settings, contrastive_settings, few, tmp_path) -> Non
     assert ended.returncode == 1
     for name in ("two", "parts"):
         same(one, runs / name)
+    same(runs / "plain", runs / "plain-parts")
     for name in wholes:
         whole = tmp_path / "contrastive" / name
         same_journals(whole, whole.with_name(f"{name}-two"))

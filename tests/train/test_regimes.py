@@ -114,7 +114,7 @@ def test_an_epoch_reaches_the_samples(micro_store, frames, student_cfg) -> None:
     samples = Samples([s.planned(frames, student_cfg) for s in asked])
     shown = []
     for epoch in range(4):
-        samples.epoch = epoch
+        samples.set_epoch(epoch)
         shown.append([samples[k].response for k in range(len(samples))])
         assert shown[-1] == [told(s.in_epoch(epoch)) for s in asked]
     assert shown[0] != shown[1]

@@ -18,8 +18,8 @@ from train import contrastive, samples, sft
 from train.checkpoints import newest_checkpoint
 from train.compatible import check_base, note_base
 from train.journal import read_journal
-from train.planned import ByLength, Samples
-from train.sft_trainer import Epochs
+from train.loop import Epochs
+from train.planned import ByLength, Planned, Samples
 
 DRAWING = LoraConfig(rank=4, dropout=0.1)
 """Adapters that draw numbers in each pass, as a run that goes on must too."""
@@ -101,11 +101,14 @@ def test_a_student_goes_on_within_a_later_epoch(
 
 def test_each_epoch_reaches_the_samples_and_their_order() -> None:
     """As the trainer tells it: at an epoch's start, and within one that is gone on with."""
-    training, order = Samples([]), ByLength(range(100), 4, seed=0)
+    shown: list[int] = []
+    training = Samples([Planned("", 0, shown.append)])
+    order = ByLength(range(100), 4, seed=0)
     orders = []
     for told, epoch in ((None, 0), (1.0, 1), (1.4, 1), (2.0, 2)):
         Epochs(training, order).on_epoch_begin(None, TrainerState(epoch=told), TrainerControl())
-        assert training.epoch == epoch
+        training[0]
+        assert shown[-1] == epoch
         orders.append(list(order))
     assert orders[1] == orders[2]
     assert orders[0] != orders[1] != orders[3]

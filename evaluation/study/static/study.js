@@ -96,7 +96,8 @@ function pressed(event) {
     choice.focus();
     choice.click();
   } else if (key === "ENTER" && form && !event.target.closest("button, a, input")) {
-    form.requestSubmit(form.querySelector("button"));
+    const button = form.querySelector("button");
+    if (!button.disabled) form.requestSubmit(button);
   }
 }
 

@@ -16,13 +16,14 @@ from urllib.parse import urlencode
 import numpy as np
 import pytest
 from PIL import Image
+from starlette.responses import PlainTextResponse
 
 from conf.entry import Run
 from conf.schema import ExportStudyCommand
 from data.frames import Frames
 from data.records import LETTERS
 from evaluation.study import export, storage
-from evaluation.study.guards import HEADERS
+from evaluation.study.guards import HEADERS, Guard
 from evaluation.study.votes import Vote, votes_of
 from tests.evaluation.study.conftest import ITEMS, SMALL
 from tests.evaluation.study.running import Annotator, Visitor, both
@@ -269,6 +270,26 @@ def test_another_sites_forms_are_refused(visitor) -> None:
             assert visitor.ask("POST", path, both(page), **headers).status == 403
     own = {"Origin": f"http://127.0.0.1:{visitor.port}"}
     assert visitor.ask("POST", "/loaded", both(page), **own).status == 204
+
+
+@pytest.mark.parametrize(
+    ("origin", "status"),
+    [("https://study.example.org", 200), ("https://study.example.org:443", 200),
+     ("http://study.example.org", 403), ("https://study.example.org:8443", 403),
+     ("https://study.example.org.evil.example", 403), ("https://:443", 403),
+     ("https://study.example.org:x", 403), ("http://INSIDE:8000", 200)],
+)  # fmt: skip
+def test_forms_come_back_to_the_public_address_however_it_is_written(origin, status) -> None:
+    told = []
+
+    async def send(message: dict) -> None:
+        told.append(message)
+
+    headers = [(b"host", b"inside:8000"), (b"origin", origin.encode())]
+    asked = {"type": "http", "method": "POST", "path": "/", "headers": headers}
+    guard = Guard(PlainTextResponse("taken"), "https://Study.Example.org:443/")
+    asyncio.run(guard(asked, None, send))
+    assert told[0]["status"] == status
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
+import stat
 import subprocess
 from pathlib import Path
 
@@ -54,6 +56,19 @@ def test_a_damaged_study_is_refused(path, content) -> None:
     assert storage.begun(path)
     with pytest.raises(UserError, match="damaged"):
         storage.open_study(path)
+
+
+def test_nobody_else_reads_a_study_that_is_being_made(tmp_path) -> None:
+    """SQLite keeps what was written last in files of their own."""
+    before = os.umask(0)
+    try:
+        db = storage.create(tmp_path / storage.DATABASE, {}, [], [], {"A1": "link"}, [])
+    finally:
+        os.umask(before)
+    made = list(tmp_path.iterdir())
+    assert len(made) == 3
+    assert {stat.S_IMODE(file.stat().st_mode) for file in made} == {0o600}
+    db.close()
 
 
 def test_a_study_whose_creation_was_killed_begins_anew(tmp_path) -> None:
