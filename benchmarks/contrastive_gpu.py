@@ -33,7 +33,10 @@ from benchmarks.sft_runs import SEED, device_name
 from conf.compose import compose
 from conf.schema import ArchitectureConfig, ContrastiveCommand
 from data.records import FrameRef, RetrievalQuery
-from train import retriever, room, towers
+from train import mini_batches, retriever, room, towers
+from train.attention import choose_attention
+from train.inputs import Inputs
+from train.ranking_loss import RankingLoss
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "plain sentence-transformers": {"plain": True},
@@ -73,8 +76,16 @@ def main() -> None:
 def measure(name: str, base: str, batch: int, steps: int) -> None:
     cfg = settings(name, base, batch)
     queries = asked(batch * (steps + 1))
+    noise = Noise(cfg.retriever.image_size)
     with tempfile.TemporaryDirectory() as folder:
         model = built(name, cfg, queries, Path(folder))
+        # As the trainer settles it, for all lines alike.
+        inputs = Inputs(model, noise, cfg.retriever, cfg.train.precision)
+        cfg.train = mini_batches.settle(
+            cfg.train, Path(folder), model, inputs, RankingLoss, queries
+        )
+    recomputed = "recomputed" if cfg.train.gradient_checkpointing else "kept"
+    print(f"activations {recomputed}, mini-batches of {cfg.train.mini_batch}")
     print(f"{name} over {base} on {device_name()}, batches of {batch} queries")
     print(towers.tower_table(towers.count_towers(model)))
     print(f"{'':<40}{'queries/s':>11}{'peak GiB':>10}{'loss':>10}", flush=True)
@@ -85,11 +96,14 @@ def measure(name: str, base: str, batch: int, steps: int) -> None:
         for parameter_name, parameter in model.named_parameters():
             if parameter_name in kept:
                 parameter.data = kept[parameter_name].clone()
+        # What shares prefixes needs masks, which the library alone does not.
+        shares = "plain" not in switches
+        choose_attention(model[0].model, "bf16", cfg.retriever.max_length, masks=shares)
         gc.collect()
         try:
             with tempfile.TemporaryDirectory() as folder:
                 figures = trained(
-                    variant, model, queries, Noise(cfg.retriever.image_size), None, steps + 1,
+                    variant, model, queries, noise, None, steps + 1,
                     "plain" in switches, Path(folder),
                 )  # fmt: skip
         except torch.OutOfMemoryError:

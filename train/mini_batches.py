@@ -38,11 +38,18 @@ def settle(
     def trial(share: int) -> MiniBatches:
         return MiniBatches(model, inputs, ranking, queries, train, share)
 
-    asked = memory.Choice(train.mini_batch, train.gradient_checkpointing)
+    size = train.mini_batch
+    if train.mini_batch_tokens is not None:
+        # As many of the longest as fill a mini-batch that is counted in tokens.
+        names = batch_of(
+            queries, train.hard_negatives, train.distinct_frames, train.shared_prefixes
+        )
+        size = max(1, train.mini_batch_tokens // max(inputs.prefix_lengths(names)))
+    asked = memory.Choice(size, train.gradient_checkpointing)
     found = memory.decide(asked, train.batch, folder, model[0].model, trial, "mini-batch")
     return replace(
         train,
-        mini_batch=found.micro_batch,
+        mini_batch=train.mini_batch if train.mini_batch_tokens is not None else found.micro_batch,
         gradient_checkpointing=found.gradient_checkpointing,
     )
 

@@ -17,6 +17,7 @@ from tqdm import tqdm
 from transformers import TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
 
+from conf.errors import UserError
 from conf.runs import rank, write_text
 from conf.schema import ContrastiveTrainConfig
 from data.geometry import displacements
@@ -148,5 +149,15 @@ def write(mined: Mined, path: Path) -> None:
 
 
 def read(path: Path) -> Mined:
-    rows = json.loads(path.read_text())
-    return {name: [FrameRef(**frame) for frame in frames] for name, frames in rows.items()}
+    """
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    try:
+        rows = json.loads(path.read_text())
+        return {name: [FrameRef(**frame) for frame in frames] for name, frames in rows.items()}
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} is missing or damaged, which holds the hard negatives that the run goes on "
+            "with: put it back, or delete the run's folder and train again"
+        ) from error

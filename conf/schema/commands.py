@@ -226,10 +226,12 @@ class ContrastiveCommand(CommandConfig):
                 "retriever=qwen3_vl_emb_8b or another one of Qwen3-VL's kind"
             )
         weights, widths = self.train.width_weights, self.retriever.widths
-        if weights is not None and (len(weights) != len(widths) or min(weights, default=0) < 0):
+        if weights is not None and (
+            len(weights) != len(widths) or min(weights) < 0 or max(weights) == 0
+        ):
             problems.append(
                 f"train.width_weights={weights} must give each of the {len(widths)} "
-                f"retriever.widths={list(widths)} a weight of 0 or more"
+                f"retriever.widths={list(widths)} a weight of 0 or more, one of them above 0"
             )
         if weights is not None and self.retriever.late is not None:
             problems.append(

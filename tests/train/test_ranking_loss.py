@@ -31,10 +31,11 @@ WEIGHTS = [1.0, 0.5]
 
 @pytest.fixture(scope="module", params=["whole", "adapters"])
 def trained(request, micro_store, retriever_cfg, saved_base, tmp_path_factory):
-    """A retriever trained whole, and one with adapters that already do something."""
+    """A retriever trained whole, and one with adapters over 4 bits that already do something."""
     cfg: RetrieverConfig = retriever_cfg
     if request.param == "adapters":
-        cfg = replace(cfg, architecture=None, model=saved_base, lora=LoraConfig(rank=4))
+        over = {"architecture": None, "model": saved_base, "quantization": "nf4"}
+        cfg = replace(cfg, **over, lora=LoraConfig(rank=4))
     texts = corpus(micro_store.retrieval("train"), cfg)
     torch.manual_seed(0)
     model = load_retriever(cfg, "fp32", texts, tmp_path_factory.mktemp("base"))
