@@ -115,15 +115,14 @@ def test_each_epoch_reaches_the_samples_and_their_order() -> None:
 
 
 @pytest.mark.slow
-def test_a_token_weighs_the_same_however_a_batch_is_split(sft_settings, tmp_path) -> None:
+def test_a_token_weighs_the_same_however_a_batch_is_split(few_steps, tmp_path) -> None:
     """The first step's loss and gradient of four unequal samples, at once and one by one."""
     first = []
     for micro_batch in (4, 1):
-        train = replace(sft_settings.train, max_steps=1, validation_items=1)
-        train.micro_batch = micro_batch
+        settings = few_steps(batch=4, max_steps=1, validation_items=1, micro_batch=micro_batch)
         run = Run(f"by {micro_batch}", tmp_path / str(micro_batch))
         run.folder.mkdir()
-        sft.main.__wrapped__(replace(sft_settings, train=train), run)
+        sft.main.__wrapped__(settings, run)
         first.append(next(r for r in read_journal(run.folder) if "grad_norm" in r))
     assert first[0]["loss"] == pytest.approx(first[1]["loss"], rel=1e-4)
     assert first[0]["grad_norm"] == pytest.approx(first[1]["grad_norm"], rel=1e-3)
