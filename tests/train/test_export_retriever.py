@@ -188,13 +188,15 @@ def test_a_card_says_what_the_run_says(settings, forms) -> None:
 
 
 def test_differences_are_shares_and_a_nan_is_not_small() -> None:
-    before = Outputs(torch.tensor([[3.0, 0.0], [0.0, 4.0]]), torch.tensor([[1.0, 0.0], [0.6, 0.8]]))
-    after = Outputs(before.queries + torch.tensor([[0.0, 1.0], [0.0, 0.0]]), before.scores.flip(1))
+    queries, scores = [[3.0, 0.0], [0.0, 4.0]], [[1.0, 0.0], [0.6, 0.8]]
+    before = Outputs(torch.tensor(queries), torch.tensor(scores), torch.tensor([2.0, 2.0]))
+    moved = before.queries + torch.tensor([[0.0, 1.0], [0.0, 0.0]])
+    after = replace(before, queries=moved, scores=before.scores.flip(1))
     assert compare(before, before) == {
         "query_difference": 0, "score_difference": 0, "best_frame_agreement": 1,
     }  # fmt: skip
     assert compare(before, after) == pytest.approx(
-        {"query_difference": 0.2, "score_difference": (2.08 / 2) ** 0.5, "best_frame_agreement": 0}
+        {"query_difference": 0.2, "score_difference": 0.52**0.5 / 2, "best_frame_agreement": 0}
     )
     broken = replace(before, queries=before.queries * float("nan"))
     assert np.isnan(compare(before, broken)["query_difference"])
@@ -204,7 +206,7 @@ def test_differences_are_shares_and_a_nan_is_not_small() -> None:
 def test_an_export_that_embeds_otherwise_is_not_kept(settings, runs, tmp_path, monkeypatch) -> None:
     """The adapters left out stand for anything that goes wrong in merging."""
     monkeypatch.setattr(backbone, "merged", lambda base, *_: base.dequantize(torch.float32))
-    with pytest.raises(UserError, match=r"query difference .* of their size.* nothing was export"):
+    with pytest.raises(UserError, match=r"query difference .* of its size.* nothing was export"):
         exported(settings, runs, "fp32", tmp_path)
     assert list(tmp_path.iterdir()) == []
 
