@@ -165,8 +165,9 @@ def vllm_arguments(
         # Without the second, a model that is held to a JSON schema may write spaces without end.
         arguments += ["--trust-request-mm-kwargs", "--structured-outputs-config", STRICT_JSON]
     if cfg.adapter is not None:
-        rank = next((r for r in LORA_RANKS if r >= adapter_rank(cfg.adapter)), LORA_RANKS[-1])
-        arguments += ["--enable-lora", "--max-lora-rank", str(rank)]
+        rank = adapter_rank(cfg.adapter)
+        room = next((r for r in LORA_RANKS if r >= rank), LORA_RANKS[-1])
+        arguments += ["--enable-lora", "--max-lora-rank", str(room)]
         arguments += ["--lora-modules", f"adapter={Path(cfg.adapter).absolute()}"]
     if not machine.cards:
         cache = round(cfg.cache_gb * 2**30)

@@ -171,13 +171,13 @@ def _hash_tensors(file: BinaryIO, whole: Any) -> None:
     whole.update(head)
     try:
         tensors = [told for name, told in sorted(json.loads(head).items()) if name != METADATA]
-        places = [told["data_offsets"] for told in tensors]
+        places = [(int(first), int(last)) for first, last in (t["data_offsets"] for t in tensors)]
     except (ValueError, TypeError, KeyError, AttributeError):
         # What loads the file tells that it is damaged.
         places = []
     for first, last in places:
-        size = min(BLOCK, last - first)
-        file.seek(8 + len(head) + (first + last - size) // 2)
+        size = max(0, min(BLOCK, last - first))
+        file.seek(max(0, 8 + len(head) + (first + last - size) // 2))
         whole.update(file.read(size))
 
 

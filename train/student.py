@@ -61,7 +61,7 @@ def train_student(
             cfg.student, cfg.train.precision, lambda: samples.corpus(store, rationales)
         )
         if not ranks.sharded():
-            # The trainer would only now find that it does not fit.
+            # Else the trainer would only find later that it does not fit.
             model.to(PartialState(cpu=not torch.cuda.is_available()).device)
     training, validation = split(cfg, store, rationales)
     ways = ways_of(cfg, model, processor)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import pytest
@@ -27,7 +28,15 @@ def test_weights_are_known_by_each_of_their_tensors(tmp_path, changed) -> None:
     assert weights_digest(one) != weights_digest(other)
 
 
+def headed(offsets: object) -> bytes:
+    """A file of safetensors with one tensor at such a place."""
+    head = json.dumps({"weight": {"dtype": "F32", "shape": [1], "data_offsets": offsets}}).encode()
+    return len(head).to_bytes(8, "little") + head
+
+
 def test_a_damaged_file_has_a_digest_too(tmp_path) -> None:
-    for k, content in enumerate((b"", b"\xff" * 100, b"\x02" + bytes(7) + b"[]")):
+    for k, content in enumerate(
+        (b"", b"\xff" * 100, b"\x02" + bytes(7) + b"[]", headed("x"), headed([-9, 2]))
+    ):
         (tmp_path / "model.safetensors").write_bytes(content)
         assert len(weights_digest(tmp_path)) == 16, k
