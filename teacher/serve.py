@@ -162,8 +162,10 @@ def vllm_arguments(
     # Every prompt begins with the same instructions.
     arguments += ["--enable-prefix-caching", "--disable-uvicorn-access-log"]
     if cfg.frames:
-        # Without the second, a model that is held to a JSON schema may write spaces without end.
+        # Without the second, a model that is held to a JSON schema may write spaces without end;
+        # without the third, clips are normalised as the processor has it for single images.
         arguments += ["--trust-request-mm-kwargs", "--structured-outputs-config", STRICT_JSON]
+        arguments += ["--no-mm-device-do-normalize"]
     if cfg.adapter is not None:
         rank = adapter_rank(cfg.adapter)
         room = next((r for r in LORA_RANKS if r >= rank), LORA_RANKS[-1])

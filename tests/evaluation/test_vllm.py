@@ -6,9 +6,11 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import openai
 import pytest
-from transformers import AutoProcessor
+import torch
+from transformers import AutoModelForImageTextToText, AutoProcessor
 
 from conf.entry import Run
 from conf.schema import ArchitectureConfig, LoraConfig, SelectCommand, ServerConfig, StudentConfig
@@ -19,7 +21,7 @@ from evaluation.protocol import Reason, parse, schema
 from evaluation.served import chat_of, request_of
 from tests.teacher.serving import Serving
 from train import backbone, samples
-from train.collate import encode
+from train.collate import Collator, encode
 
 pytestmark = pytest.mark.slow
 
@@ -35,24 +37,59 @@ STUDENT = StudentConfig(
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory, micro_store):
-    """A base on disk, whose processor has sizes of its own, as a released one's has."""
+    """A base on disk, whose processor has sizes of its own, as a released one's has, and sees
+    single images in other shades than clips, as the tiny base's does."""
     folder = tmp_path_factory.mktemp("base")
     model, processor = backbone.load_base(STUDENT, "fp32", lambda: samples.corpus(micro_store, []))
+    processor.image_processor.image_mean = [0.4, 0.45, 0.5]
     backbone.save(model, processor, folder, "fp32")
     return folder
 
 
 @pytest.fixture(scope="module")
-def server(base, tmp_path_factory):
-    serving = Serving(base, tmp_path_factory.mktemp("serve"), "frames=true", "dtype=float32")
+def cfg(base):
+    return replace(STUDENT, model=str(base), architecture=None)
+
+
+@pytest.fixture(scope="module")
+def adapters(cfg, tmp_path_factory):
+    """A student over that base, as a run of the trainer leaves it, that answers in its own way."""
+    folder = tmp_path_factory.mktemp("student")
+    torch.manual_seed(0)
+    trained = replace(cfg, lora=LoraConfig(rank=4))
+    model, processor = backbone.load_student(trained, "fp32", list)
+    with torch.no_grad():
+        for name, weight in model.named_parameters():
+            if "lora_B" in name:
+                weight.normal_(std=0.2)
+    backbone.save(model, processor, folder, "fp32")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def merged(cfg, adapters, tmp_path_factory):
+    """The same student merged into its base, as `train.export` writes it."""
+    folder = tmp_path_factory.mktemp("merged")
+    model, processor = backbone.load_base(cfg, "fp32", list)
+    backbone.write(backbone.merged(model, adapters, "none", "fp32"), processor, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def server(base, adapters, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("serve")
+    serving = Serving(base, folder, "frames=true", "dtype=float32", f"adapter={adapters}")
     serving.start()
     yield serving
     serving.stop()
 
 
 @pytest.fixture
-def cfg(base):
-    return replace(STUDENT, model=str(base), architecture=None)
+def server_of_merged(merged, tmp_path):
+    serving = Serving(merged, tmp_path, "frames=true", "dtype=float32")
+    serving.start()
+    yield serving
+    serving.stop()
 
 
 @pytest.mark.parametrize("control", [None, "shuffled_prefix", "candidate_only"])
@@ -87,3 +124,45 @@ def test_a_served_model_is_measured_by_records(server, cfg, micro, micro_store, 
         assert row["valid"] or (row["cut"] and found.reason is Reason.CUT_OFF)
         names = [f'"{name}"' for name in schema()["properties"] if f'"{name}"' in row["text"]]
         assert names == sorted(names, key=row["text"].index)
+
+
+def test_a_server_answers_as_the_student_whose_adapters_it_has(
+    server, cfg, base, merged, micro_store
+) -> None:
+    asked = cfg, micro_store, micro_store.selection("test")[0]
+    tokens, served = likeliest_served(server, "adapter", *asked)
+    assert served == pytest.approx(scored_here(merged, *asked)[tokens], abs=1e-3)
+    # Without them it says another thing.
+    assert served != pytest.approx(scored_here(base, *asked)[tokens], abs=0.1)
+
+
+def test_a_server_answers_as_the_student_that_was_merged(
+    server_of_merged, cfg, merged, micro_store
+) -> None:
+    asked = cfg, micro_store, micro_store.selection("test")[0]
+    tokens, served = likeliest_served(server_of_merged, "tiny", *asked)
+    assert served == pytest.approx(scored_here(merged, *asked)[tokens], abs=1e-3)
+
+
+def likeliest_served(server, model, cfg, store, item) -> tuple[list[int], list[float]]:
+    """The likeliest first tokens of an answer, and their log-probabilities."""
+    sample = shown("cot", Frames(store, cfg.image_size), cfg, None, "answer", item)
+    request = request_of(cfg, "answer", sample.clip)
+    request |= {"max_tokens": 1, "logprobs": True, "top_logprobs": 10}
+    request["extra_body"]["return_tokens_as_token_ids"] = True
+    client = openai.OpenAI(base_url=server.url, api_key="none")
+    reply = client.chat.completions.create(model=model, messages=chat_of(sample), **request)
+    likeliest = reply.choices[0].logprobs.content[0].top_logprobs
+    tokens = [int(top.token.removeprefix("token_id:")) for top in likeliest]
+    return tokens, [top.logprob for top in likeliest]
+
+
+def scored_here(folder, cfg, store, item) -> np.ndarray:
+    """The log-probability of every token there, by the standard classes."""
+    sample = shown("cot", Frames(store, cfg.image_size), cfg, None, "answer", item)
+    processor = AutoProcessor.from_pretrained(folder)
+    backbone.pin_sizes(processor, cfg.image_size, cfg.frames)
+    model = AutoModelForImageTextToText.from_pretrained(folder, dtype="auto").eval()
+    with torch.no_grad():
+        logits = model(**Collator(processor, cfg.max_length)([sample])).logits
+    return logits[0, -1].log_softmax(dim=-1).numpy()
