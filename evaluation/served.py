@@ -21,7 +21,7 @@ from evaluation.protocol import schema
 from teacher.servers.client import Client, UnansweredError
 from teacher.servers.lanes import in_lanes
 from teacher.servers.replies import CUT_OFF, Reply
-from teacher.servers.server import NO_REPLY, Chat, Request
+from teacher.servers.server import NO_REPLY, Chat, Request, api_key, locked
 from train.conversation import Clip, Sample
 from train.generate import THOUGHT, Written, new_tokens
 
@@ -152,13 +152,17 @@ def revision(server: ServerConfig) -> dict[str, Any]:
     from, and that of the `parent` that it is an adapter of.
 
     Raises:
-        UserError: none answers, or that one does not serve the model.
+        UserError: none answers, or that one does not serve the model or accept the key.
     """
     problems = []
     for url in server.urls:
         try:
-            with openai.OpenAI(base_url=url, api_key="none", max_retries=0, timeout=10) as client:
+            with openai.OpenAI(
+                base_url=url, api_key=api_key(), max_retries=0, timeout=10
+            ) as client:
                 models = {m.id: m.model_extra or {} for m in client.models.list()}
+        except openai.AuthenticationError as error:
+            raise locked(url, error) from error
         except (openai.OpenAIError, *NO_REPLY) as error:
             problems.append(f"{url}: {error.__cause__ or error}")
             continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import email.utils
+import os
 import time
 from typing import Any
 
@@ -24,6 +25,22 @@ NO_REPLY = (AttributeError, IndexError, TypeError, ValueError)
 
 BUSY = (408, 409)
 """Statuses below 500 that another try may change: a timeout on the way, a conflict."""
+KEY = "OPENAI_API_KEY"
+"""The variable that holds the key of servers that want one: no setting, for those are written
+down."""
+
+
+def api_key() -> str:
+    """The key; a server that wants none is content with any word, and the client wants one."""
+    return os.environ.get(KEY) or "none"
+
+
+def locked(url: str, error: openai.APIStatusError) -> UserError:
+    """What to tell a user whom a server does not let in."""
+    return UserError(
+        f"{url} does not accept the key that it was given ({error.message}): put that server's key "
+        f"into the environment variable {KEY}"
+    )
 
 
 class RequestError(Exception):
@@ -53,7 +70,7 @@ class Server:
         self.url = url
         self.cfg = cfg
         self.client = openai.AsyncOpenAI(
-            base_url=url, api_key="none", max_retries=0, timeout=cfg.timeout
+            base_url=url, api_key=api_key(), max_retries=0, timeout=cfg.timeout
         )
 
     async def ask(self, chat: Chat, n: int, request: Request) -> list[Reply]:
@@ -61,7 +78,7 @@ class Server:
 
         Raises:
             RequestError: there is no answer, this time.
-            UserError: the server does not know the model.
+            UserError: the server does not know the model, or the key.
         """
         cfg = self.cfg
         try:
@@ -70,6 +87,8 @@ class Server:
                 return await self._replies(chat, n, request)
         except openai.NotFoundError as error:
             raise await self._unknown_model() from error
+        except openai.AuthenticationError as error:
+            raise locked(self.url, error) from error
         except openai.RateLimitError as error:
             raise RateLimitedError("HTTP 429", _retry_after(error)) from error
         except openai.InternalServerError as error:

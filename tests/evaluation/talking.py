@@ -15,10 +15,12 @@ Said = str | int | bytes | dict[str, Any]
 
 
 class TalkingServer(LocalServer):
-    """`says` gives an answer to each request; `asked` are the requests."""
+    """`says` gives an answer to each request; `asked` are the requests. Where `key` is set, those
+    without it are turned away."""
 
     def __init__(self, says: Callable[[dict[str, Any]], Said], port: int = 0) -> None:
         self.says = says
+        self.key: str | None = None
         self.asked: list[dict[str, Any]] = []
         super().__init__(Handler, port)
 
@@ -27,11 +29,15 @@ class Handler(JsonHandler):
     server: TalkingServer
 
     def get(self) -> None:
+        if self.locked():
+            return
         model = {"id": "served", "object": "model", "root": "weights", "parent": None}
         adapter = {"id": "adapter", "object": "model", "root": "lora", "parent": "served"}
         self.say(200, {"object": "list", "data": [model, adapter]})
 
     def post(self, request: dict[str, Any]) -> None:
+        if self.locked():
+            return
         self.server.asked.append(request)
         said = self.server.says(request)
         if isinstance(said, int):
@@ -52,3 +58,10 @@ class Handler(JsonHandler):
         choice = {"index": 0, "finish_reason": finish, "message": message}
         body = {"id": "x", "object": "chat.completion", "created": 0, "model": "served"}
         self.say(200, {**body, "choices": [choice]})
+
+    def locked(self) -> bool:
+        """Whether the key is another, which is told."""
+        wanted = self.server.key
+        if wrong := wanted is not None and self.headers["Authorization"] != f"Bearer {wanted}":
+            self.say(401, {"error": {"message": "no such key"}})
+        return wrong

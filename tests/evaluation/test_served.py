@@ -211,6 +211,23 @@ def test_what_is_served_is_told_apart(talking) -> None:
         revision(at(server))
 
 
+def test_a_server_is_given_its_key(items, frames, talking, tmp_path, monkeypatch) -> None:
+    server = talking(lambda _: FULL)
+    server.key = "secret"
+    log = opened(tmp_path, items)
+    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
+    for ask in (
+        lambda: revision(at(server)),
+        lambda: ask_all(items, "record", asker(at(server), frames), log),
+    ):
+        with pytest.raises(UserError, match=f"{server.url} .*no such key.*OPENAI_API_KEY"):
+            ask()
+    monkeypatch.setenv("OPENAI_API_KEY", "secret")
+    assert revision(at(server))["root"] == "weights"
+    given = ask_all(items, "record", asker(at(server), frames), log)
+    assert [a.letter for a in given] == ["C"] * 8
+
+
 def test_a_student_is_not_measured_by_its_base(talking, tmp_path) -> None:
     server = talking(lambda _: FULL)
     cfg = SelectCommand(server=replace(at(server), model=None), student=STUDENT)
