@@ -33,7 +33,8 @@ def main(cfg: ReportCommand, run: Run) -> None:
     figures, tables = run.folder / "figures", run.folder / "tables"
     for earlier in (figures, tables):
         shutil.rmtree(earlier, ignore_errors=True)
-    sections = sections_of(once(choices), once(ranks), runs, browser.confusions, figures)
+    told = (browser.confusions, browser.apart)
+    sections = sections_of(once(choices), once(ranks), runs, *told, figures)
 
     tables.mkdir()
     for section in sections:

@@ -81,27 +81,44 @@ def paired_table(found: Sequence[tuple[str, Sequence[Paired]]]) -> Table:
     """What two ways of answering the same items are apart, by how these were asked."""
     parts = {
         f"{way}: {of[0].left} (left) less {of[0].right} (right)": [
-            [
-                p.of,
-                *map(_percent, (p.left_accuracy, p.right_accuracy)),
-                f"{100 * p.difference:+.1f}",
-                f"{100 * p.low:+.1f} to {100 * p.high:+.1f}",
-                *("-" if count is None else f"{count:,}" for count in (p.only_left, p.only_right)),
-                "-" if p.p is None else f"{p.p:.2g}",
-                f"{p.n:,}",
-            ]
-            for p in of
+            [p.of, *map(_percent, (p.left_accuracy, p.right_accuracy)), *_apart(p)] for p in of
         ]
         for way, of in found
     }
     head = ["Paired accuracy, %", "Left", "Right", "Apart", "95%", "Only left", "Only right"]
     note = (
         "Apart: left less right, its interval bootstrapped over scenes. Only left, only right: "
-        "items answered right that way alone; p is McNemar's exact test of the two, which takes "
-        "the items of a scene for independent."
+        f"items answered right that way alone; {_MCNEMAR}"
     )
     caption = "Paired differences of accuracy"
     return Table("paired", caption, [*head, "p", "Items"], parts, (note,))
+
+
+def apart_table(found: Sequence[Sequence[Paired]]) -> Table:
+    """What models are apart over all items, a line each under the model it is held against."""
+    parts: dict[str, list[list[str]]] = {}
+    for of in found:
+        over_all = of[-1]
+        parts.setdefault(f"less {over_all.right}", []).append([over_all.left, *_apart(over_all)])
+    head = ["Apart over all items, %", "Apart", "95%", "Won", "Lost", "p", "Items"]
+    note = (
+        "The interval is bootstrapped over scenes. Won, lost: items that the row's model, or the "
+        f"other one, alone has right; {_MCNEMAR}"
+    )
+    return Table("apart", "How far models are apart, item by item", head, parts, (note,))
+
+
+_MCNEMAR = "p is McNemar's exact test of the two, which takes the items of a scene for independent."
+
+
+def _apart(p: Paired) -> list[str]:
+    return [
+        f"{100 * p.difference:+.1f}",
+        f"{100 * p.low:+.1f} to {100 * p.high:+.1f}",
+        *("-" if count is None else f"{count:,}" for count in (p.only_left, p.only_right)),
+        "-" if p.p is None else f"{p.p:.2g}",
+        f"{p.n:,}",
+    ]
 
 
 def position_table(found: dict[str, Positions]) -> Table:

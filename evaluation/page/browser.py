@@ -13,6 +13,7 @@ from conf.errors import UserError
 from data.controls import MATCHED
 from data.store import Store, open_store
 from evaluation.page import items, plots
+from evaluation.page.apart import apart
 from evaluation.page.rows import Measured, once
 from evaluation.page.said import (
     Asked,
@@ -22,6 +23,7 @@ from evaluation.page.said import (
     check_same_items,
     control_of,
 )
+from evaluation.paired import Paired
 from evaluation.select import chosen_items
 
 RunAnswers = Mapping[Path, Mapping[Asked, Mapping[str, Said]]]
@@ -33,13 +35,15 @@ class Browser:
     """The items that the page shows, their frames as data addresses by name, and in sentences what
     it shows of each benchmark and what it cannot.
 
-    `confusions` are of all answered items, by benchmark and model, as `plots.confusion` counts.
+    `confusions` are of all answered items, by benchmark and model, as `plots.confusion` counts;
+    `apart` are the models of a benchmark that are held against each other.
     """
 
     entries: list[dict[str, Any]] = field(default_factory=list)
     frames: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     confusions: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    apart: dict[str, list[list[Paired]]] = field(default_factory=dict)
 
 
 def browser_of(choices: Sequence[Measured], stores: Path, bound: int, seed: int) -> Browser:
@@ -74,11 +78,16 @@ def _add(
     """Add a benchmark's items and what `answered` models said to them."""
     every = {i.item_id: i for suite in (None, MATCHED) for i in store.selection("test", suite)}
     answers: dict[str, Mapping[str, Said]] = {}
+    models: dict[str, dict[str, tuple[Measured, Mapping[str, Said]]]] = {}
     for m in answered:
         label = _label(m, answers)
         answers[label] = given = _answers(m, said)
+        models.setdefault(m.benchmark, {})[label] = (m, given)
         pairs = [(every[k].letter, s.choice.letter) for k, s in given.items() if k in every]
         browser.confusions.setdefault(m.benchmark, {})[label] = plots.confusion(pairs)
+    # A control is held against the items as they are where it is measured.
+    if plain := models.get(store.name):
+        browser.apart[store.name] = apart(plain, every, seed)
     asked = set().union(*answers.values())
     known = [item for name, item in every.items() if name in asked]
     shown = items.spread(known, answers, bound, seed)

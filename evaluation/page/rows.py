@@ -18,19 +18,42 @@ SUITES = {"movi_a": "MoVi-A", "physion": "Physion"}
 class Measured:
     """A row with what its table needs of the run that it stands in.
 
-    `regime` is how a student was trained, None for a model as it was released. `home` is the
-    benchmark that it was trained on, None where it was not or where that is not known.
+    `training` holds the settings that the model was trained by, None for one as it was released,
+    and nothing where they are not known.
     """
 
     row: SelectionRow | RetrievalRow
     run: Finished
-    trained: bool
-    regime: str | None = None
-    home: str | None = None
+    training: dict[str, Any] | None = None
 
     @property
     def benchmark(self) -> str:
         return self.row.benchmark
+
+    @property
+    def trained(self) -> bool:
+        return self.training is not None
+
+    @property
+    def regime(self) -> str | None:
+        """How a student was trained."""
+        return (self.training or {}).get("train", {}).get("regime")
+
+    @property
+    def home(self) -> str | None:
+        """The benchmark that the model was trained on, where that is known."""
+        return (self.training or {}).get("benchmark", {}).get("name")
+
+    @property
+    def seed(self) -> int | None:
+        """That of the training."""
+        return (self.training or {}).get("seed")
+
+    @property
+    def base(self) -> str | None:
+        """What a student began from, or is as it was released."""
+        settings = self.training if self.trained else self.run.config
+        return settings.get("student", {}).get("name")
 
     @property
     def label(self) -> str:
@@ -67,17 +90,10 @@ def _rows(
         rows = [kind.from_dict(row) for row in run.report["rows"]]
     except (KeyError, TypeError) as error:
         raise unreadable(run.folder) from error
-    return [_measured(run, row, training) for row in rows]
-
-
-def _measured(
-    run: Finished, row: SelectionRow | RetrievalRow, training: dict[str, Any] | None
-) -> Measured:
     # A trained retriever's report has a row of what it began from, too.
-    if training is None or row.name.startswith(UNTRAINED):
-        return Measured(row, run, trained=False)
-    regime = training.get("train", {}).get("regime")
-    return Measured(row, run, True, regime, training.get("benchmark", {}).get("name"))
+    return [
+        Measured(row, run, None if row.name.startswith(UNTRAINED) else training) for row in rows
+    ]
 
 
 def once(rows: Iterable[Measured]) -> list[Measured]:

@@ -48,6 +48,7 @@ def sections_of(
     ranks: Sequence[Measured],
     runs: Sequence[Finished],
     confusions: Mapping[str, Mapping[str, np.ndarray]],
+    apart: Mapping[str, Sequence[Sequence[Paired]]],
     folder: Path,
 ) -> list[Section]:
     """Every section that has a table, in the paper's order.
@@ -55,15 +56,16 @@ def sections_of(
     Args:
         choices, ranks: the selection and the retrieval rows of `runs`.
         confusions: by benchmark and model, as `plots.confusion` counts.
+        apart: by benchmark, what pairs of models are apart.
         folder: where figures are drawn.
     """
     plain = [m for m in choices if ", " not in m.benchmark]
     every = [m for m in ranks if m.row.builder is None]
     found = [
         zero_shot(plain, every, folder),
-        distillation(plain, every),
+        distillation(plain, every, apart),
         ablation(plain),
-        transfer(plain),
+        transfer(plain, apart),
         controls([m for m in choices if ", " in m.benchmark], runs),
         *(study(run) for run in runs if run.kind in STUDIES),
         choices_in_detail(plain, confusions, folder),
@@ -90,12 +92,17 @@ def zero_shot(choices: Sequence[Measured], ranks: Sequence[Measured], folder: Pa
     return section
 
 
-def distillation(choices: Sequence[Measured], ranks: Sequence[Measured]) -> Section:
+def distillation(
+    choices: Sequence[Measured],
+    ranks: Sequence[Measured],
+    apart: Mapping[str, Sequence[Sequence[Paired]]],
+) -> Section:
     section = Section("Distillation")
     abroad = transfers(choices)
     for benchmark, rows in by_benchmark(choices).items():
         if benchmark not in abroad and any(m.trained for m in rows):
             section.tables.append(shaped.selection_distilled(benchmark, rows))
+            _add_apart(section, benchmark, apart)
     for benchmark, rows in by_benchmark(ranks).items():
         if any(m.trained for m in rows):
             section.tables.append(shaped.retrieval_distilled(benchmark, widest(rows)))
@@ -114,7 +121,9 @@ def ablation(choices: Sequence[Measured]) -> Section:
     return Section("Ablation", [shaped.overall_table("ablation", caption, told, labels, reference)])
 
 
-def transfer(choices: Sequence[Measured]) -> Section:
+def transfer(
+    choices: Sequence[Measured], apart: Mapping[str, Sequence[Sequence[Paired]]]
+) -> Section:
     """Students on benchmarks that they were not trained on, and the models that they began from."""
     section = Section("Transfer")
     if not (abroad := transfers(choices)):
@@ -128,7 +137,18 @@ def transfer(choices: Sequence[Measured]) -> Section:
     for benchmark, rows in by_benchmark(choices).items():
         if benchmark in abroad:
             section.tables.append(shaped.selection_transfer(benchmark, rows))
+            _add_apart(section, benchmark, apart)
     return section
+
+
+def _add_apart(
+    section: Section, benchmark: str, apart: Mapping[str, Sequence[Sequence[Paired]]]
+) -> None:
+    """Add what the benchmark's models are apart, and folded away the same by family."""
+    if found := apart.get(benchmark):
+        section.tables.append(_renamed(tables.apart_table(found), benchmark))
+        by_family = tables.paired_table([(benchmark, of) for of in found])
+        section.details.append(_renamed(by_family, benchmark))
 
 
 def controls(choices: Sequence[Measured], runs: Sequence[Finished]) -> Section:

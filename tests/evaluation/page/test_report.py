@@ -42,8 +42,8 @@ def test_everything_is_written_in_the_papers_shape(runs, micro_store):
     assert names == {path.stem for path in (folder / "tables").glob("*.md")}
     assert names == {
         "selection-micro", "retrieval-micro", "distillation-selection-micro",
-        "distillation-retrieval-micro", "ablation", "costs-micro", "widths-micro",
-        "subtypes-micro", "readings-micro", "positions-micro", "training",
+        "distillation-retrieval-micro", "apart-micro", "paired-micro", "ablation", "costs-micro",
+        "widths-micro", "subtypes-micro", "readings-micro", "positions-micro", "training",
     }  # fmt: skip
     table = (folder / "tables" / "distillation-selection-micro.md").read_text()
     assert "| cot (reasoning) | 100.0 | 100.0 | 100.0 | 100.0 | 100.0 | 100.0 |" in table
@@ -62,6 +62,31 @@ def test_everything_is_written_in_the_papers_shape(runs, micro_store):
     data = page_data(folder)
     assert len(data["items"]) == 12
     assert all(len(item["said"]) == 4 for item in data["items"])
+
+
+def test_students_are_held_against_what_they_should_surpass(runs, micro, micro_store):
+    # What the other students say is B.
+    items = micro_store.selection("test")
+    wrong = sum(item.letter != "B" for item in items)
+    select_run(runs, micro_store, micro, "plain", right, mode="reasoning")
+    folder = reported(runs, micro_store.folder.parent, items=0)
+    table = (folder / "tables" / "apart-micro.md").read_text()
+    parts = re.split(r"^\| \*less (.*?)\*.*$", table, flags=re.MULTILINE)[1:]
+    rows = {
+        other: {
+            line.split(" | ")[0].removeprefix("| "): line for line in lines.splitlines() if line
+        }
+        for other, lines in zip(parts[::2], parts[1::2], strict=True)
+    }
+    ablated = r"cot\_no\_candidate\_analysis (reasoning)"
+    alone = rows[r"answer\_only (answer)"]
+    assert f"| {wrong} | 0 |" in alone["cot (reasoning)"]
+    assert f"| {100 * wrong / len(items):+.1f} |" in alone["cot (reasoning)"]
+    assert "| +0.0 | +0.0 to +0.0 | 0 | 0 | 1 |" in alone[ablated]
+    assert f"| 0 | {wrong} |" in rows["small base (reasoning)"][ablated]
+    assert next(iter(rows[ablated])) == "cot (reasoning)"
+    # Nobody else was asked as a student of answers alone was, or as the base was.
+    assert len(parts) == 6
 
 
 def test_the_page_holds_all_that_it_shows(runs, micro_store):

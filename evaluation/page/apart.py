@@ -1,0 +1,63 @@
+"""Which models of a benchmark are held against each other, and how far their answers are apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from data.records import SelectionItem
+from evaluation.page.rows import Measured
+from evaluation.page.said import Said
+from evaluation.page.tables import REGIMES
+from evaluation.paired import Paired, compare
+
+ABLATED = ("cot_no_candidate_analysis", "cot_no_match_layout")
+
+
+def apart(
+    answered: Mapping[str, tuple[Measured, Mapping[str, Said]]],
+    items: Mapping[str, SelectionItem],
+    seed: int,
+) -> list[list[Paired]]:
+    """The models of each pair, item by item: by family, their macro, and over all.
+
+    Args:
+        answered: models of one benchmark by their label, and what they said by item.
+        items: those items by their id; what was said of others is left out.
+        seed: of the scenes that are drawn for the intervals.
+    """
+    models = {label: m for label, (m, _) in answered.items()}
+    found = []
+    for one, other in pairs(models):
+        credits = []
+        for label in (one, other):
+            given = answered[label][1]
+            credits.append(
+                {
+                    k: float(said.choice.letter == items[k].letter)
+                    for k, said in given.items()
+                    if k in items
+                }
+            )
+        asked = [item for name, item in items.items() if name in credits[0]]
+        if asked:
+            found.append(compare(asked, *credits, (one, other), seed))
+    return found
+
+
+def pairs(models: Mapping[str, Measured]) -> Iterator[tuple[str, str]]:
+    """What the paper's claims hold against each other: a student and its base asked in the same
+    mode, rationales and answers alone, and the full student and one without a part. Students of a
+    pair have the same base and seed."""
+    for label, m in models.items():
+        kin = [(name, other) for name, other in models.items() if other.base == m.base]
+        twins = [(name, other) for name, other in kin if other.seed == m.seed]
+        if m.regime not in REGIMES:
+            continue
+        against = [name for name, o in kin if not o.trained and o.row.mode == m.row.mode]
+        if m.regime != "answer_only":
+            against += [name for name, o in twins if o.regime == "answer_only"]
+        if m.regime == "cot":
+            against += [
+                name for name, o in twins if o.regime in ABLATED and o.row.mode == m.row.mode
+            ]
+        yield from ((label, name) for name in against)
