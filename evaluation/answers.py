@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -102,28 +102,41 @@ class AnswerLog:
         self._path = path
         self._keys = {mode: _key(mode, what) for mode, what in asked.items()}
         self.judged = judged
-        self.answers: dict[tuple[str, str], Kept] = {}
-        thing_of = {thing.name: thing for thing in things}
-        lines = path.read_bytes().splitlines() if path.exists() else []
-        whole, told = [], set()
-        for line in lines:
-            try:
-                row = json.loads(line)
-                if "asked" in row:
-                    told.add(row["key"])
-                elif (thing := thing_of.get(row["item_id"])) and self._bears_key(row):
-                    answer = judged(thing, row["mode"], Written(row["text"], row["cut"]))
-                    self.answers[answer.item_id, answer.mode] = answer
-            except (ValueError, TypeError, KeyError, AttributeError):
-                # Torn by a kill: that is asked again.
-                continue
-            whole.append(line.decode())
+        self._thing_of = {thing.name: thing for thing in things}
+        read = self._read(path)
+        self.answers = {(a.item_id, a.mode): a for a, _, _ in read if a}
+        told = {row.get("key") for _, row, _ in read if "asked" in row}
+        whole = [line for _, _, line in read]
         whole += [
             json.dumps({"key": key, "mode": mode, "asked": asked[mode]})
             for mode, key in self._keys.items()
             if key not in told
         ]
         write_text(path, "".join(f"{line}\n" for line in whole))
+
+    def take_over(self, others: Iterable[Path]) -> int:
+        """Keep also what other files hold of answers to the same, which are not asked again; how
+        many these are."""
+        before = len(self.answers)
+        for path in others:
+            found = [answer for answer, _, _ in self._read(path) if answer]
+            self.append([a for a in found if (a.item_id, a.mode) not in self.answers])
+        return len(self.answers) - before
+
+    def _read(self, path: Path) -> list[tuple[Kept | None, dict[str, Any], str]]:
+        """The lines of a file, each with its object and, where it is one to what is asked, the
+        answer. What a kill tore is left out: that is asked again."""
+        found = []
+        for line in path.read_bytes().splitlines() if path.exists() else []:
+            try:
+                row, answer = json.loads(line), None
+                thing = None if "asked" in row else self._thing_of.get(row["item_id"])
+                if thing and self._bears_key(row):
+                    answer = self.judged(thing, row["mode"], Written(row["text"], row["cut"]))
+                found.append((answer, row, line.decode()))
+            except (ValueError, TypeError, KeyError, AttributeError):
+                continue
+        return found
 
     def _bears_key(self, row: dict[str, Any]) -> bool:
         return row["mode"] in self._keys and row["key"] == self._keys[row["mode"]]

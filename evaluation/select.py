@@ -39,7 +39,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     items = chosen_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = Frames(store, student.image_size)
     model = asked.asked_model(cfg, folder, trained)
-    given = {}
+    given, runs = {}, Path(cfg.checkpoints, "select")
     # What a control changes shows only beside the same items as they are.
     for control in dict.fromkeys([None, cfg.control]):
         known = {
@@ -49,6 +49,8 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
             for mode in modes
         }
         journal = answers.AnswerLog(run.folder / "answers.jsonl", known, items)
+        if cfg.control and (taken := journal.take_over(sorted(runs.glob("**/answers.jsonl")))):
+            log.info("%d answers are there already, from other runs of this model", taken)
         sample_of = partial(asked.shown, regime, frames, student, control)
         for mode in modes:
             log.info("asking %s in %s mode%s", model.name, mode, f", {control}" if control else "")

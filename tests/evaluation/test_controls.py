@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -69,6 +72,32 @@ def test_a_prefix_is_worth_what_its_items_lose_without_it(
     assert select.main.__wrapped__(cfg, Run("x", tmp_path)) == metrics
     assert not server.asked
     assert json.loads((tmp_path / "report.json").read_text()) == told
+
+
+def test_what_another_run_has_asked_is_not_asked_again(
+    command, micro_store, talking, tmp_path
+) -> None:
+    server = talking(lambda _: "Answer: C")
+    cfg = command(server, limit=12, checkpoints=str(tmp_path))
+    select.main.__wrapped__(cfg, Run("x", folder(tmp_path, "x")))
+    server.asked.clear()
+    held = replace(cfg, control="candidate_only")
+    metrics = select.main.__wrapped__(held, Run("y", folder(tmp_path, "y")))
+    assert len(server.asked) == 12
+    assert not any(p["type"] == "video_url" for asked in server.asked for p in parts_of(asked))
+    # It has them from then on, and another question has another answer.
+    shutil.rmtree(tmp_path / "select" / "x")
+    server.asked.clear()
+    assert select.main.__wrapped__(held, Run("y", folder(tmp_path, "y"))) == metrics
+    assert not server.asked
+    other = replace(held, student=replace(STUDENT, max_new_tokens=30), modes=["record"])
+    select.main.__wrapped__(other, Run("z", folder(tmp_path, "z")))
+    assert len(server.asked) == 24
+
+
+def folder(root: Path, name: str) -> Path:
+    (made := root / "select" / name).mkdir(parents=True, exist_ok=True)
+    return made
 
 
 def test_the_questions_of_a_pair_are_held_against_each_other(benchmark_store, tmp_path) -> None:
