@@ -80,7 +80,7 @@ def _add(
     answers: dict[str, Mapping[str, Said]] = {}
     models: dict[str, dict[str, tuple[Measured, Mapping[str, Said]]]] = {}
     for m in answered:
-        label = _label(m, answers)
+        label = ", ".join(filter(None, (m.label, control_of(m.benchmark))))
         answers[label] = given = _answers(m, said)
         models.setdefault(m.benchmark, {})[label] = (m, given)
         pairs = [(every[k].letter, s.choice.letter) for k, s in given.items() if k in every]
@@ -108,11 +108,6 @@ def _add(
 
 def _store_name(m: Measured) -> str:
     return m.benchmark.split(", ")[0]
-
-
-def _label(m: Measured, taken: Mapping[str, Any]) -> str:
-    label = ", ".join(filter(None, (m.label, control_of(m.benchmark))))
-    return f"{label}, {m.run.name}" if label in taken else label
 
 
 def _answers(m: Measured, said: RunAnswers) -> Mapping[str, Said]:

@@ -32,7 +32,7 @@ ON_PAGE = {
 """Colours of a figure that follow the page's, light or dark."""
 
 
-def by_horizon(subtypes: Mapping[str, Mapping[str, Any]]) -> dict[str, Interval]:
+def by_horizon(subtypes: Mapping[str, Interval]) -> dict[str, Interval]:
     """Accuracy of a run's subtypes over how far ahead they ask: 1 s and 2 s of the time family, and
     frames of the window family, nearest first, with Wilson's intervals."""
     hits: dict[str, list[float]] = {}
@@ -41,7 +41,7 @@ def by_horizon(subtypes: Mapping[str, Mapping[str, Any]]) -> dict[str, Interval]
         horizon = f"{window[1]} frames" if window else HORIZONS.get(cell)
         if horizon is not None:
             right, n = hits.get(horizon, (0.0, 0))
-            hits[horizon] = (right + found["value"] * found["n"], n + found["n"])
+            hits[horizon] = (right + found.value * found.n, n + found.n)
     return {
         horizon: Interval(right / n, *wilson(right, n), n)
         for horizon, (right, n) in sorted(hits.items(), key=lambda found: _how_far(found[0]))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,14 @@ class Measured:
     """A row with what its table needs of the run that it stands in.
 
     `training` holds the settings that the model was trained by, None for one as it was released,
-    and nothing where they are not known.
+    and nothing where they are not known. `reported` is the name that the run's report gives the
+    model, where the row's is another.
     """
 
     row: SelectionRow | RetrievalRow
     run: Finished
     training: dict[str, Any] | None = None
+    reported: str | None = None
 
     @property
     def benchmark(self) -> str:
@@ -61,8 +64,9 @@ class Measured:
 
     def told(self, kind: str) -> Any:
         """What else the run reports of a selection row's model, such as its subtypes."""
-        name = self.row.name if self.run.kind == "similarity" else self.row.mode
-        return self.run.report.get(kind, {}).get(name)
+        name = self.reported or self.row.name
+        key = name if self.run.kind == "similarity" else self.row.mode
+        return self.run.report.get(kind, {}).get(key)
 
     @property
     def suite(self) -> str:
@@ -97,12 +101,26 @@ def _rows(
 
 
 def once(rows: Iterable[Measured]) -> list[Measured]:
-    """Each row once: a released model's stands in the reports of several trained from it."""
+    """Each row once, for a released model's stands in the reports of several trained from it; and
+    what runs measured otherwise under one name, each with its run's name."""
     kept: list[Measured] = []
     for m in rows:
         if all(m.row != other.row for other in kept):
             kept.append(m)
-    return kept
+    called = Counter(_place(m) for m in kept)
+    return [_with_run(m) if called[_place(m)] > 1 else m for m in kept]
+
+
+def _place(m: Measured) -> tuple:
+    """What tells a row from others of a table."""
+    row = m.row
+    how = row.mode if isinstance(row, SelectionRow) else (row.width, row.builder)
+    return m.run.kind, row.benchmark, row.name, how
+
+
+def _with_run(m: Measured) -> Measured:
+    row = replace(m.row, name=f"{m.row.name}, {m.run.name}")
+    return replace(m, row=row, reported=m.row.name)
 
 
 def by_benchmark(rows: Iterable[Measured]) -> dict[str, list[Measured]]:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -206,9 +206,13 @@ def study(run: Finished) -> Section:
 def choices_in_detail(
     choices: Sequence[Measured], confusions: Mapping[str, Mapping[str, np.ndarray]], folder: Path
 ) -> Section:
+    """
+    Raises:
+        UserError: what a run reports is of another version.
+    """
     section = Section("Selection in detail")
     for benchmark, rows in by_benchmark(choices).items():
-        cells = {m.label: found for m in rows if (found := m.told("subtypes"))}
+        cells = _told(rows, "subtypes", _intervals)
         horizons = {label: by for label, of in cells.items() if (by := plots.by_horizon(of))}
         if horizons:
             drawn = _draw(folder, f"horizons-{benchmark}", plots.horizon_figure, horizons)
@@ -221,22 +225,37 @@ def choices_in_detail(
     return section
 
 
-def _details(rows: Sequence[Measured], cells: Mapping[str, Mapping[str, Any]]) -> list[Table]:
+def _intervals(told: Mapping[str, Any]) -> dict[str, Interval]:
+    return {cell: Interval(**found) for cell, found in told.items()}
+
+
+def _details(rows: Sequence[Measured], cells: Mapping[str, Mapping[str, Interval]]) -> list[Table]:
     """The tables of what runs report of their models besides their rows."""
-    intervals = {
-        label: {cell: Interval(**found) for cell, found in of.items()}
-        for label, of in cells.items()
-    }
-    readings = {m.label: found for m in rows if (found := m.told("readings"))}
-    letters = {m.label: Positions(**found) for m in rows if (found := m.told("positions"))}
-    sure = {m.label: Calibration.from_dict(of) for m in rows if (of := m.told("calibration"))}
-    told = [tables.subtype_table(intervals)] if intervals else []
+    readings = _told(rows, "readings", dict)
+    letters = _told(rows, "positions", lambda of: Positions(**of))
+    sure = _told(rows, "calibration", Calibration.from_dict)
+    told = [tables.subtype_table(cells)] if cells else []
     told += [tables.reading_table(readings)] if readings else []
     told += [tables.position_table(letters)] if letters else []
     for k, (label, found) in enumerate(sure.items()):
         table = tables.calibration_table(label, found)
         told.append(replace(table, name=f"{table.name}-{k}"))
     return told
+
+
+T = TypeVar("T")
+
+
+def _told(rows: Sequence[Measured], kind: str, read: Callable[[Any], T]) -> dict[str, T]:
+    """What runs report of one kind, by the label of the model; where they report of it."""
+    found = {}
+    for m in rows:
+        try:
+            if told := m.told(kind):
+                found[m.label] = read(told)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise unreadable(m.run.folder) from error
+    return found
 
 
 def rankings_in_detail(ranks: Sequence[Measured], folder: Path) -> Section:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from evaluation.metrics import Interval
 from evaluation.page import items as shown
 from evaluation.page.page import embedded
 from evaluation.page.plots import by_horizon, confusion
@@ -142,7 +143,7 @@ def test_confusion_counts_every_answer_once():
 
 def test_horizons_pool_their_subtypes():
     def cell(value, n):
-        return {"value": value, "low": 0.0, "high": 1.0, "n": n}
+        return Interval(value, 0.0, 1.0, n)
 
     found = by_horizon(
         {

@@ -89,6 +89,19 @@ def test_students_are_held_against_what_they_should_surpass(runs, micro, micro_s
     assert len(parts) == 6
 
 
+def test_models_of_one_name_are_told_apart_by_their_runs(runs, micro, micro_store):
+    select_run(runs, micro_store, micro, "drawn", right, mode="record")
+    folder = reported(runs, micro_store.folder.parent, items=1)
+    names = ["small base, base (record)", "small base, drawn (record)"]
+    for table in ("selection-micro", "readings-micro", "subtypes-micro", "positions-micro"):
+        text = (folder / "tables" / f"{table}.md").read_text()
+        assert all(name in text for name in names), table
+    assert {s["by"] for s in page_data(folder)["items"][0]["said"]} > set(names)
+    # Of one run alone, the model's name will do.
+    folder = reported(runs, micro_store.folder.parent, runs=["select/drawn"], items=1)
+    assert "small base (record)" in (folder / "tables" / "selection-micro.md").read_text()
+
+
 def test_the_page_holds_all_that_it_shows(runs, micro_store):
     page = (reported(runs, micro_store.folder.parent, items=4) / "report.html").read_text()
     markup = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
@@ -224,6 +237,10 @@ def test_two_databases_are_told_apart(runs, micro, micro_store):
         ),
         (lambda runs: (runs / "select/cot/report.json").unlink(), {}, "report.json is missing"),
         (lambda runs: (runs / "select/cot/report.json").write_text("[]"), {}, "another version"),
+        (lambda runs: _add(runs / "select/cot/report.json", positions={"reasoning": {"A": 1}}),
+         {}, "cot/report.json is .* of another version"),
+        (lambda runs: _add(runs / "select/cot/report.json", calibration={"reasoning": {"bins": 1}}),
+         {}, "cot/report.json is .* of another version"),
         (lambda runs: (runs / "select/cot/metrics.json").unlink(), {"runs": ["select/cot"]},
          "no finished run"),
         (lambda runs: None, {"runs": ["select/cto"]}, "names no run .*; there are .*select/cot"),
@@ -237,6 +254,10 @@ def test_what_cannot_be_read_is_named(runs, micro_store, damage, settings, said)
         reported(runs, micro_store.folder.parent, **settings)
     assert "\n" not in str(told.value)
     assert not (runs / "report" / "default" / "report.html").exists()
+
+
+def _add(report: Path, **told: object) -> None:
+    report.write_text(json.dumps(json.loads(report.read_text()) | told))
 
 
 def test_patterns_are_checked_before_anything_is_read():
