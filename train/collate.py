@@ -73,12 +73,17 @@ def encode(
             f"student.max_length={max_length}: raise it, or lower student.image_size or "
             "student.frames"
         )
-    media = {name: prompt[name] for name in MEDIA if name in prompt}
+    media = {name: prompt[name] for name in MEDIA_INPUTS if name in prompt}
     labels = [IGNORED] * len(ids) + response
     return Encoded(ids + response, labels, types + [0] * len(response), media)
 
 
-MEDIA = ("pixel_values", "image_grid_thw", "pixel_values_videos", "video_grid_thw")
+MEDIA = {
+    "image": ("pixel_values", "image_grid_thw"),
+    "video": ("pixel_values_videos", "video_grid_thw"),
+}
+"""What the processor gives of each kind of media: its pixels and their grid."""
+MEDIA_INPUTS = tuple(name for names in MEDIA.values() for name in names)
 
 
 class Collator:
@@ -129,7 +134,7 @@ def pad(encoded: Sequence[Encoded], pad_id: int) -> dict[str, Any]:
 
 def stacked_media(encoded: Sequence[Encoded]) -> dict[str, torch.Tensor]:
     """The media tensors of all samples in order."""
-    parts = {name: [e.media[name] for e in encoded if name in e.media] for name in MEDIA}
+    parts = {name: [e.media[name] for e in encoded if name in e.media] for name in MEDIA_INPUTS}
     return {name: torch.cat(found) for name, found in parts.items() if found}
 
 

@@ -21,7 +21,7 @@ from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDe
 from conf.errors import UserError
 from conf.runs import ranks_here
 from conf.schema import SftTrainConfig
-from train.collate import Collator
+from train.collate import MEDIA, Collator
 from train.conversation import Sample
 from train.room import available
 
@@ -29,10 +29,6 @@ log = logging.getLogger(__name__)
 
 KEYS = "slices"
 """Names what each slice of a batch's media shows: first those of the images, then of the clips."""
-MEDIA = {
-    "image": ("pixel_values", "image_grid_thw"),
-    "video": ("pixel_values_videos", "video_grid_thw"),
-}
 
 
 class Keyed:

@@ -13,14 +13,11 @@ from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDe
 from conf.schema import RetrieverConfig
 from data.frames import Frames
 from train.batches import Batch
+from train.collate import MEDIA
 from train.planned import STAMP, TOKEN
 from train.prefixes import give_own, shared_input
 from train.retriever import frame_input
 
-MEDIA = {
-    "image": ("pixel_values", "image_grid_thw"),
-    "video": ("pixel_values_videos", "video_grid_thw"),
-}
 SEEN = "seen"
 """With a kind of media: the tower's outputs, (1 + deepstack layers, tokens, width)."""
 

@@ -43,8 +43,8 @@ class Slice:
         ordered = sorted(database, key=lambda f: (f.scene_id, f.frame))
         super().__init__(
             queries={q.query_id: q for q in queries},
-            corpus={_name(f): f for f in ordered},
-            relevant_docs={q.query_id: {_name(q.target)} for q in queries},
+            corpus={f.name: f for f in ordered},
+            relevant_docs={q.query_id: {q.target.name} for q in queries},
             accuracy_at_k=list(RECALLS),
             precision_recall_at_k=[1],
             mrr_at_k=[len(ordered)],
@@ -102,7 +102,3 @@ class LateHeldOutRanking(Slice, MultiVectorInformationRetrievalEvaluator):
 
     score = staticmethod(maxsim)
     joined = staticmethod(list)
-
-
-def _name(frame: FrameRef) -> str:
-    return f"{frame.scene_id}/{frame.frame}"

@@ -157,15 +157,18 @@ class ContrastiveTrainConfig(TrainConfig):
     """Same-scene wrong-time frames a query."""
     mine_every: int = 0
     """Steps after which hard negatives are mined anew: the wrong frames that the retriever then
-    ranks highest. 0 keeps the benchmark's."""
+    ranks highest. 0 keeps the benchmark's. What is mined for one query may be another's target, so
+    that this masks as train.mask_identical=true does."""
     mine_margin: float = 24.0
     """Mined frames of the target's scene are displaced by so many px (at 336 x 336) from it."""
     scale: float = 50.0
     """Inverse temperature of the scores: cosine similarities, which retriever.late sums up."""
     distinct_frames: bool = True
-    """Whether a frame that several queries of a batch name is embedded once; moves no gradient."""
+    """Whether a frame that several queries of a rank's share name is embedded once; moves no
+    gradient."""
     shared_prefixes: bool = True
-    """Whether a prefix that several queries of a batch share passes once; moves no gradient."""
+    """Whether a prefix that several queries of a rank's share have in common passes once; moves no
+    gradient."""
     reuse_features: bool = False
     """Whether the frozen tower's outputs are kept between the two passes of a step, in memory that
     grows with the batch (about 30 MB a query of an 8B model); moves no gradient."""
