@@ -303,7 +303,7 @@ def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFact
     pixels = scene.image_positions[:, index] * VIEW / np.asarray(scene.image_size)
     sight, target_sight = _sight(scene, cut, index), _sight(scene, target, index)
     speed = _speed(scene, index, cut) if sight != OUT else None
-    moving = speed not in (None, "stationary")
+    heading = heading_of(scene, index, free_since(scene, index, cut), cut)
     travelled = pixels[target] - pixels[cut]
     extent = _extent(travelled) if {sight, target_sight} != {OUT} else "unseen"
     return ObjectFacts(
@@ -311,12 +311,21 @@ def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFact
         region=region_of(scene, cut, index),
         sight=sight,
         speed=speed,
-        heading=compass(pixels[cut] - pixels[free_since(scene, index, cut)]) if moving else None,
+        heading=heading if speed is not None else None,
         target_region=region_of(scene, target, index),
         target_sight=target_sight,
         extent=extent,
         travel=None if extent in ("stays", "unseen") else compass(travelled),
     )
+
+
+def heading_of(scene: Scene, index: int, since: int, frame: int) -> str | None:
+    """The compass word of the way that an object has gone since an earlier frame; None where it
+    does not move."""
+    if _speed(scene, index, frame) == "stationary":
+        return None
+    pixels = scene.image_positions[:, index] * VIEW / np.asarray(scene.image_size)
+    return compass(pixels[frame] - pixels[since])
 
 
 def _speed(scene: Scene, index: int, frame: int) -> str:

@@ -2,10 +2,11 @@
 write before it is ever asked to choose.
 
 A frame is described by its objects and their places, alone and among four candidates, one after the
-other; an object is looked for in each of four candidates; a clip is told by the built-in narrator,
-with the frame that comes of it shown or not; after a clip and what is told of it, its item's
-candidates are compared with that by where they show an object; of several frames the one is named
-that is the later, or that fits a description. None of it is the selection task itself.
+other; an object is looked for in each of four candidates; an object of a clip is told by how it
+moves; a clip is told by the built-in narrator, with the frame that comes of it shown or not; after
+a clip and what is told of it, its item's candidates are compared with that by where they show an
+object; of several frames the one is named that is the later, or that fits a description. None of it
+is the selection task itself.
 """
 
 from __future__ import annotations
@@ -20,7 +21,15 @@ from conf.schema import StudentConfig
 from data.frames import Frames
 from data.records import LETTERS, Scene, SelectionItem, shown_frames
 from data.store import Store
-from teacher.predicates import REGIONS, Predicates, predicates_of, region_of
+from teacher.predicates import (
+    REGIONS,
+    ObjectFacts,
+    Predicates,
+    facts_of,
+    heading_of,
+    predicates_of,
+    region_of,
+)
 from teacher.template import describe, matches
 from train.conversation import Sample, Sight, answer_line, clip_of, conversation
 from train.planned import Planned, rng_of
@@ -29,19 +38,25 @@ FRAME = "Describe the frame."
 CANDIDATES = "Describe each candidate."
 WHERE = "Where does each candidate show the {}?"
 COMPARE = "Compare each candidate with the prediction by the {}."
+MOVES = "How does the {} move?"
 CLIP = "Describe the scene, how its objects move, and what will come of it."
 LATER = 'Which candidate comes later? End with a line "Answer:" and the letter.'
 MATCH = (
     "Which candidate shows {}? Say of each candidate, in a line of its own, whether it matches and "
     'why. End with a line "Answer:" and the letter.'
 )
-ASKED = (FRAME, CANDIDATES, WHERE, COMPARE, CLIP, LATER, MATCH)
+ASKED = (FRAME, CANDIDATES, WHERE, COMPARE, MOVES, CLIP, LATER, MATCH)
 FRAMES = 2
 """Frames described for each item in an epoch."""
 SETS = 2
 """Sets of candidates for each item in an epoch, of those described and of those looked through."""
-COMPARED = 6
-"""Objects to compare by after a clip, for each item in an epoch: the hardest to learn of all."""
+MOVING = 6
+"""Objects of a clip whose motion is told, for each item in an epoch: a few pixels between frames,
+which nothing else of a clip makes a model look for."""
+CLIPS = 2
+"""Times that a clip is told in an epoch."""
+COMPARED = 3
+"""Objects to compare by after a clip, for each item in an epoch."""
 MOVED = 0.08
 """Share of the view's width by which an object has moved in the later of two frames, at least."""
 CLEAR = 0.3
@@ -62,7 +77,8 @@ def kinds(
         "frame": [make.frame(item, k) for item in items for k in range(FRAMES)],
         "candidates": [make.candidates(item, items, k) for item in items for k in range(SETS)],
         "where": [make.where(item, items, k) for item in items for k in range(SETS)],
-        "clip": [clip for item in items for clip in make.clip(item)],
+        "moves": [one for item in items for k in range(MOVING) for one in make.moves(item, k)],
+        "clip": [clip for item in items for k in range(CLIPS) for clip in make.clip(item, k)],
         "compared": [
             one for item in items for k in range(COMPARED) for one in make.compared(item, k)
         ],
@@ -186,19 +202,39 @@ class _Maker:
         shown += [(item.scene_id, f) for f in self._prefix(item)]
         return shown[rng.integers(len(shown))]
 
-    def clip(self, item: SelectionItem) -> Iterator[Planned]:
+    def moves(self, item: SelectionItem, k: int) -> Iterator[Planned]:
+        """How an object of the clip moves, as often one that rests as another."""
+        scene = self.store.scene(item.scene_id)
+        facts = facts_of(scene, item.prefix_start, item.prefix_stop, item.target_frame)
+        seen = [o for o in facts.objects if o.sight == "shown"] if facts else []
+        if seen:
+            longest = max((_motion(facts.instant, o) for o in seen), key=len)
+            text = f"{MOVES.format(seen[0].object)} {longest}"
+            make = partial(self._moves, item, facts.instant, seen, k)
+            yield Planned(text, self.cfg.frames // 2, make)
+
+    def _moves(
+        self, item: SelectionItem, instant: str, seen: list[ObjectFacts], k: int, epoch: int
+    ) -> Sample:
+        rng = rng_of(self.seed, epoch, item.item_id, "moves", k)
+        rests = rng.random() < 0.5
+        some = [o for o in seen if (o.speed == "stationary") == rests] or seen
+        told = some[rng.integers(len(some))]
+        return self._after_prefix(item, [MOVES.format(told.object)], _motion(instant, told), [])
+
+    def clip(self, item: SelectionItem, k: int) -> Iterator[Planned]:
         """The clip with the frame that comes of it, to be read off, or without, to be foreseen."""
         if (text := self._told(item)) is not None:
             media = self.cfg.frames // 2 + 1
-            yield Planned(f"{CLIP} {text}", media, partial(self._clip, item, text))
+            yield Planned(f"{CLIP} {text}", media, partial(self._clip, item, text, k))
 
     def _told(self, item: SelectionItem) -> str | None:
         """The clip and what comes of it in the narrator's words, None where it is too short."""
         scene = self.store.scene(item.scene_id)
         return describe(scene, item.prefix_start, item.prefix_stop, item.target_frame, self.seed)
 
-    def _clip(self, item: SelectionItem, text: str, epoch: int) -> Sample:
-        shown = rng_of(self.seed, epoch, item.item_id, "clip").random() < 0.5
+    def _clip(self, item: SelectionItem, text: str, k: int, epoch: int) -> Sample:
+        shown = rng_of(self.seed, epoch, item.item_id, "clip", k).random() < 0.5
         pixels = self.frames.array(item.scene_id, item.target_frame)
         later = ["Later: ", pixels, "\n"] if shown else []
         images = [(item.scene_id, item.target_frame, "")] if shown else []
@@ -270,20 +306,37 @@ class _Maker:
     ) -> Sample:
         shown = self._prefix(item)
         clip = clip_of(item.scene_id, shown, self.frames)
+        scene = self.store.scene(item.scene_id)
         # A visual token of a clip shows two frames; its object is where the first has it.
-        sights = self._sights([*((item.scene_id, f, "") for f in shown[::2]), *images])
-        return conversation(f"{item.item_id} (clip and frames)", parts, told, clip, sights)
+        pairs = [(f, shown[min(k + 1, len(shown) - 1)]) for k, f in enumerate(shown)][::2]
+        watched = [
+            Sight(k, place, (*words, heading_of(scene, index, *pair) or "stationary"))
+            for k, pair in enumerate(pairs)
+            for index, place, words in sights(scene, pair[0])
+        ]
+        watched += self._sights(images, len(pairs))
+        return conversation(f"{item.item_id} (clip and frames)", parts, told, clip, watched)
 
-    def _sights(self, pictures: list[Picture]) -> list[Sight]:
-        """What a sample's pictures show, and of a candidate under which letter."""
+    def _sights(self, pictures: list[Picture], before: int = 0) -> list[Sight]:
+        """What a sample's pictures show, and of a candidate under which letter; so many pictures
+        stand `before` them."""
         return [
-            Sight(k, place, (*words, *letter))
+            Sight(before + k, place, (*words, *letter))
             for k, (scene_id, frame, letter) in enumerate(pictures)
-            for place, words in sights(self.store.scene(scene_id), frame)
+            for _, place, words in sights(self.store.scene(scene_id), frame)
         ]
 
     def _prefix(self, item: SelectionItem) -> list[int]:
         return shown_frames(item.prefix_start, item.prefix_stop, self.cfg.frames)
+
+
+def _motion(instant: str, o: ObjectFacts) -> str:
+    """Where an object is at an instant and how it moves, in the words of a rationale."""
+    told = f"{instant}, the {o.object} is {o.region} and"
+    if o.speed == "stationary":
+        return f"{told[0].upper()}{told[1:]} does not move."
+    way = f" toward the {o.heading}" if o.heading else ""
+    return f"{told[0].upper()}{told[1:]} moves {o.speed}{way}."
 
 
 def _shows(letter: str, phrase: str, place: str | None) -> str:
@@ -318,13 +371,13 @@ def account(scene: Scene, frame: int) -> str:
     return " ".join(told) or "No object is in view."
 
 
-def sights(scene: Scene, frame: int) -> Iterator[tuple[tuple[float, float], tuple[str, ...]]]:
-    """Where in a frame each object is that can be made out, as shares of width and height, and the
-    words that name it."""
+def sights(scene: Scene, frame: int) -> Iterator[tuple[int, tuple[float, float], tuple[str, ...]]]:
+    """The objects that can be made out in a frame: the index of each, where it is, as shares of
+    width and height, and the words that name it."""
     places = scene.image_positions[frame] / np.asarray(scene.image_size)
     seen = scene.in_view[frame] & (scene.visible_fraction[frame] > CLEAR)
     for k in np.flatnonzero(seen):
-        yield tuple(places[k].tolist()), tuple(scene.objects[k].phrase.split())
+        yield int(k), tuple(places[k].tolist()), tuple(scene.objects[k].phrase.split())
 
 
 def moved(scene: Scene, start: int) -> list[int]:

@@ -1,5 +1,5 @@
 """Teach a base to see, token by token: at the place of a visual token that shows an object, the
-model names the object and, in a candidate, the candidate's letter.
+model names the object and, in a candidate, the candidate's letter; in a clip, the way it moves.
 
 What a sample's answer says of its pictures is a weak sign of what they show: a model that writes it
 well may hardly look. The words of the object at each visual token are a strong one, beside it.
@@ -27,7 +27,7 @@ PLACES = ("top", "left", "right", "center", "bottom")
 """First words of the places that an object is near."""
 WORDS = 4
 """Words at most that a visual token is told: an object's colour, material and shape, and a
-candidate's letter."""
+candidate's letter or, in a clip, the way that the object moves."""
 NONE = -1
 """Stands where a token is told fewer words."""
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
 
 from data.frames import Frames
 from data.records import LETTERS
 from data.store import Store
-from teacher.predicates import region_of
+from teacher.predicates import cut_of, region_of
 from train import eyes
 from train.planned import Planned
 
@@ -107,6 +108,56 @@ def test_candidates_are_compared_with_what_is_foreseen_of_an_object(
             assert " and agrees" in {verdict for _, verdict in verdicts}
             answers.add(tuple(verdicts))
     assert len(answers) > 16
+
+
+def test_an_object_of_a_clip_moves_as_it_is_said_to(micro_store, kinds) -> None:
+    items = {item.item_id: item for item in micro_store.selection("train")}
+    rests = []
+    for planned in kinds["moves"][:24]:
+        sample = planned.make(0)
+        item = items[sample.sample_id.partition(" (")[0]]
+        scene = micro_store.scene(item.scene_id)
+        end = cut_of(scene, item.prefix_start, item.prefix_stop)
+        phrase = re.fullmatch(r"How does the (.+) move\?", sample.content[-1]["text"])[1]
+        index = [o.phrase for o in scene.objects].index(phrase)
+        speed = np.linalg.norm(scene.velocities[end, index])
+        told = re.fullmatch(
+            rf"[A-Z].+, the {phrase} is (near the [\w-]+) and (does not move|moves .+)\.",
+            sample.response,
+        )
+        assert told[1] == region_of(scene, end, index)
+        assert (told[2] == "does not move") == (speed < 0.05)
+        if way := re.search(r"toward the (\w+)$", told[2]):
+            gone = np.diff(scene.image_positions[[end - 1, end], index], axis=0)[0]
+            assert np.dot(gone, DIRECTIONS[way[1]]) > 0
+        rests.append(told[2] == "does not move")
+    assert 0.2 < np.mean(rests) < 0.8
+
+
+DIRECTIONS = {
+    "east": (1, 0), "southeast": (1, 1), "south": (0, 1), "southwest": (-1, 1),
+    "west": (-1, 0), "northwest": (-1, -1), "north": (0, -1), "northeast": (1, -1),
+}  # fmt: skip
+
+
+def test_a_clips_tokens_tell_how_their_objects_move(micro_store, kinds) -> None:
+    items = {item.item_id: item for item in micro_store.selection("train")}
+    ways = set()
+    for planned in kinds["moves"][::6]:
+        sample = planned.make(0)
+        item = items[sample.sample_id.partition(" (")[0]]
+        scene, frames = micro_store.scene(item.scene_id), sample.clip.indices
+        assert {sight.picture for sight in sample.sights} <= set(range(sample.pictures))
+        for sight in sample.sights:
+            index = [tuple(o.phrase.split()) for o in scene.objects].index(sight.words[:3])
+            pair = [frames[2 * sight.picture], frames[2 * sight.picture + 1]]
+            moves = np.linalg.norm(scene.velocities[pair[1], index]) >= 0.05
+            assert (sight.words[3] != "stationary") == moves
+            if moves:
+                gone = np.diff(scene.image_positions[pair, index], axis=0)[0]
+                assert np.dot(gone, DIRECTIONS[sight.words[3]]) > 0
+            ways.add(sight.words[3])
+    assert len(ways) > 4
 
 
 def said_of_each(response: str, phrase: str, end: str) -> list[tuple[str | None, str]]:

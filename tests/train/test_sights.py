@@ -46,7 +46,7 @@ def test_words_stand_at_the_tokens_that_show_them(
 def test_sights_are_of_what_a_frame_shows(micro_store) -> None:
     scene = micro_store.scene(micro_store.scene_ids("train")[0])
     for frame in (0, scene.frames - 1):
-        words = {words for _, words in eyes.sights(scene, frame)}
+        words = {words for _, _, words in eyes.sights(scene, frame)}
         account = eyes.account(scene, frame)
         assert words
         assert all(f"The {' '.join(w)} is near" in account for w in words)
