@@ -17,6 +17,7 @@ from torch.nn.functional import pad
 from transformers import ProcessorMixin
 
 from data.records import COLORS, MATERIALS, SHAPES
+from teacher.predicates import COMPASS
 from train.collate import IGNORED, Collator
 from train.conversation import Sample
 from train.sft_trainer import StudentTrainer
@@ -25,6 +26,8 @@ WEIGHT = 6.0
 """A named object weighs as much as this many supervised tokens."""
 PLACES = ("top", "left", "right", "center", "bottom")
 """First words of the places that an object is near."""
+MOTION = ("moves", "does")
+"""What tells that an object moves from that it does not."""
 WORDS = 4
 """Words at most that a visual token is told: an object's colour, material and shape, and a
 candidate's letter or, in a clip, the way that the object moves."""
@@ -33,8 +36,10 @@ NONE = -1
 
 
 def seen_words(processor: ProcessorMixin) -> dict[str, list[int]]:
-    """The words of objects and of their places, by kind, each by its first token."""
+    """The words of objects, of their places and of their motion, by kind, each by its first
+    token."""
     kinds = {"color": COLORS, "material": MATERIALS, "shape": SHAPES, "place": PLACES}
+    kinds |= {"motion": MOTION, "heading": COMPASS}
     return {kind: [first_token(processor, w) for w in words] for kind, words in kinds.items()}
 
 
