@@ -132,12 +132,25 @@ def watch(trainer: Trainer, run: Run) -> None:
     if rank() == 0:
         trainer.add_callback(Journal(run.folder))
     trainer.add_callback(NamedMeasure())
+    trainer.add_callback(BestCheckpoint())
     if "wandb" in trainer.args.report_to:
         # What it keeps on disk belongs to the run, and a run that goes on is the same run there;
         # TensorBoard's files are there by themselves.
         wandb = {"DIR": run.folder, "PROJECT": PROJECT, "RUN_ID": run_id(run), "RESUME": "allow"}
         for name, value in wandb.items():
             os.environ.setdefault(f"WANDB_{name}", str(value))
+
+
+class BestCheckpoint(TrainerCallback):
+    """Has every rank know the best checkpoint by its step. The library looks for its folder while
+    it is written: where a model is written in parts (FSDP) that is too early, so that an earlier
+    checkpoint stays the best, or one rank finds it and another does not, and they wait for each
+    other for ever in the end."""
+
+    def on_save(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        if state.best_global_step:
+            folder = Path(args.output_dir, f"checkpoint-{state.best_global_step}")
+            state.best_model_checkpoint = str(folder)
 
 
 class Epochs(TrainerCallback):
