@@ -125,9 +125,7 @@ def build_processor(corpus: Iterable[str], vocabulary: int, image_size: int) -> 
         extra_special_tokens=list(SPECIAL_TOKENS[1:]),
     )
     pixels = image_size * image_size
-    # As released: by default a single image is normalised otherwise than the same frame of a clip.
     shared = {"patch_size": PATCH, "merge_size": MERGE, "temporal_patch_size": TEMPORAL}
-    shared |= {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}
     return Qwen3VLProcessor(
         image_processor=Qwen2VLImageProcessor(
             size={"shortest_edge": 32 * 32, "longest_edge": pixels}, **shared
