@@ -303,7 +303,7 @@ def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFact
     pixels = scene.image_positions[:, index] * VIEW / np.asarray(scene.image_size)
     sight, target_sight = _sight(scene, cut, index), _sight(scene, target, index)
     speed = _speed(scene, index, cut) if sight != OUT else None
-    heading = heading_of(scene, index, free_since(scene, index, cut), cut)
+    moving = speed not in (None, "stationary")
     travelled = pixels[target] - pixels[cut]
     extent = _extent(travelled) if {sight, target_sight} != {OUT} else "unseen"
     return ObjectFacts(
@@ -311,7 +311,7 @@ def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFact
         region=region_of(scene, cut, index),
         sight=sight,
         speed=speed,
-        heading=heading if speed is not None else None,
+        heading=heading_of(scene, index, free_since(scene, index, cut), cut) if moving else None,
         target_region=region_of(scene, target, index),
         target_sight=target_sight,
         extent=extent,

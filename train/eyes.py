@@ -77,8 +77,8 @@ def kinds(
         "frame": [make.frame(item, k) for item in items for k in range(FRAMES)],
         "candidates": [make.candidates(item, items, k) for item in items for k in range(SETS)],
         "where": [make.where(item, items, k) for item in items for k in range(SETS)],
-        "moves": [one for item in items for k in range(MOVING) for one in make.moves(item, k)],
-        "clip": [clip for item in items for k in range(CLIPS) for clip in make.clip(item, k)],
+        "moves": [one for item in items for one in make.moves(item)],
+        "clip": [clip for item in items for clip in make.clip(item)],
         "compared": [
             one for item in items for k in range(COMPARED) for one in make.compared(item, k)
         ],
@@ -202,7 +202,7 @@ class _Maker:
         shown += [(item.scene_id, f) for f in self._prefix(item)]
         return shown[rng.integers(len(shown))]
 
-    def moves(self, item: SelectionItem, k: int) -> Iterator[Planned]:
+    def moves(self, item: SelectionItem) -> Iterator[Planned]:
         """How an object of the clip moves, as often one that rests as another."""
         scene = self.store.scene(item.scene_id)
         facts = facts_of(scene, item.prefix_start, item.prefix_stop, item.target_frame)
@@ -210,8 +210,9 @@ class _Maker:
         if seen:
             longest = max((_motion(facts.instant, o) for o in seen), key=len)
             text = f"{MOVES.format(seen[0].object)} {longest}"
-            make = partial(self._moves, item, facts.instant, seen, k)
-            yield Planned(text, self.cfg.frames // 2, make)
+            for k in range(MOVING):
+                make = partial(self._moves, item, facts.instant, seen, k)
+                yield Planned(text, self.cfg.frames // 2, make)
 
     def _moves(
         self, item: SelectionItem, instant: str, seen: list[ObjectFacts], k: int, epoch: int
@@ -222,11 +223,12 @@ class _Maker:
         told = some[rng.integers(len(some))]
         return self._after_prefix(item, [MOVES.format(told.object)], _motion(instant, told), [])
 
-    def clip(self, item: SelectionItem, k: int) -> Iterator[Planned]:
+    def clip(self, item: SelectionItem) -> Iterator[Planned]:
         """The clip with the frame that comes of it, to be read off, or without, to be foreseen."""
         if (text := self._told(item)) is not None:
             media = self.cfg.frames // 2 + 1
-            yield Planned(f"{CLIP} {text}", media, partial(self._clip, item, text, k))
+            for k in range(CLIPS):
+                yield Planned(f"{CLIP} {text}", media, partial(self._clip, item, text, k))
 
     def _told(self, item: SelectionItem) -> str | None:
         """The clip and what comes of it in the narrator's words, None where it is too short."""

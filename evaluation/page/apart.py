@@ -7,10 +7,8 @@ from collections.abc import Iterator, Mapping
 from data.records import SelectionItem
 from evaluation.page.rows import Measured
 from evaluation.page.said import Said
-from evaluation.page.tables import REGIMES
+from evaluation.page.tables import ABLATED, REGIMES
 from evaluation.paired import Paired, compare
-
-ABLATED = ("cot_no_candidate_analysis", "cot_no_match_layout")
 
 
 def apart(
@@ -49,10 +47,10 @@ def pairs(models: Mapping[str, Measured]) -> Iterator[tuple[str, str]]:
     mode, rationales and answers alone, and the full student and one without a part. Students of a
     pair have the same base and seed."""
     for label, m in models.items():
-        kin = [(name, other) for name, other in models.items() if other.base == m.base]
-        twins = [(name, other) for name, other in kin if other.seed == m.seed]
         if m.regime not in REGIMES:
             continue
+        kin = [(name, other) for name, other in models.items() if other.base == m.base]
+        twins = [(name, other) for name, other in kin if other.seed == m.seed]
         against = [name for name, o in kin if not o.trained and o.row.mode == m.row.mode]
         if m.regime != "answer_only":
             against += [name for name, o in twins if o.regime == "answer_only"]

@@ -19,7 +19,7 @@ from evaluation.page import plots
 from evaluation.page import tables as shaped
 from evaluation.page.gathering import STUDIES, TRAININGS, Finished, json_lines, unreadable
 from evaluation.page.rows import Measured, by_benchmark, transfers, widest
-from evaluation.page.tables import REGIMES
+from evaluation.page.tables import ABLATED, REGIMES
 from evaluation.paired import Paired
 from train.plots import curves_figure
 
@@ -112,7 +112,7 @@ def distillation(
 def ablation(choices: Sequence[Measured]) -> Section:
     """The regimes of chain of thought beside each other, in reasoning mode."""
     told = [m for m in choices if m.row.mode == "reasoning" and m.regime in REGIMES]
-    if not {m.regime for m in told} & {"cot_no_candidate_analysis", "cot_no_match_layout"}:
+    if not any(m.regime in ABLATED for m in told):
         return Section("Ablation")
     told.sort(key=lambda m: list(REGIMES).index(m.regime))
     labels = [f"{REGIMES[m.regime]} ({m.row.name})" for m in told]

@@ -29,6 +29,8 @@ REGIMES = {
     "cot_no_match_layout": "- match layout",
 }
 """What the paper calls the regimes of a student's training."""
+ABLATED = ("cot_no_candidate_analysis", "cot_no_match_layout")
+"""Those without a part of the rationale."""
 
 
 def selection_zero_shot(benchmark: str, rows: Sequence[Measured]) -> Table:
