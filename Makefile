@@ -107,10 +107,10 @@ test: setup vllm-env ## Run every test
 	@$(HAS_CHROMIUM)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
-# What the tests of trainers and of their evaluation import takes longer than all quick tests.
+# What the tests of trainers and of models that are asked import takes longer than all quick tests.
 check: setup lint ## Lint, then run the quick tests
 	$(BIN)/python -m pytest -m "not slow" -n logical --maxprocesses 4 --dist loadfile \
-		--ignore tests/train --ignore tests/evaluation/test_commands.py
+		--ignore tests/train --ignore tests/evaluation/models
 
 lint: setup ## Check format and style
 	$(BIN)/ruff format --check .

@@ -39,7 +39,7 @@ from evaluation.foreseen import ROUTES, foreseen
 from evaluation.measures import retrieval_rows
 from evaluation.metrics import query_measures, rank_metrics
 from evaluation.ranked import ranks_of, standard_test
-from tests.evaluation import released
+from tests.evaluation.models import released
 from train import backbone, samples
 
 SMALL = ArchitectureConfig(

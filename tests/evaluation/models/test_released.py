@@ -31,7 +31,7 @@ from evaluation.dual import unit
 from evaluation.embedding import EMBEDDINGS
 from evaluation.encoders import released_encoder
 from evaluation.languagebind import LanguageBindVideo, spread
-from tests.evaluation import released
+from tests.evaluation.models import released
 
 KINDS = ("clip", "siglip2", "languagebind", "vlm2vec")
 ASKED = {
