@@ -111,6 +111,7 @@ def test_a_sweep_outlives_a_failed_job_and_goes_on(room):
     assert json.loads((folder / "0/run.json").read_text())["earlier_starts"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env", "at_once"), [(NO_GPU, 1), (TWO_GPUS, 2)])
 def test_a_killed_sweep_takes_its_children_along(room, env, at_once):
     sweep = started(room, "-m", "x=1,2,3", "end=never", "run=s", env=env)
@@ -179,6 +180,7 @@ def test_a_cluster_comes_to_the_same_table_and_run_folders(room):
     assert "x is 2.0" in (folder / "0/output.log").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -274,6 +276,7 @@ def test_another_search_in_the_same_folder_is_refused(searched, changed, said):
     assert rows(searched / "checkpoints/toy/s") == table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -337,6 +340,7 @@ def test_the_regimes_are_all_that_a_student_can_be_trained_in():
     assert {job.train.regime for job in preset_jobs("regimes")} == set(REGIMES) - {"describe"}
 
 
+@pytest.mark.slow
 def test_the_scale_of_adapters_stays_the_papers_at_every_rank():
     jobs = preset_jobs("lr_rank")
     paper = compose("train.sft", SftCommand, ["student=qwen3_vl_8b"])
@@ -348,6 +352,7 @@ def test_the_scale_of_adapters_stays_the_papers_at_every_rank():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(path.stem for path in PRESETS.glob("*.yaml")))
 def test_a_preset_is_checked_before_it_starts(name):
     preflight("train.sft", SftCommand, [f"+sweep={name}"], sweep=True)

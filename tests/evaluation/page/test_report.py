@@ -117,6 +117,7 @@ def test_the_page_holds_all_that_it_shows(runs, micro_store):
         assert name in ids
 
 
+@pytest.mark.slow
 def test_the_same_runs_give_the_same_page(runs, micro_store):
     page = reported(runs, micro_store.folder.parent, items=3) / "report.html"
     whole = page.read_bytes()
@@ -127,6 +128,7 @@ def test_the_same_runs_give_the_same_page(runs, micro_store):
     assert page.read_bytes() != whole
 
 
+@pytest.mark.slow
 def test_runs_are_chosen_by_name_and_pattern(runs, micro_store):
     assert list(reported(runs, micro_store.folder.parent, items=0).glob("tables/*retrieval*"))
     folder = reported(runs, micro_store.folder.parent, runs=["select/cot*", "select/base"], items=1)
