@@ -69,17 +69,22 @@ def ranks_here() -> int:
 
 
 def run_name(run: str | None, overrides: Sequence[str]) -> str:
-    """The given name, or one made of the overrides in the order they were typed."""
+    """The given name, or one of the overrides, in whichever order they were typed."""
     if run is not None:
         return run
-    told = [o.lstrip("+") for o in overrides]
-    told = [o for o in told if o.partition("=")[0] not in ELSEWHERE]
+    # Of two values of one key the later holds.
+    told = sorted((o.lstrip("+") for o in overrides), key=_key)
+    told = [o for o in told if _key(o) not in ELSEWHERE]
     # Only what can be typed after model= as it stands: "=" and "," mean something there.
     name = re.sub(r"[^A-Za-z0-9_.+-]", "-", "+".join(told)) or "default"
     if len(name) > 120:
         digest = hashlib.sha256(name.encode()).hexdigest()[:8]
         name = f"{name[:111]}-{digest}"
     return name
+
+
+def _key(override: str) -> str:
+    return override.partition("=")[0]
 
 
 def run_below(run: str, folder: str) -> str:

@@ -1,6 +1,7 @@
 """A run's folder is named by its command and holds what was run."""
 
 import json
+from itertools import permutations
 
 import pytest
 
@@ -16,7 +17,7 @@ SETTINGS = {"seed": 0, "run": None, "store": "store", "checkpoints": "c", "worke
     [
         ([], "default"),
         (["+exp=cot"], "exp-cot"),
-        (["train.lr=1e-3", "+exp=cot"], "train.lr-1e-3+exp-cot"),
+        (["train.lr=1e-3", "+exp=cot"], "exp-cot+train.lr-1e-3"),
         (["store=/big", "workers=8", "checkpoints=c"], "default"),
         (["student.model=Qwen/Qwen3 VL"], "student.model-Qwen-Qwen3-VL"),
     ],
@@ -24,6 +25,12 @@ SETTINGS = {"seed": 0, "run": None, "store": "store", "checkpoints": "c", "worke
 def test_a_run_is_named_by_its_overrides(overrides, name):
     assert run_name(None, overrides) == name
     assert run_name("mine", overrides) == "mine"
+
+
+def test_a_name_is_the_settings_and_not_the_order_that_they_were_typed_in():
+    typed = ["x=1", "+exp=cot", "train.lr=1e-3"]
+    assert len({run_name(None, list(order)) for order in permutations(typed)}) == 1
+    assert run_name(None, ["x=1", "x=2"]) != run_name(None, ["x=2", "x=1"])
 
 
 def test_a_long_name_is_cut_and_stays_distinct():

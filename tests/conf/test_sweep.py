@@ -131,7 +131,7 @@ def test_as_many_jobs_run_at_once_as_there_are_gpus_and_each_sees_one(room):
     done = toy(room, "-m", "x=1,2", "end=meet", env=TWO_GPUS)
     assert done.returncode == 0, done.stderr
     # A sweep without a name is named by its overrides.
-    folder = room / "checkpoints/toy/x-1-2+end-meet"
+    folder = room / "checkpoints/toy/end-meet+x-1-2"
     logs = [(folder / f"{number}/run.log").read_text() for number in range(2)]
     seen = [line for log in logs for line in log.splitlines() if "sees GPU" in line]
     assert sorted(line[-1] for line in seen) == ["0", "1"]
