@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from transformers import PreTrainedConfig, PreTrainedTokenizerBase, ProcessorMixin
 
 BASE = "base.json"
+MODULES = "modules.json"
+"""In which sentence-transformers lists a model's parts."""
 PEFT = "base_model.model."
 """What peft puts before the names of the modules that it adapts."""
 BLOCK = 1 << 12
@@ -119,12 +121,39 @@ def check_adapters(folder: Path, base: nn.Module, cfg: StudentConfig) -> None:
             )
 
 
-def check_pooling(saved: Path) -> None:
-    """Raises UserError where a saved retriever does not pool the last token."""
+def file_of(model: str | Path, name: str, revision: str | None = None) -> Path:
+    """Where a file of a model is: in its folder, or in the hub's cache, which it is fetched into.
+
+    Raises:
+        FileNotFoundError: the model has no such file, as far as can be known here.
+    """
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import EntryNotFoundError
+
+    if Path(model).is_dir():
+        return Path(model) / name
     try:
-        modules = json.loads((saved / "modules.json").read_text())
-        parts = [saved / m["path"] for m in modules if m["type"].endswith(".Pooling")]
-        modes = [json.loads((part / "config.json").read_text())["pooling_mode"] for part in parts]
+        return Path(hf_hub_download(str(model), name, revision=revision))
+    except EntryNotFoundError as error:
+        raise FileNotFoundError(f"{model} has no {name}") from error
+
+
+def is_retriever(model: str | Path, revision: str | None = None) -> bool:
+    """Whether a model, in a folder or of the hub, says what comes after its backbone."""
+    try:
+        return file_of(model, MODULES, revision).exists()
+    except FileNotFoundError:
+        return False
+
+
+def check_pooling(saved: str | Path, revision: str | None = None) -> None:
+    """Raises UserError where a saved retriever, in a folder or of the hub, does not pool the last
+    token."""
+    try:
+        modules = json.loads(file_of(saved, MODULES, revision).read_text())
+        parts = [m["path"] for m in modules if m["type"].endswith(".Pooling")]
+        files = [file_of(saved, f"{part}/config.json", revision) for part in parts]
+        modes = [json.loads(file.read_text())["pooling_mode"] for file in files]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{saved} is damaged: what it says of its modules cannot be read ({error}); delete "

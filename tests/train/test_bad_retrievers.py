@@ -95,8 +95,8 @@ def test_a_batch_that_is_too_small_for_what_it_needs(contrastive_settings) -> No
     assert "train.hard_negatives=3 is more than benchmark.retrieval.hard_negatives=2" in problem
 
 
-def over(settings: ContrastiveCommand, folder: Path) -> ContrastiveCommand:
-    """Settings of adapters over the base in a folder."""
+def over(settings: ContrastiveCommand, folder: Path | str) -> ContrastiveCommand:
+    """Settings of adapters over the base in a folder, or of the hub."""
     cfg = replace(settings.retriever, architecture=None, model=str(folder), lora=LoraConfig(rank=4))
     return replace(settings, retriever=cfg)
 
@@ -112,6 +112,20 @@ def test_a_base_that_was_saved_by_another_pooling(
         kinds = json.loads((saved / "modules.json").read_text())[:1]
         (saved / "modules.json").write_text(json.dumps(kinds))
     refused(over(contrastive_settings, saved), tmp_path / "run", rf"saved {said}.* last token")
+
+
+def test_a_base_of_the_hubs_cache_with_another_pooling(
+    contrastive_settings, saved_base, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    cached = tmp_path / "models--lab--embedder"
+    whole = SentenceTransformer(modules=[Transformer(saved_base), Pooling(64, pooling_mode="mean")])
+    whole.save_pretrained(str(cached / "snapshots" / "a1"), create_model_card=False)
+    (cached / "refs").mkdir()
+    (cached / "refs" / "main").write_text("a1")
+    cfg = over(contrastive_settings, "lab/embedder")
+    refused(cfg, tmp_path / "run", r"lab/embedder was saved with mean pooling.* last token")
 
 
 def test_weights_that_are_no_numbers(contrastive_settings, saved_base, tmp_path) -> None:
