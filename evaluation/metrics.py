@@ -201,40 +201,10 @@ def _interval(correct: np.ndarray) -> Interval:
     )
 
 
-def bootstrap_by_scene(
-    values: np.ndarray,
-    scenes: Sequence[str],
-    statistic: Callable[[np.ndarray], float],
-    seed: int,
-    resamples: int = 2000,
-) -> tuple[float, float]:
-    """The 95% percentile interval of a statistic when whole scenes are drawn again.
-
-    Items of one scene share its video, so drawing items would call the result surer than it is.
-
-    Args:
-        values: (items, ...) what `statistic` reads; it is handed the rows of the drawn scenes.
-        scenes: (items,) the scene of each row.
-
-    Raises:
-        ValueError: no items, or not one scene an item.
-    """
-    values, scenes = np.asarray(values), np.asarray(scenes)
-    if not len(values) or len(values) != len(scenes):
-        raise ValueError(f"{len(values)} values for {len(scenes)} scenes")
-    _, codes = np.unique(scenes, return_inverse=True)
-    order = np.argsort(codes, kind="stable")
-    rows = np.split(order, np.flatnonzero(np.diff(codes[order])) + 1)
-    rng = np.random.default_rng(seed)
-    drawn = rng.integers(len(rows), size=(resamples, len(rows)))
-    results = [statistic(values[np.concatenate([rows[i] for i in picks])]) for picks in drawn]
-    low, high = np.percentile(results, [2.5, 97.5])
-    return float(low), float(high)
-
-
 class SceneBootstrap:
-    """`bootstrap_by_scene` of means and medians, with its very draws, for many measures of the same
-    items: what is drawn is how often each item counts, and nothing is copied."""
+    """95% percentile intervals of means and medians when whole scenes are drawn again: items of one
+    scene share its video, so drawing items would call a result surer than it is. For many measures
+    of the same items: what is drawn is how often each item counts, and nothing is copied."""
 
     def __init__(self, scenes: Sequence[str], seed: int, resamples: int = 2000) -> None:
         """`scenes` names the scene of each item.

@@ -10,7 +10,6 @@ from evaluation.metrics import (
     SceneBootstrap,
     accuracy_by,
     accuracy_table,
-    bootstrap_by_scene,
     compare,
     expected_hits,
     gold_scores,
@@ -20,6 +19,7 @@ from evaluation.metrics import (
     ranks_of,
     wilson,
 )
+from tests.evaluation.resampled import interval
 
 KS = (1, 2, 3, 10)
 
@@ -201,28 +201,18 @@ def test_wrong_tables_are_refused(families, correct):
 def test_bootstrap_draws_whole_scenes():
     rng = np.random.default_rng(0)
     alone = rng.random(400)
-    spread = bootstrap_by_scene(alone, np.arange(400), np.mean, seed=1)
+    spread = SceneBootstrap(np.arange(400), seed=1).mean(alone)
     half = 1.96 * alone.std() / 20
     assert spread == pytest.approx((alone.mean() - half, alone.mean() + half), abs=0.01)
     # Twenty-five copies of 16 values say no more than the 16: a scene is drawn or it is not.
     few, scenes = np.repeat(rng.random(16), 25), np.repeat(np.arange(16), 25)
-    low, high = bootstrap_by_scene(few, scenes, np.mean, seed=1)
+    low, high = SceneBootstrap(scenes, seed=1).mean(few)
     assert high - low > 4 * (spread[1] - spread[0]) * 0.7
-    sizes = set()
-    bootstrap_by_scene(few, scenes, lambda v: sizes.add(len(v)) or 0.0, seed=1, resamples=5)
-    assert sizes == {400}
-
-
-def test_bootstrap_repeats_and_keeps_rows_together():
-    values = np.stack([np.arange(12.0), np.arange(12.0)], axis=1)
-    scenes = ["b", "a", "c"] * 4
-    args = (values, scenes, lambda v: float(np.abs(v[:, 0] - v[:, 1]).max()), 3, 50)
-    assert bootstrap_by_scene(*args) == bootstrap_by_scene(*args) == (0, 0)
 
 
 def test_bootstrap_of_nothing_is_refused():
-    with pytest.raises(ValueError, match="values for"):
-        bootstrap_by_scene([], [], np.mean, seed=0)
+    with pytest.raises(ValueError, match="no items"):
+        SceneBootstrap([], seed=0)
 
 
 @pytest.mark.parametrize("items", [1, 2, 40, 401])
@@ -232,7 +222,7 @@ def test_many_measures_at_once_draw_what_one_does(items):
     values = np.round(rng.random(items), 2)
     once = SceneBootstrap(scenes, seed=7, resamples=300)
     for found, statistic in ((once.mean(values), np.mean), (once.median(values), np.median)):
-        drawn = bootstrap_by_scene(values, scenes, statistic, seed=7, resamples=300)
+        drawn = interval(values, scenes, statistic, seed=7, resamples=300)
         assert found == pytest.approx(drawn, abs=1e-12)
         assert found[0] <= statistic(values) <= found[1]
 
@@ -251,13 +241,11 @@ def test_a_macro_is_the_mean_of_its_families_means(items):
     assert found.value == pytest.approx(accuracy_table(families, credits).macro)
     assert found.n == items
     table = np.stack([families, credits.astype(str)], axis=1)
-    drawn = bootstrap_by_scene(table, scenes, macro, seed=7)
+    drawn = interval(table, scenes, macro, seed=7)
     assert (found.low, found.high) == pytest.approx(drawn, abs=1e-12)
     # Of one family it is the mean.
     alone = macro_by_scene(credits, ["time"] * items, scenes, seed=7)
-    assert (alone.low, alone.high) == pytest.approx(
-        bootstrap_by_scene(credits, scenes, np.mean, seed=7)
-    )
+    assert (alone.low, alone.high) == pytest.approx(interval(credits, scenes, np.mean, seed=7))
 
 
 def test_a_macro_of_parts_that_do_not_fit_is_refused():

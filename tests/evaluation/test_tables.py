@@ -17,7 +17,6 @@ from evaluation.measures import recall_curves, selection_row
 from evaluation.measures import retrieval_rows as retrieval_rows_of
 from evaluation.metrics import (
     accuracy_table,
-    bootstrap_by_scene,
     metrics_from_counts,
     query_measures,
     wilson,
@@ -31,6 +30,7 @@ from evaluation.tables import (
     retrieval_table,
     selection_table,
 )
+from tests.evaluation.resampled import interval
 from train.plots import curves_figure
 
 
@@ -92,12 +92,11 @@ def test_rows_are_the_metrics_of_their_queries_with_an_interval_around(ranks, qu
         for found in row.measures.values():
             assert found.low <= found.value <= found.high
             assert found.n == len(of)
-    # As `bootstrap_by_scene` draws them.
     each = query_measures(ranks.greater[1], ranks.tied[1], ranks.found[1], 10_000, RECALLS)
     scenes = [q.scene_id for q in queries]
     for name, statistic in (("mrr", np.mean), ("median_rank", np.median), ("recall@10", np.mean)):
         found = rows[1].measures[name]
-        drawn = bootstrap_by_scene(each[name], scenes, statistic, seed=3)
+        drawn = interval(each[name], scenes, statistic, seed=3)
         assert (found.low, found.high) == pytest.approx(drawn)
     assert rows == retrieval_rows_of("tiny", "one", ranks, queries, seed=3)
     assert rows != retrieval_rows_of("tiny", "one", ranks, queries, seed=4)
