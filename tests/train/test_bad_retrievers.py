@@ -27,7 +27,7 @@ Rows = list[dict]
 def edited(folder: Path, root: Path, edit: Callable[[Rows], Rows]) -> str:
     """A store of stores with a copy of a benchmark, sealed, whose queries are edited."""
     copy = root / folder.name
-    shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("frames", "embeddings"))
+    shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("embeddings"))
     path = copy / "retrieval.parquet"
     save_rows(edit(load_rows(path)), path)
     manifest = json.loads((copy / store.MANIFEST).read_text())
