@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
@@ -26,6 +26,12 @@ _LATEX = {
     "->": r"$\rightarrow$",
     "…": r"\ldots{}",
 }
+
+
+class Best(str):
+    """A cell that is the best of its column: bold, except in plain text."""
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True)
@@ -134,8 +140,14 @@ def _line(row: Iterable[str], widths: list[int]) -> str:
 
 def _piped(row: Sequence[str], raw: int = 0) -> str:
     """A line of a Markdown table; the first `raw` cells are Markdown already."""
-    cells = [*row[:raw], *map(_plain, row[raw:])]
+    cells = [*row[:raw], *_shown(row[raw:], _plain, "**{}**")]
     return f"| {' | '.join(cells)} |"
+
+
+def _shown(row: Iterable[str], written: Callable[[str], str], bold: str) -> list[str]:
+    """Each cell as a format has it written, the best ones in its way of bold."""
+    cells = ((cell, written(cell.strip())) for cell in row)
+    return [bold.format(text) if isinstance(cell, Best) else text for cell, text in cells]
 
 
 def _plain(text: str) -> str:
@@ -144,7 +156,7 @@ def _plain(text: str) -> str:
 
 
 def _ampersands(row: Sequence[str]) -> str:
-    return f"{' & '.join(_latex(cell.strip()) for cell in row)} \\\\"
+    return " & ".join(_shown(row, _latex, r"\textbf{{{}}}")) + r" \\"
 
 
 def _latex(text: str) -> str:
@@ -154,8 +166,7 @@ def _latex(text: str) -> str:
 def _tagged(row: Sequence[str], tag: str, first: str | None = None) -> str:
     """A line of an HTML table, its cells in elements of `tag`, the first one in that of `first`."""
     tags = [first or tag, *[tag] * (len(row) - 1)]
-    cells = [
-        f"<{t}>{escape(cell.strip())}</{t.split()[0]}>" for t, cell in zip(tags, row, strict=True)
-    ]
+    told = zip(tags, _shown(row, escape, "<b>{}</b>"), strict=True)
+    cells = [f"<{t}>{cell}</{t.split()[0]}>" for t, cell in told]
     under = ' class="under"' if row[0].startswith("  ") else ""
     return f"<tr{under}>{''.join(cells)}</tr>"

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from evaluation.formats import NAME_WIDTH, Table, clipped
+from evaluation.formats import NAME_WIDTH, Best, Table, clipped
 
 NAMES = (
     "a & b | c_d # 100% $x$",
@@ -96,6 +96,15 @@ def unescaped(text: str) -> str:
 )
 def test_a_format_holds_every_cell(written, read):
     assert read(written) == ROWS
+
+
+def test_the_best_of_a_column_stands_bold_and_the_rest_do_not():
+    table = Table("t", "c", ["Name", "R"], {"": [["a", Best("9 & 10")], ["b", "8"]]})
+    assert table.as_html().count("<b>") == table.as_html().count("<td><b>9 &amp; 10</b></td>") == 1
+    assert r"| **9 \& 10** |" in table.as_markdown()
+    assert "| 8 |" in table.as_markdown()
+    assert table.as_latex().count("textbf") == table.as_latex().count(r"\textbf{9 \& 10} \\") == 1
+    assert "*" not in table.as_text()
 
 
 def test_latex_closes_what_it_opens():
