@@ -32,6 +32,8 @@ def selection_row(
     credits: Sequence[float],
     parse_rate: float | None,
     seed: int,
+    suite: str | None = None,
+    control: str | None = None,
 ) -> SelectionRow:
     """A row of the credit that each item was given, 1 for a right choice and 1/m for a tie among m.
     The scenes of macro's interval are drawn by `seed`."""
@@ -40,7 +42,8 @@ def selection_row(
     timed = [(i, credit) for i, credit in zip(items, credits, strict=True) if i.family == "time"]
     horizons = accuracy_by([f"{CELLS[i.subtype]} s" for i, _ in timed], [c for _, c in timed])
     accuracy = accuracy_table(families, credits)
-    return SelectionRow.of(benchmark, name, mode, accuracy, parse_rate, macro, horizons)
+    told = (macro, horizons, suite, control)
+    return SelectionRow.of(benchmark, name, mode, accuracy, parse_rate, *told)
 
 
 def by_subtype(items: Sequence[SelectionItem], credits: Sequence[float]) -> dict[str, Interval]:

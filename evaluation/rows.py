@@ -25,7 +25,8 @@ class SelectionRow:
 
     `mode` says how it was asked, such as answer, reasoning or similarity; `parse_rate` is None
     where nothing is parsed; `n` is the number of items. `horizons` are the time items by their
-    distance, "1 s" and "2 s"; the interval of `macro` is drawn over scenes.
+    distance, "1 s" and "2 s"; the interval of `macro` is drawn over scenes. `suite` and `control`
+    are those of `SelectCommand`, None where all items were shown as they are.
     """
 
     benchmark: str
@@ -38,6 +39,8 @@ class SelectionRow:
     n: int
     macro_interval: Interval | None = None
     horizons: dict[str, Interval] = field(default_factory=dict)
+    suite: str | None = None
+    control: str | None = None
 
     @classmethod
     def of(
@@ -49,9 +52,11 @@ class SelectionRow:
         parse_rate: float | None,
         macro_interval: Interval | None = None,
         horizons: dict[str, Interval] | None = None,
+        suite: str | None = None,
+        control: str | None = None,
     ) -> SelectionRow:
         shares = (found.families, found.macro, found.micro, parse_rate)
-        told = (macro_interval, horizons or {})
+        told = (macro_interval, horizons or {}, suite, control)
         return cls(benchmark, name, mode, *shares, found.micro.n, *told)
 
     def to_dict(self) -> dict[str, Any]:

@@ -41,8 +41,8 @@ def write_report(
     for (mode, control), said in given.items():
         right = [a.right for a in said]
         parsed = sum(a.letter is not None for a in said) / len(said)
-        measured = ", ".join(filter(None, (benchmark, cfg.suite, control)))
-        row = selection_row(measured, name, mode, items, right, parsed, cfg.seed)
+        asked = (cfg.seed, cfg.suite, control)
+        row = selection_row(benchmark, name, mode, items, right, parsed, *asked)
         rows.append(row)
         told[way(mode, control)] = said
         if control == cfg.control:

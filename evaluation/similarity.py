@@ -41,7 +41,6 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     candidates = {FrameRef(c.scene_id, c.frame) for item in items for c in item.candidates}
     frames = Frames(store, preset.image_size)
     precision = settled(trained.train.precision)
-    asked_of = ", ".join(filter(None, (store.name, cfg.suite)))
     rows, subtypes, letters, apart = [], {}, {}, []
     for embedder in embedding.embedders(folder, preset, precision, store, run.folder):
         asked = embedding.embed_queries(embedder, items, store, frames, cfg.batch)
@@ -50,7 +49,8 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         scores = nearest.candidate_scores(items, asked, shown, preset)
         right = nearest.credits(scores, [item.answer for item in items])
         name = embedder.name
-        rows.append(selection_row(asked_of, name, SIMILARITY, items, right, None, cfg.seed))
+        how = (None, cfg.seed, cfg.suite)
+        rows.append(selection_row(store.name, name, SIMILARITY, items, right, *how))
         subtypes[name] = by_subtype(items, right)
         letters[name] = positions(nearest.letters(scores), [item.letter for item in items])
         if cfg.suite == MATCHED:

@@ -21,7 +21,6 @@ from evaluation.page.said import (
     answers_of,
     check_same_build,
     check_same_items,
-    control_of,
 )
 from evaluation.paired import Paired
 from evaluation.select import chosen_items
@@ -53,13 +52,13 @@ def browser_of(choices: Sequence[Measured], stores: Path, bound: int, seed: int)
         UserError: two runs measured different items, or builds, of one benchmark.
     """
     said = {m.run.folder: answers_of(m.run) for m in choices if m.run.kind == "select"}
-    opened = {name: _open(stores / name) for name in dict.fromkeys(map(_store_name, choices))}
-    ids = [_item_ids(m, said, opened[_store_name(m)]) for m in choices]
+    opened = {name: _open(stores / name) for name in dict.fromkeys(m.benchmark for m in choices)}
+    ids = [_item_ids(m, said, opened[m.benchmark]) for m in choices]
     check_same_items(choices, ids)
     check_same_build([m.run for m in once(choices) if m.run.kind == "select"])
     browser = Browser()
     for name, store in opened.items():
-        answered = [m for m in once(choices) if _store_name(m) == name and _answers(m, said)]
+        answered = [m for m in once(choices) if m.benchmark == name and _answers(m, said)]
         if answered and isinstance(store, str):
             browser.notes.append(f"The items of {name} cannot be shown: {store}.")
         elif answered:
@@ -80,11 +79,11 @@ def _add(
     answers: dict[str, Mapping[str, Said]] = {}
     models: dict[str, dict[str, tuple[Measured, Mapping[str, Said]]]] = {}
     for m in answered:
-        label = ", ".join(filter(None, (m.label, control_of(m.benchmark))))
+        label = ", ".join([m.label, *m.ways])
         answers[label] = given = _answers(m, said)
-        models.setdefault(m.benchmark, {})[label] = (m, given)
+        models.setdefault(m.items, {})[label] = (m, given)
         pairs = [(every[k].letter, s.choice.letter) for k, s in given.items() if k in every]
-        browser.confusions.setdefault(m.benchmark, {})[label] = plots.confusion(pairs)
+        browser.confusions.setdefault(m.items, {})[label] = plots.confusion(pairs)
     # A control is held against the items as they are where it is measured.
     if plain := models.get(store.name):
         browser.apart[store.name] = apart(plain, every, seed)
@@ -106,13 +105,9 @@ def _add(
     browser.notes += [f"Frames are missing: {why}." for why in gone[:1]]
 
 
-def _store_name(m: Measured) -> str:
-    return m.benchmark.split(", ")[0]
-
-
 def _answers(m: Measured, said: RunAnswers) -> Mapping[str, Said]:
     of_run = said.get(m.run.folder, {})
-    return of_run.get((m.row.mode, control_of(m.benchmark)), {})
+    return of_run.get((m.row.mode, m.row.control), {})
 
 
 def _item_ids(m: Measured, said: RunAnswers, store: Store | str) -> Mapping[str, object] | None:

@@ -34,6 +34,18 @@ class Measured:
         return self.row.benchmark
 
     @property
+    def ways(self) -> list[str]:
+        """How its items were chosen and shown, where that is not all of them as they are."""
+        if isinstance(self.row, RetrievalRow):
+            return []
+        return [way for way in (self.row.suite, self.row.control) if way is not None]
+
+    @property
+    def items(self) -> str:
+        """What its items are called, those of the whole benchmark by its name."""
+        return ", ".join([self.benchmark, *self.ways])
+
+    @property
     def trained(self) -> bool:
         return self.training is not None
 
@@ -69,7 +81,7 @@ class Measured:
         return self.run.report.get(kind, {}).get(key)
 
     @property
-    def suite(self) -> str:
+    def column(self) -> str:
         """What a column of this benchmark is called."""
         simulator = self.run.config.get("benchmark", {}).get("simulator")
         return SUITES.get(simulator, self.benchmark)
@@ -115,7 +127,7 @@ def _place(m: Measured) -> tuple:
     """What tells a row from others of a table."""
     row = m.row
     how = row.mode if isinstance(row, SelectionRow) else (row.width, row.builder)
-    return m.run.kind, row.benchmark, row.name, how
+    return m.run.kind, m.items, row.name, how
 
 
 def _with_run(m: Measured) -> Measured:
@@ -123,11 +135,11 @@ def _with_run(m: Measured) -> Measured:
     return replace(m, row=row, reported=m.row.name)
 
 
-def by_benchmark(rows: Iterable[Measured]) -> dict[str, list[Measured]]:
-    """What is measured on another benchmark is measured on other items: never in one table."""
+def by_items(rows: Iterable[Measured]) -> dict[str, list[Measured]]:
+    """What is measured on other items never stands in one table."""
     found: dict[str, list[Measured]] = {}
     for m in rows:
-        found.setdefault(m.benchmark, []).append(m)
+        found.setdefault(m.items, []).append(m)
     return found
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from conf.errors import UserError
-from conf.schema.commands import CONTROLS
 from evaluation.page.gathering import Finished, json_lines
 from evaluation.page.rows import Measured
 from evaluation.paired import same_items
@@ -28,11 +27,6 @@ class Said:
     @cached_property
     def choice(self) -> Choice:
         return parse(self.text, cut=self.cut)
-
-
-def control_of(benchmark: str) -> str | None:
-    """The control in a row's benchmark, such as "tiny, candidate_only"."""
-    return next((part for part in benchmark.split(", ")[1:] if part in CONTROLS), None)
 
 
 def answers_of(run: Finished) -> dict[Asked, dict[str, Said]]:
@@ -81,7 +75,7 @@ def check_same_items(rows: Sequence[Measured], ids: Sequence[Mapping[str, object
     """
     first: dict[str, int] = {}
     for k, m in enumerate(rows):
-        j = first.setdefault(m.benchmark, k)
+        j = first.setdefault(m.items, k)
         names = (str(rows[j].run.folder), str(m.run.folder))
         try:
             if ids[j] is not None and ids[k] is not None:

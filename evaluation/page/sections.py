@@ -18,7 +18,7 @@ from evaluation.metrics import Interval
 from evaluation.page import plots
 from evaluation.page import tables as shaped
 from evaluation.page.gathering import STUDIES, TRAININGS, Finished, json_lines, unreadable
-from evaluation.page.rows import Measured, by_benchmark, transfers, widest
+from evaluation.page.rows import Measured, by_items, transfers, widest
 from evaluation.page.tables import ABLATED, REGIMES
 from evaluation.paired import Paired
 from train.plots import curves_figure
@@ -59,14 +59,14 @@ def sections_of(
         apart: by benchmark, what pairs of models are apart.
         folder: where figures are drawn.
     """
-    plain = [m for m in choices if ", " not in m.benchmark]
+    plain = [m for m in choices if not m.ways]
     every = [m for m in ranks if m.row.builder is None]
     found = [
         zero_shot(plain, every, folder),
         distillation(plain, every, apart),
         ablation(plain),
         transfer(plain, apart),
-        controls([m for m in choices if ", " in m.benchmark], runs),
+        controls([m for m in choices if m.ways], runs),
         *(study(run) for run in runs if run.kind in STUDIES),
         choices_in_detail(plain, confusions, folder),
         rankings_in_detail(every, folder),
@@ -78,12 +78,12 @@ def sections_of(
 def zero_shot(choices: Sequence[Measured], ranks: Sequence[Measured], folder: Path) -> Section:
     section = Section("Zero-shot")
     abroad = transfers(choices)
-    for benchmark, rows in by_benchmark(m for m in choices if not m.trained).items():
+    for benchmark, rows in by_items(m for m in choices if not m.trained).items():
         if benchmark not in abroad:
             section.tables.append(shaped.selection_zero_shot(benchmark, rows))
-    for benchmark, rows in by_benchmark(m for m in ranks if not m.trained).items():
+    for benchmark, rows in by_items(m for m in ranks if not m.trained).items():
         section.tables.append(shaped.retrieval_zero_shot(benchmark, widest(rows)))
-    for benchmark, rows in by_benchmark(choices).items():
+    for benchmark, rows in by_items(choices).items():
         caption = f"Accuracy by family on {benchmark}, with 95% intervals."
         drawn = _draw(
             folder, f"families-{benchmark}", figures.selection_figure, [m.row for m in rows]
@@ -99,11 +99,11 @@ def distillation(
 ) -> Section:
     section = Section("Distillation")
     abroad = transfers(choices)
-    for benchmark, rows in by_benchmark(choices).items():
+    for benchmark, rows in by_items(choices).items():
         if benchmark not in abroad and any(m.trained for m in rows):
             section.tables.append(shaped.selection_distilled(benchmark, rows))
             _add_apart(section, benchmark, apart)
-    for benchmark, rows in by_benchmark(ranks).items():
+    for benchmark, rows in by_items(ranks).items():
         if any(m.trained for m in rows):
             section.tables.append(shaped.retrieval_distilled(benchmark, widest(rows)))
     return section
@@ -134,7 +134,7 @@ def transfer(
     caption = "Transfer: accuracy over all items (%)"
     reference = {"paper, Section 5.3 (answer mode)": paper.TRANSFER}
     section.tables.append(shaped.overall_table("transfer", caption, told, labels, reference))
-    for benchmark, rows in by_benchmark(choices).items():
+    for benchmark, rows in by_items(choices).items():
         if benchmark in abroad:
             section.tables.append(shaped.selection_transfer(benchmark, rows))
             _add_apart(section, benchmark, apart)
@@ -166,7 +166,7 @@ def controls(choices: Sequence[Measured], runs: Sequence[Finished]) -> Section:
                 ways = [told["mode"]] if run.kind == "similarity" else [_model(run), told["mode"]]
             except (KeyError, TypeError) as error:
                 raise unreadable(run.folder) from error
-            way = ", ".join([run.report["rows"][0]["benchmark"].partition(",")[0], *ways])
+            way = ", ".join([run.report["rows"][0]["benchmark"], *ways])
             apart.setdefault((run.folder, way, pair.left, pair.right), []).append(pair)
     if apart:
         ways = Counter(key[1:] for key in apart)
@@ -178,7 +178,7 @@ def controls(choices: Sequence[Measured], runs: Sequence[Finished]) -> Section:
         )
         caption = "Controls: paired differences of accuracy (%)"
         section.tables.append(replace(table, name="controls", caption=caption))
-    for benchmark, rows in by_benchmark(choices).items():
+    for benchmark, rows in by_items(choices).items():
         name = f"control-{benchmark.replace(', ', '-')}"
         caption = f"Controls: selection accuracy (%) on {benchmark}"
         section.tables.append(shaped.selection_trained(name, caption, rows, {}))
@@ -211,7 +211,7 @@ def choices_in_detail(
         UserError: what a run reports is of another version.
     """
     section = Section("Selection in detail")
-    for benchmark, rows in by_benchmark(choices).items():
+    for benchmark, rows in by_items(choices).items():
         cells = _told(rows, "subtypes", _intervals)
         horizons = {label: by for label, of in cells.items() if (by := plots.by_horizon(of))}
         if horizons:
@@ -260,7 +260,7 @@ def _told(rows: Sequence[Measured], kind: str, read: Callable[[Any], T]) -> dict
 
 def rankings_in_detail(ranks: Sequence[Measured], folder: Path) -> Section:
     section = Section("Retrieval in detail")
-    for benchmark, rows in by_benchmark(ranks).items():
+    for benchmark, rows in by_items(ranks).items():
         of_all = [m.row for m in rows]
         section.tables.append(_renamed(tables.cost_table(of_all), benchmark))
         section.details.append(_renamed(tables.retrieval_table(of_all), benchmark, "widths"))

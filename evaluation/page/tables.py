@@ -85,7 +85,7 @@ def selection_trained(
         "trained": selection_cells([m.row for m in rows if m.trained]),
         **{label: selection_references(told) for label, told in reference.items()},
     }
-    head = [f"Selection, {rows[0].benchmark}", *SELECTION_HEAD]
+    head = [f"Selection, {rows[0].items}", *SELECTION_HEAD]
     told = _with_best(head, _told(parts), SELECTION_BEST)
     return Table(name, caption, head, told, (SELECTION_NOTE, BOLD))
 
@@ -146,7 +146,7 @@ def overall_table(
     columns = [
         "In domain"
         if m.benchmark == m.home or (not m.trained and m.benchmark in homes)
-        else m.suite
+        else m.column
         for m in rows
     ]
     suites = dict.fromkeys(["In domain", *SUITES.values(), *columns])

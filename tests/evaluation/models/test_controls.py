@@ -53,8 +53,8 @@ def test_a_prefix_is_worth_what_its_items_lose_without_it(
     told = json.loads((tmp_path / "report.json").read_text())
     name = micro_store.name
     rows = [SelectionRow.from_dict(r) for r in told["rows"]]
-    assert [(r.benchmark, r.mode) for r in rows] == [
-        (name, "answer"), (f"{name}, candidate_only", "answer"),
+    assert [(r.benchmark, r.control, r.mode) for r in rows] == [
+        (name, None, "answer"), (name, "candidate_only", "answer"),
     ]  # fmt: skip
     assert metrics["answer_micro"] == rows[1].micro.value == control / 12
     whole = next(p for p in told["controls"] if p["of"] == "all")

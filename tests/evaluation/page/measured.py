@@ -74,6 +74,7 @@ def select_run(
     items: Sequence[SelectionItem] | None = None,
     model: str | None = None,
     mode: str = "answer",
+    suite: str | None = None,
 ) -> Path:
     """A run of evaluation.select over `items` (null takes the test's); `model` is a run of
     train.sft."""
@@ -81,13 +82,14 @@ def select_run(
     folder = root / "select" / name
     settings = SelectCommand(
         benchmark=benchmark, student=STUDENT, store=str(store.folder.parent),
-        model=None if model is None else f"{root}/sft/{model}",
+        model=None if model is None else f"{root}/sft/{model}", suite=suite,
     )  # fmt: skip
     chosen = [parse(say(item)).letter for item in items]
     credits = [float(c == item.letter) for c, item in zip(chosen, items, strict=True)]
     accuracy = accuracy_table([i.family for i in items], credits)
     parsed = sum(c is not None for c in chosen)
-    row = SelectionRow.of(store.name, model or "small base", mode, accuracy, parsed / len(items))
+    name = model or "small base"
+    row = SelectionRow.of(store.name, name, mode, accuracy, parsed / len(items), suite=suite)
     cells = accuracy_by([f"{i.family}/{i.subtype}" for i in items], credits)
     letters = positions(chosen, [i.letter for i in items])
     report = {

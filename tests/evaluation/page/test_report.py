@@ -12,6 +12,7 @@ import pytest
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import ReportCommand
+from data.controls import MATCHED
 from evaluation import report
 from tests.evaluation.page.measured import retrieve_run, right, select_run, similarity_run
 
@@ -160,10 +161,27 @@ def test_what_was_said_before_a_model_changed_is_left_out(runs, micro_store):
     assert all(s["text"] != "stale" for i in page_data(folder)["items"] for s in i["said"])
 
 
+def test_what_a_suite_is_answered_stands_beside_what_all_items_are(
+    runs, micro, micro_store
+) -> None:
+    """Both of one model, whose answers are told apart."""
+    everything = {"runs": ["select/*"], "items": 500}
+    before = page_data(reported(runs, micro_store.folder.parent, **everything))["items"]
+    pairs = micro_store.selection("test")[:6]
+    suite = {"model": "cot", "mode": "reasoning", "suite": MATCHED}
+    select_run(runs, micro_store, micro, "pairs", right, pairs, **suite)
+    after = page_data(reported(runs, micro_store.folder.parent, **everything))["items"]
+    said = {item["id"]: {s["by"] for s in item["said"]} for item in after}
+    for item in before:
+        assert {s["by"] for s in item["said"]} <= said[item["id"]]
+    of_suite = {name for name, by in said.items() if "cot (reasoning), matched_anchor" in by}
+    assert of_suite == {item.item_id for item in pairs}
+
+
 def test_controls_are_gathered_with_their_differences(runs, micro_store):
     path = runs / "select" / "cot" / "report.json"
     told = json.loads(path.read_text())
-    row = dict(told["rows"][0], benchmark="micro, candidate_only")
+    row = dict(told["rows"][0], control="candidate_only")
     told["rows"].append(row)
     told["controls"] = [
         {"mode": "reasoning", "left": "items as they are", "right": "candidate_only", "n": 63,
