@@ -47,6 +47,8 @@ async def say(
             one though it answers others.
     """
     loop = asyncio.get_running_loop()
+    # What is held to a record from its first token on has no thought.
+    opened = cfg.thinking and mode != "constrained"
     # Frames are kept in one cache, which takes one thread at a time.
     with ThreadPoolExecutor(1) as desk:
         first = await loop.run_in_executor(desk, sample_of, things[0])
@@ -65,7 +67,7 @@ async def say(
                         f"{server.model} has no answer about {thing.name} ({fault}); once that is "
                         "mended, run the same command again, it goes on with what is answered"
                     ) from fault
-                keep([(thing, written(reply, cfg.thinking))])
+                keep([(thing, written(reply, opened))])
 
             await in_lanes(things, server.concurrency, ask)
 
@@ -136,13 +138,13 @@ def request_of(cfg: StudentConfig, mode: str, clip: Clip | None) -> Request:
     return request
 
 
-def written(reply: Reply, thinking: bool) -> Written:
-    """What a server's model wrote, its thought within the text. A thought that the prompt opens,
-    or that the server has taken out, is opened again."""
+def written(reply: Reply, opened: bool) -> Written:
+    """What a server's model wrote, its thought within the text. A thought that the prompt has
+    `opened`, or that the server has taken out, is opened again."""
     text = reply.text
     if reply.thought:
         text = f"{THOUGHT}{reply.thought}" + (f"</think>{text}" if text else "")
-    elif thinking and THOUGHT not in text:
+    elif opened and THOUGHT not in text:
         text = f"{THOUGHT}{text}"
     return Written(text, reply.flaw == CUT_OFF)
 

@@ -47,13 +47,13 @@ _VALUE_ENDS = re.compile(r"""\s*(?:[,}\]"']|$)""")
 _ANSWER = re.compile(
     r"(?:^|[.!?;]\s)[ \t*_#>`\-]*(?:(?:so|thus|hence|therefore),?\s+)?(?:(?:the|my)\s+)?"
     r"(?:(?:final|correct|best|forced)[ \t_]+)*(?:answer|choice)[*_`]*"
-    r"\s*(?:\bis\b\s*:?|[:=])(?P<value>\s*[^\n]*)",
+    r"(?:\s*(?:\bis\b\s*:?|[:=])|[ \t]*(?=\n))(?P<value>\s*[^\n]*)",
     re.IGNORECASE | re.MULTILINE,
 )
 _ONE = re.compile(
     r"(?:the\s+)?(?:(?:correct|best|right|final)\s+)?"
     r"(?:(?:option|candidate|image|choice|frame|letter|answer)(?:\s+is)?[\s:#.\-]\s*)?"
-    r"(?P<letter>[^\W_])(?!\w)\s*(?P<rest>$|(?:[.,:;!?/|&+=]|[\-–—](?!\w)|because\b|since\b).*)",
+    r"(?P<letter>[^\W_])(?!\w)\s*(?P<rest>$|(?:[.,:;!?/|&+=。]|[\-–—](?!\w)|because\b|since\b).*)",
     re.IGNORECASE | re.DOTALL,
 )
 _STANDALONE = re.compile(
@@ -64,6 +64,8 @@ _BETWEEN = frozenset(
     ("or", "and", "vs", "to", "either", "both", "but", "maybe", "possibly", "perhaps", "option")
 )
 
+_UNSEEN = re.compile("[\u200b-\u200f\u2060\ufeff]")
+_LATEX = re.compile(r"\\(?:boxed|text(?:bf|rm|tt)?|math(?:bf|rm|tt)|displaystyle)(?![a-z])")
 _EMPTY = frozenset(("", "null"))
 _DECLINES = frozenset(("none", "n/a", "na", "nil", "no", "neither", "unknown", "unsure", "abstain"))
 _REFUSAL = re.compile(
@@ -75,7 +77,9 @@ _REFUSAL = re.compile(
     re.IGNORECASE,
 )
 _DENIAL = re.compile(
-    r"none of|no (?:correct|valid|suitable) (?:answer|option|choice|candidate|image)", re.IGNORECASE
+    r"none of|\bor none\b|no (?:correct|valid|suitable) (?:answer|option|choice|candidate|image)|"
+    r"\bwait\b|can\s?not be determined|\b(?:that|this|it)(?:'s| is) (?:wrong|incorrect|not right)",
+    re.IGNORECASE,
 )
 """Takes back a letter that was said before it."""
 
@@ -99,7 +103,7 @@ def parse(raw: str, letters: str = LETTERS, cut: bool = False) -> Choice:
         cut: whether the model was stopped before its output's end, so that the last word may be a
             part of one.
     """
-    text = unicodedata.normalize("NFKC", raw)
+    text = _UNSEEN.sub("", unicodedata.normalize("NFKC", raw))
     text = text.rpartition("</think>")[2]
     if "<think>" in text:
         return Choice(None, Reason.CUT_OFF)
@@ -225,8 +229,9 @@ def _agree(choices: list[Choice]) -> Choice:
 
 
 def _bare(value: str) -> str:
-    """A value without its quotes, brackets and markdown; apostrophes inside words stay."""
-    value = re.sub(r"\\(?:boxed|text)\b|[*_`\"“”()\[\]{}<>$\\]+|(?<!\w)'|'(?!\w)", " ", value)
+    """A value without its quotes, brackets, LaTeX and markdown; apostrophes inside words stay."""
+    value = _LATEX.sub(" ", value)
+    value = re.sub(r"[*_`\"“”()\[\]{}<>$\\]+|(?<!\w)'|'(?!\w)", " ", value)
     return " ".join(value.split())
 
 
@@ -265,6 +270,6 @@ def _lone(text: str, letters: str) -> Choice:
         refused = _REFUSAL.search(value)
         return Choice(None, Reason.REFUSAL if refused else Reason.NO_ANSWER)
     choice, one = _read(value, letters), _ONE.fullmatch(value)
-    if choice.letter and one["rest"].strip(" .,:;!?"):
+    if choice.letter and one["rest"].strip(" .,:;!?。"):
         return Choice(None, Reason.NO_ANSWER)
     return choice

@@ -86,9 +86,12 @@ def pixels(png: str) -> np.ndarray:
 
 def test_a_model_is_held_to_the_schema_and_draws_by_seeds(items, frames, talking) -> None:
     server = talking(lambda _: FULL)
+    said = []
     for seed in (0, 0, 1):
         held = asker(at(server), frames, THINKING, "constrained", seed=seed)
-        held(items[:2], lambda _: None)
+        held(items[:2], said.extend)
+    answers = [judge(item, "constrained", found) for item, found in said]
+    assert [(a.letter, a.valid) for a in answers] == [("C", True)] * 6
     format_ = server.asked[0]["response_format"]
     assert format_["json_schema"]["schema"] == schema()
     sampling = {key: server.asked[0][key] for key in ("temperature", "top_p", "top_k")}
