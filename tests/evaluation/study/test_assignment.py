@@ -49,6 +49,25 @@ def test_the_right_answer_stands_everywhere_equally_often(items, seed) -> None:
         assert all(sorted(p.order) == [0, 1, 2, 3] for p in planned)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_pages_side_by_side_show_all_candidates_moving_alike(items, seed) -> None:
+    of = {i.item_id: i for i in items}
+    by_item: dict[str, list[tuple[int, ...]]] = {}
+    for p in plan(items, NAMES, seed):
+        by_item.setdefault(p.item_id, []).append(p.order)
+    right, wrong = Counter(), Counter()
+    for name, orders in by_item.items():
+        for candidate in range(4):
+            places = [order.index(candidate) for order in orders]
+            assert sorted(places) == [0, 1, 2, 3]
+            moved = right if candidate == of[name].answer else wrong
+            moved[places[0], places[1]] += 1
+    # Of the twelve ways to move from one page to the next none tells the right answer.
+    assert len(wrong) == 12
+    assert len(right) >= 10
+    assert max(right.values()) < len(items) / 3
+
+
 def test_orders_come_from_the_seed_and_the_items_and_are_each_annotators_own(items) -> None:
     planned = plan(items, NAMES, 0)
     assert planned == plan(items, NAMES, 0)
