@@ -23,28 +23,28 @@ def summary(votes: Sequence[Vote], items: int, annotators: Sequence[str]) -> dic
 
     Args:
         items: how many the study asks, answered or not.
-        annotators: everyone who has an account.
+        annotators: everyone who has an account, whether it was used or not.
 
     Returns:
-        `items`, `judgments`, `annotators`; `depth`, how many items have each number of votes;
-        `accuracy` by annotator, with `families`, `macro` and `micro` as in
-        `evaluation.metrics.Accuracy`, of those who answered; `majority`, the same of the items that
-        have a vote, and how many of them are `undecided`; `fleiss_kappa` with the `items` that
-        every annotator answered; `krippendorff_alpha` with the `items` of two votes or more; and
-        median `seconds` by family.
+        `items`, `judgments`; `annotators`, those who answered; `depth`, how many items have each
+        number of votes; `accuracy` by annotator, with `families`, `macro` and `micro` as in
+        `evaluation.metrics.Accuracy`; `majority`, the same of the items that have a vote, and how
+        many of them are `undecided`; `fleiss_kappa` with the `items` that all of them answered;
+        `krippendorff_alpha` with the `items` of two votes or more; and median `seconds` by family.
     """
     by_item = _grouped(votes, "item_id")
     by_annotator = _grouped(votes, "annotator")
     chosen = {item: [vote.choice for vote in of] for item, of in by_item.items()}
-    complete = [c for c in chosen.values() if len(c) == len(annotators)]
+    took_part = [a for a in annotators if a in by_annotator]
+    complete = [c for c in chosen.values() if 1 < len(c) == len(took_part)]
     several = [c for c in chosen.values() if len(c) > 1]
     depth = Counter(map(len, chosen.values())) + Counter({0: items - len(chosen)})
     return {
         "items": items,
         "judgments": len(votes),
-        "annotators": list(annotators),
+        "annotators": took_part,
         "depth": {str(votes): depth[votes] for votes in sorted(depth)},
-        "accuracy": {a: _accuracy(by_annotator[a]) for a in annotators if a in by_annotator},
+        "accuracy": {a: _accuracy(by_annotator[a]) for a in took_part},
         "majority": _majority_accuracy(by_item) if by_item else None,
         "fleiss_kappa": {"value": fleiss_kappa(complete), "items": len(complete)},
         "krippendorff_alpha": {"value": krippendorff_alpha(several), "items": len(several)},

@@ -13,10 +13,10 @@ from urllib.parse import parse_qsl
 import jinja2
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
-from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import Route
+from starlette.types import ASGIApp
 
 from data.records import LETTERS
 from evaluation.study import accounts, course
@@ -99,8 +99,12 @@ class Pages:
         session = accounts.sign_in(self._db, link)
         if session is None:
             raise HTTPException(410)
-        self._links_changed()
         log.info("%s signed in", name)
+        try:
+            self._links_changed()
+        except OSError as error:
+            # The link is spent: without the session its owner would be locked out.
+            log.warning("the file of links still holds that of %s: %s", name, error)
         response = RedirectResponse("/", 303)
         response.set_cookie(
             COOKIE, session, max_age=COOKIE_SECONDS, httponly=True, samesite="lax",
@@ -185,16 +189,17 @@ def make_app(
     rest_every: int,
     public: str | None,
     links_changed: Callable[[], None],
-) -> Starlette:
+) -> ASGIApp:
     """The study as an ASGI application; `public` is its address behind a proxy, if it has one."""
     secure = (public or "").startswith("https:")
     pages = Pages(db, rest_every, secure, links_changed)
-    return Starlette(
+    app = Starlette(
         routes=pages.routes(),
-        middleware=[Middleware(Guard, public=public)],
         exception_handlers={HTTPException: pages.refusal, 500: pages.refusal},
         max_body_size=FORM_BYTES,
     )
+    # Around all of it: what Starlette itself replies to a long body or an error goes through too.
+    return Guard(app, public)
 
 
 async def form_of(request: Request) -> dict[str, str]:

@@ -31,7 +31,8 @@ class Planned:
 
 @dataclass(frozen=True)
 class Waiting:
-    """An item that an annotator has not been asked. `votes` counts the others' answers to it."""
+    """An item that an annotator has not been asked. `votes` counts the others' answers
+    to it, and those who have it open."""
 
     item_id: str
     family: str

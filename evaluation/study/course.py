@@ -16,6 +16,8 @@ from evaluation.study.assignment import Waiting, next_item
 from evaluation.study.media import PREFIX
 from evaluation.study.storage import transaction
 
+ABANDONED = 3600.0
+"""Seconds after which an item that was opened and not answered counts as one that was not."""
 ANSWERED = """
     SELECT turn.* FROM turn JOIN item USING (item_id)
     WHERE annotator = ? AND practice = ? AND answered IS NOT NULL
@@ -209,10 +211,11 @@ def _open(db: sqlite3.Connection, name: str, practice: bool) -> str:
 def _waiting(db: sqlite3.Connection, name: str, practice: bool) -> list[Waiting]:
     rows = db.execute(
         "SELECT item_id, family, scene_id, prefix_stop, rank, "
-        "(SELECT count(*) FROM turn WHERE turn.item_id = item.item_id) AS votes "
+        "(SELECT count(*) FROM turn WHERE turn.item_id = item.item_id "
+        "AND (answered IS NOT NULL OR opened > ?)) AS votes "
         "FROM plan JOIN item USING (item_id) WHERE annotator = ? AND practice = ? "
         "AND item_id NOT IN (SELECT item_id FROM turn WHERE annotator = ?)",
-        (name, practice, name),
+        (time.time() - ABANDONED, name, practice, name),
     )
     return [Waiting(**dict(row)) for row in rows]
 

@@ -28,7 +28,7 @@ def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
     if not storage.begun(path):
         raise UserError(f"{path} is not there: begin a study with python -m evaluation.study")
     db = storage.open_study(path)
-    with storage.transaction(db):
+    with storage.transaction(db, reads=True):
         votes = list(votes_of(db))
         about, items = storage.about(db), len(storage.item_ids(db, practice=False))
         annotators = storage.annotators(db)

@@ -119,9 +119,9 @@ def open_study(path: Path) -> sqlite3.Connection:
 
 
 @contextmanager
-def transaction(db: sqlite3.Connection) -> Iterator[None]:
-    """All that happens within, or nothing of it."""
-    db.execute("BEGIN IMMEDIATE")
+def transaction(db: sqlite3.Connection, reads: bool = False) -> Iterator[None]:
+    """All that happens within, or nothing of it; what only `reads` holds up nobody who writes."""
+    db.execute("BEGIN" if reads else "BEGIN IMMEDIATE")
     try:
         yield
     except BaseException:

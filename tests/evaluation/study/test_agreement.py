@@ -117,9 +117,16 @@ def test_a_study_of_the_papers_shape() -> None:
     assert max(map(len, table.splitlines())) <= 100
 
 
-def test_an_annotator_who_gave_nothing_has_no_row_and_leaves_no_complete_case() -> None:
+def test_an_annotator_who_gave_nothing_has_no_row_and_costs_no_complete_case() -> None:
+    votes = [vote(name, k, (k + (name == "A3")) % 2) for k in range(4) for name in ("A1", "A3")]
+    found = summary(votes, 4, ["A1", "A2", "A3"])
+    assert found == summary(votes, 4, ["A1", "A3"])
+    assert list(found["accuracy"]) == found["annotators"] == ["A1", "A3"]
+    assert found["fleiss_kappa"] == {"value": pytest.approx(-1.0), "items": 4}
+
+
+def test_of_one_annotator_there_is_no_agreement() -> None:
     found = summary([vote("A1", k, 0) for k in range(3)], 3, ["A1", "A2"])
-    assert list(found["accuracy"]) == ["A1"]
     assert found["fleiss_kappa"] == {"value": None, "items": 0}
     assert found["krippendorff_alpha"] == {"value": None, "items": 0}
     assert "undefined" in str(human_table(found))

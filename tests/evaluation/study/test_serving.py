@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import io
 import json
 import re
@@ -22,7 +23,8 @@ from conf.entry import Run
 from conf.schema import ExportStudyCommand
 from data.frames import Frames
 from data.records import LETTERS
-from evaluation.study import export, storage
+from evaluation.study import accounts, export, storage
+from evaluation.study.app import make_app
 from evaluation.study.guards import HEADERS, Guard
 from evaluation.study.votes import Vote, votes_of
 from tests.evaluation.study.conftest import ITEMS, SMALL
@@ -198,6 +200,45 @@ def test_every_reply_carries_the_headers_that_shut_other_sites_out(small, visito
         assert {name: told[name] for name in HEADERS} == HEADERS
         assert not {"server", "etag", "last-modified"} & {name.lower() for name in told}
     assert "unsafe" not in HEADERS["Content-Security-Policy"]
+
+
+def test_what_goes_wrong_inside_carries_them_and_locks_nobody_out(small) -> None:
+    def full() -> None:
+        raise OSError("No space left on device")
+
+    db = storage.open_study(small.folder / storage.DATABASE)
+    told = asked(make_app(db, 10, None, full), "POST", "/link", small.links()["A1"])
+    accounts.write_links(db, small.folder / accounts.LINKS, "http://here")
+    assert told["status"] == 303
+    assert any(name == b"set-cookie" for name, _ in told["headers"])
+    # Without its tables no page can be made.
+    broken = make_app(sqlite3.connect(":memory:"), 10, None, full)
+    for body, status in (("x" * 10, 500), ("x" * 5000, 413)):
+        told = asked(broken, "POST", "/link", body)
+        assert told["status"] == status
+        heads = {name.decode().lower(): value.decode() for name, value in told["headers"]}
+        assert {name: heads[name.lower()] for name in HEADERS} == HEADERS
+
+
+def asked(app, method: str, path: str, link: str) -> dict:
+    """How an application begins its reply to a form with a link."""
+    told = []
+
+    async def receive() -> dict:
+        return {"type": "http.request", "body": f"link={link}".encode(), "more_body": False}
+
+    async def send(message: dict) -> None:
+        told.append(message)
+
+    headers = [(b"host", b"here"), (b"content-length", str(len(link) + 5).encode())]
+    scope = {
+        "type": "http", "method": method, "path": path, "raw_path": path.encode(),
+        "query_string": b"", "headers": headers, "http_version": "1.1",
+    }  # fmt: skip
+    # The server logs what it re-raises.
+    with contextlib.suppress(sqlite3.Error):
+        asyncio.run(app(scope, receive, send))
+    return told[0]
 
 
 def test_a_replayed_or_early_or_forged_answer_does_nothing(small, visitor) -> None:
