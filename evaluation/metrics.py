@@ -12,16 +12,17 @@ from data.records import FAMILIES
 
 
 def gold_scores(scores: np.ndarray, gold: np.ndarray) -> np.ndarray:
-    """The fp32 scores (queries,) of the gold columns; NaN where there is none (`gold` < 0).
+    """The fp32 scores (queries,) of the gold columns; NaN where there is none.
 
     Args:
         scores: (queries, frames), numpy or a CPU tensor that numpy can read.
-        gold: (queries,) column indices.
+        gold: (queries,) column indices; below 0, NaN or None where there is none.
 
     Raises:
-        ValueError: shapes that do not fit, or a gold column past the last frame.
+        ValueError: shapes that do not fit, a gold column past the last frame, or one that is no
+            whole number.
     """
-    scores, gold = np.asarray(scores, np.float32), np.asarray(gold)
+    scores, gold = np.asarray(scores, np.float32), _columns(gold)
     if scores.ndim != 2 or gold.shape != scores.shape[:1]:
         raise ValueError(
             f"scores {scores.shape} and gold {gold.shape}: "
@@ -29,8 +30,21 @@ def gold_scores(scores: np.ndarray, gold: np.ndarray) -> np.ndarray:
         )
     if gold.size and gold.max() >= scores.shape[1]:
         raise ValueError(f"gold column {gold.max()} is past the last of {scores.shape[1]} frames")
-    own = scores[np.arange(len(gold)), np.maximum(gold, 0)]
-    return np.where(gold < 0, np.float32(np.nan), own)
+    own = np.full(len(gold), np.nan, np.float32)
+    there = np.flatnonzero(gold >= 0)
+    own[there] = scores[there, gold[there]]
+    return own
+
+
+def _columns(gold: Sequence[float | None] | np.ndarray) -> np.ndarray:
+    given = np.asarray(gold)
+    if given.dtype == bool:
+        raise ValueError("gold columns are true or false: expected whole numbers")
+    numbers = np.asarray(given, float)
+    told = np.where(np.isnan(numbers), -1, numbers)
+    if not np.isfinite(told).all() or (told != np.floor(told)).any():
+        raise ValueError("gold columns must be whole numbers")
+    return told.astype(np.int64)
 
 
 def compare(scores: np.ndarray, gold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -125,10 +139,8 @@ def summary(measure: str) -> Callable[[np.ndarray], float]:
 def rank_metrics(scores: np.ndarray, gold: np.ndarray, ks: Sequence[int]) -> dict[str, float]:
     """`metrics_from_counts` of one score matrix (queries, frames) and its gold columns (queries,).
 
-    A negative gold column or a NaN gold score is a miss. Scores are compared in fp32.
-
-    Raises:
-        ValueError: no query, shapes that do not fit, or a gold column past the last frame.
+    A gold column that is negative, NaN or None, or a NaN gold score, is a miss. Scores are compared
+    in fp32. Errors are those of `gold_scores`, and ValueError where there is no query.
     """
     valid = ~np.isnan(gold_scores(scores, gold))
     return metrics_from_counts(*ranks_of(scores, gold), valid, np.shape(scores)[1], ks)

@@ -115,6 +115,22 @@ def test_all_nan_scores_tie_with_nothing():
     assert found == {"recall@1": 0.0, "mrr": 0.0, "median_rank": 4.0, "tie_rate": 0.0}
 
 
+@pytest.mark.parametrize("missing", [-1, np.nan, None])
+def test_a_missing_query_is_a_miss_however_it_is_told(missing):
+    scores = [[0.5, 0.1], [0.5, 0.1]]
+    found = rank_metrics(scores, [0, missing], [1])
+    assert found == rank_metrics(scores, np.array([0, -1]), [1])
+    assert found["recall@1"] == found["mrr"] == 0.5
+    # Nor is there a frame to find in an empty database.
+    assert rank_metrics(np.zeros((1, 0)), [missing], [1])["recall@1"] == 0
+
+
+@pytest.mark.parametrize("gold", [[0.5, 1], [True, False], [np.inf, 0]])
+def test_a_column_that_is_no_number_of_one_is_refused(gold):
+    with pytest.raises(ValueError, match="whole numbers"):
+        rank_metrics(np.zeros((2, 3)), gold, [1])
+
+
 def test_scores_are_compared_in_fp32():
     scores = np.array([[0.5, 0.5 + 1e-12, 0.1]])
     assert rank_metrics(scores, np.array([0]), [1])["tie_rate"] == 1
@@ -127,11 +143,12 @@ def test_tensors_are_read():
 
 
 @pytest.mark.parametrize(
-    ("shape", "gold"), [((2, 3), [0]), ((2, 3), [0, 3]), ((3,), [0, 1, 2]), ((0, 3), [])]
+    ("shape", "gold"),
+    [((2, 3), [0]), ((2, 3), [0, 3]), ((3,), [0, 1, 2]), ((0, 3), []), ((0,), [])],
 )
 def test_wrong_shapes_are_refused(shape, gold):
     with pytest.raises(ValueError, match=r"expected|past|no queries"):
-        rank_metrics(np.zeros(shape), np.array(gold, int), KS)
+        rank_metrics(np.zeros(shape), gold, KS)
 
 
 def test_credit_of_four_candidates():
