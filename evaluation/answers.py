@@ -100,7 +100,7 @@ class AnswerLog:
         judged: Callable[[Thing, str, Written], Kept] = judge,
     ) -> None:
         self._path = path
-        self._keys = {mode: _key(mode, what) for mode, what in asked.items()}
+        self.keys = {mode: _key(mode, what) for mode, what in asked.items()}
         self.judged = judged
         self._thing_of = {thing.name: thing for thing in things}
         read = self._read(path)
@@ -109,7 +109,7 @@ class AnswerLog:
         whole = [line for _, _, line in read]
         whole += [
             json.dumps({"key": key, "mode": mode, "asked": asked[mode]})
-            for mode, key in self._keys.items()
+            for mode, key in self.keys.items()
             if key not in told
         ]
         write_text(path, "".join(f"{line}\n" for line in whole))
@@ -139,12 +139,12 @@ class AnswerLog:
         return found
 
     def _bears_key(self, row: dict[str, Any]) -> bool:
-        return row["mode"] in self._keys and row["key"] == self._keys[row["mode"]]
+        return row["mode"] in self.keys and row["key"] == self.keys[row["mode"]]
 
     def append(self, answers: list[Kept]) -> None:
         with open(self._path, "a") as file:
             file.writelines(
-                json.dumps({**asdict(a), "key": self._keys[a.mode]}) + "\n" for a in answers
+                json.dumps({**asdict(a), "key": self.keys[a.mode]}) + "\n" for a in answers
             )
         self.answers |= {(a.item_id, a.mode): a for a in answers}
 

@@ -24,10 +24,11 @@ def main(cfg: ReportCommand, run: Run) -> None:
     from evaluation.page.browser import browser_of
     from evaluation.page.page import write_page
     from evaluation.page.rows import once, read_rows
-    from evaluation.page.said import check_same_rankings
+    from evaluation.page.said import check_same_build, check_same_rankings
     from evaluation.page.sections import sections_of
 
     choices, ranks = read_rows(runs, root)
+    check_same_build(m.run for m in (*choices, *ranks))
     check_same_rankings(ranks)
     browser = browser_of(choices, Path(cfg.store), cfg.items, cfg.seed)
     figures, tables = run.folder / "figures", run.folder / "tables"

@@ -61,7 +61,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
         curves += measures.recall_curves(name, ranks, queries)
 
     told = [tables.index_table(indexes)] if indexes else []
-    ranked.write_report(run.folder, rows, curves, told, indexes=indexes)
+    ranked.write_report(run.folder, rows, curves, told, build=store.identity, indexes=indexes)
     return {name: found.value for name, found in rows[0].measures.items() if name != "tie_rate"}
 
 

@@ -39,7 +39,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     items = chosen_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = Frames(store, student.image_size)
     model = asked.asked_model(cfg, folder, trained)
-    given, runs = {}, Path(cfg.checkpoints, "select")
+    given, keys, runs = {}, {}, Path(cfg.checkpoints, "select")
     # What a control changes shows only beside the same items as they are.
     for control in dict.fromkeys([None, cfg.control]):
         known = {
@@ -55,8 +55,10 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
         for mode in modes:
             log.info("asking %s in %s mode%s", model.name, mode, f", {control}" if control else "")
             given[mode, control] = answers.ask_all(items, mode, model.say(mode, sample_of), journal)
+            keys[mode, control] = journal.keys[mode]
 
-    metrics = selected.write_report(given, items, model.name, store.name, cfg, run.folder)
+    about = {"build": store.identity, "asked": [[*how, key] for how, key in keys.items()]}
+    metrics = selected.write_report(given, items, model.name, store.name, cfg, run.folder, about)
     letter = given[modes[0], cfg.control][0].letter
     draw_item(items[0], letter, Frames(store), run.folder / "item.png")
     return metrics

@@ -7,6 +7,7 @@ import logging
 from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from conf.runs import write_text
 from conf.schema import SelectCommand
@@ -31,8 +32,11 @@ def write_report(
     benchmark: str,
     cfg: SelectCommand,
     folder: Path,
+    about: dict[str, Any],
 ) -> dict[str, float]:
     """Write report.txt, report.json and selection.png of the model called `name` into `folder`.
+    `about` says in the report of which build of the benchmark, and of which lines of the answers'
+    file, its numbers are.
 
     Returns:
         The accuracies and parse rates of each mode, under the control if there is one.
@@ -64,6 +68,7 @@ def write_report(
     parts += [tables.calibration_table(w, found) for w, found in confidences.items()]
     write_text(folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")
     report = {
+        **about,
         "rows": [r.to_dict() for r in rows],
         "controls": [{"mode": w, **asdict(p)} for w, found in apart for p in found],
         "subtypes": {w: {c: vars(i) for c, i in by.items()} for w, by in subtypes.items()},

@@ -62,6 +62,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     parts += [tables.subtype_table(subtypes), tables.position_table(letters)]
     write_text(run.folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")
     report = {
+        "build": store.identity,
         "rows": [r.to_dict() for r in rows],
         "controls": [{"mode": name, **asdict(p)} for name, found in apart for p in found],
         "subtypes": {n: {c: vars(i) for c, i in by.items()} for n, by in subtypes.items()},

@@ -77,9 +77,8 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
 
     told = {mode: foreseen.counts(of) for mode, of in written.items()}
     reading = tables.reading_table(told, "What was written")
-    ranked.write_report(
-        run.folder, rows, curves, [reading], paper.RETRIEVAL_TWO_STAGE, indexes=[], texts=told
-    )
+    also = {"build": store.identity, "indexes": [], "texts": told}
+    ranked.write_report(run.folder, rows, curves, [reading], paper.RETRIEVAL_TWO_STAGE, **also)
     write_text(run.folder / "matched.jsonl", "".join(json.dumps(m) + "\n" for m in matched))
     return metrics
 

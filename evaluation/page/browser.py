@@ -14,12 +14,12 @@ from data.controls import MATCHED
 from data.store import Store, open_store
 from evaluation.page import items, plots
 from evaluation.page.apart import apart
+from evaluation.page.gathering import unreadable
 from evaluation.page.rows import Measured, once
 from evaluation.page.said import (
     Asked,
     Said,
     answers_of,
-    check_same_build,
     check_same_items,
 )
 from evaluation.paired import Paired
@@ -55,7 +55,6 @@ def browser_of(choices: Sequence[Measured], stores: Path, bound: int, seed: int)
     opened = {name: _open(stores / name) for name in dict.fromkeys(m.benchmark for m in choices)}
     ids = [_item_ids(m, said, opened[m.benchmark]) for m in choices]
     check_same_items(choices, ids)
-    check_same_build([m.run for m in once(choices) if m.run.kind == "select"])
     browser = Browser()
     for name, store in opened.items():
         answered = [m for m in once(choices) if m.benchmark == name and _answers(m, said)]
@@ -116,8 +115,11 @@ def _item_ids(m: Measured, said: RunAnswers, store: Store | str) -> Mapping[str,
         return _answers(m, said) or None
     if isinstance(store, str):
         return None
-    of = m.run.config
-    return {i.item_id: i for i in chosen_items(store, of["suite"], of["limit"], of["seed"])}
+    try:
+        chosen = [m.run.config[key] for key in ("suite", "limit", "seed")]
+    except KeyError as error:
+        raise unreadable(m.run.folder) from error
+    return {i.item_id: i for i in chosen_items(store, *chosen)}
 
 
 def _open(folder: Path) -> Store | str:

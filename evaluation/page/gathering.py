@@ -23,14 +23,15 @@ KINDS = (*CHOICES, *RANKINGS, *STUDIES, *TRAININGS)
 
 @dataclass(frozen=True)
 class Finished:
-    """A finished run: its folder, the command's folder that it is in (`kind`), its settings, and
-    its report.json, which a training run has none of."""
+    """A finished run: its folder, the command's folder that it is in (`kind`), its settings, its
+    report.json, which a training run has none of, and when it was first started."""
 
     folder: Path
     kind: str
     name: str
     config: dict[str, Any]
     report: dict[str, Any]
+    began: str
 
 
 def gather(root: Path, patterns: Sequence[str] | None) -> list[Finished]:
@@ -50,7 +51,7 @@ def gather(root: Path, patterns: Sequence[str] | None) -> list[Finished]:
             "model=checkpoints/sft/RUN or python -m evaluation.retrieve "
             "model=checkpoints/contrastive/RUN first"
         )
-    return sorted(runs, key=lambda run: (run.folder / "metrics.json").stat().st_mtime)
+    return sorted(runs, key=lambda run: (run.began, run.kind, run.name))
 
 
 def _runs(root: Path, kind: str) -> list[Path]:
@@ -62,7 +63,12 @@ def _runs(root: Path, kind: str) -> list[Path]:
 def _named(root: Path, pattern: str, finished: Sequence[Path]) -> list[Path]:
     """The runs that a pattern names, which are looked for among the `finished` ones."""
     pattern = pattern.strip("/").removeprefix(f"{root.as_posix().strip('/')}/")
-    folders = [path for path in root.glob(pattern) if path.is_dir()]
+    try:
+        folders = [path for path in root.glob(pattern) if path.is_dir()]
+    except (ValueError, NotImplementedError) as error:
+        raise UserError(
+            f"runs: {pattern} is no pattern of folders below {root}: {error}"
+        ) from error
     chosen = [path for path in folders if path in finished]
     if chosen:
         return sorted(chosen)
@@ -86,7 +92,15 @@ def _read(root: Path, folder: Path) -> Finished:
         )
     settings = _settings(folder / "config.yaml", f"delete {folder} and measure again")
     report = {} if kind in TRAININGS else _report(folder)
-    return Finished(folder, kind, "/".join(name), settings, report)
+    return Finished(folder, kind, "/".join(name), settings, report, _began(folder))
+
+
+def _began(folder: Path) -> str:
+    try:
+        record = json.loads((folder / "run.json").read_text())
+        return min(str(at) for at in [record["started"], *record["earlier_starts"]])
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise unreadable(folder, "run.json") from error
 
 
 def _settings(config: Path, mend: str) -> dict[str, Any]:
@@ -107,9 +121,9 @@ def _report(folder: Path) -> dict[str, Any]:
         raise unreadable(folder) from error
 
 
-def unreadable(folder: Path) -> UserError:
+def unreadable(folder: Path, file: str = "report.json") -> UserError:
     return UserError(
-        f"{folder / 'report.json'} is missing, damaged or of another version: delete {folder} "
+        f"{folder / file} is missing, damaged or of another version: delete {folder} "
         "and measure again"
     )
 
@@ -139,6 +153,8 @@ def training_of(run: Finished, root: Path) -> dict[str, Any] | None:
     model = run.config.get("model") or (run.config.get("matcher") or {}).get("model")
     if model is None:
         return None
+    if not isinstance(model, str):
+        raise unreadable(run.folder, "config.yaml")
     # Where the runs were moved, or are reported from another folder, it is below `root`.
     for folder in (Path(model), root / Path(*Path(model).parts[1:])):
         if (folder / "config.yaml").is_file():

@@ -3,12 +3,12 @@ measured the same items."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 from conf.errors import UserError
-from evaluation.page.gathering import Finished, json_lines
+from evaluation.page.gathering import Finished, json_lines, unreadable
 from evaluation.page.rows import Measured
 from evaluation.paired import same_items
 from train.choice import Choice, parse
@@ -30,36 +30,39 @@ class Said:
 
 
 def answers_of(run: Finished) -> dict[Asked, dict[str, Said]]:
-    """What the model of a run said, by item; what it said before it was asked otherwise is left
-    out, as are lines that a kill tore."""
-    controls: dict[str, str | None] = {}
-    by_key: dict[tuple[str, str | None], dict[str, Said]] = {}
-    for row in json_lines(run.folder / "answers.jsonl"):
-        if "asked" in row:
-            controls[row["key"]] = row["asked"].get("control")
-        elif {"item_id", "mode", "text"} <= row.keys():
-            found = by_key.setdefault((row["mode"], row.get("key")), {})
-            found[row["item_id"]] = Said(row["text"], row.get("cut", False))
-    plain = run.config.get("control")
-    return {(mode, controls.get(key, plain)): said for (mode, key), said in by_key.items()}
+    """What the model of a run said, by item: what its report is of. What it said when it was asked
+    otherwise is left out, as are lines that a kill tore.
+
+    Raises:
+        UserError: the report is of another version.
+    """
+    try:
+        asked = {key: (mode, control) for mode, control, key in run.report["asked"]}
+        said: dict[Asked, dict[str, Said]] = {how: {} for how in asked.values()}
+        for row in json_lines(run.folder / "answers.jsonl"):
+            if "text" in row and row["key"] in asked:
+                said[asked[row["key"]]][row["item_id"]] = Said(str(row["text"]), bool(row["cut"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise unreadable(run.folder) from error
+    return said
 
 
-def check_same_build(runs: Sequence[Finished]) -> None:
+def check_same_build(runs: Iterable[Finished]) -> None:
     """A benchmark that was built anew under its name may have other items by the same ids.
 
     Raises:
-        UserError: two runs answered different builds of a benchmark.
+        UserError: two runs measured different builds of a benchmark.
     """
     first: dict[str, tuple[str, Finished]] = {}
     for run in runs:
-        told = [row["asked"] for row in json_lines(run.folder / "answers.jsonl") if "asked" in row]
-        if not told:
-            continue
-        name, build = run.config["benchmark"]["name"], told[-1].get("benchmark")
+        try:
+            name, build = run.config["benchmark"]["name"], run.report["build"]
+        except (KeyError, TypeError) as error:
+            raise unreadable(run.folder) from error
         known, other = first.setdefault(name, (build, run))
         if known != build:
             raise UserError(
-                f"{other.folder} and {run.folder} answered different builds of benchmark {name}: "
+                f"{other.folder} and {run.folder} measured different builds of benchmark {name}: "
                 "measure one of them again (run=NAME), or leave it out with runs=[...]"
             )
 

@@ -111,7 +111,7 @@ def test_the_questions_of_a_pair_are_held_against_each_other(benchmark_store, tm
         benchmark=BenchmarkConfig(name="any"), student=STUDENT, suite=MATCHED,
         control="candidate_only",
     )  # fmt: skip
-    metrics = write_report(given, items, "one", "any", cfg, tmp_path)
+    metrics = write_report(given, items, "one", "any", cfg, tmp_path, {})
     told = json.loads((tmp_path / "report.json").read_text())["controls"]
     truth = [by_event.letter for by_event, _ in pairs(items)]
     matched = [p for p in told if p["left"] == "event"]

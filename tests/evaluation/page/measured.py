@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,8 @@ def finish(
     if report is not None:
         (folder / "report.json").write_text(json.dumps(report))
     (folder / "metrics.json").write_text(json.dumps(metrics or {}))
+    started = {"started": datetime.now(UTC).isoformat(), "earlier_starts": []}
+    (folder / "run.json").write_text(json.dumps(started))
 
 
 def trained_student(root: Path, benchmark, name: str, regime: str) -> None:
@@ -93,6 +96,8 @@ def select_run(
     cells = accuracy_by([f"{i.family}/{i.subtype}" for i in items], credits)
     letters = positions(chosen, [i.letter for i in items])
     report = {
+        "build": store.identity,
+        "asked": [[mode, None, "k1"]],
         "rows": [row.to_dict()],
         "subtypes": {mode: {cell: vars(found) for cell, found in cells.items()}},
         "readings": {mode: {"with a letter": parsed}},
@@ -120,7 +125,8 @@ def similarity_run(
     row = SelectionRow.of(store.name, f"untrained {name}", SIMILARITY, accuracy, None)
     cells = accuracy_by([f"{i.family}/{i.subtype}" for i in items], credits)
     told = {f"untrained {name}": {cell: vars(found) for cell, found in cells.items()}}
-    finish(root / "similarity" / name, settings, {"rows": [row.to_dict()], "subtypes": told})
+    report = {"build": store.identity, "rows": [row.to_dict()], "subtypes": told}
+    finish(root / "similarity" / name, settings, report)
     return root / "similarity" / name
 
 
@@ -140,7 +146,8 @@ def retrieve_run(
         ranks = Ranks((64, 32), greater, np.zeros_like(greater), found, frames, *sizes)
         rows += retrieval_rows(store.name, title, ranks, queries, 0)
         curves += recall_curves(title, ranks, queries)
-    report = {"rows": [r.to_dict() for r in rows], "curves": curves, "indexes": []}
+    told = {"build": store.identity, "curves": curves, "indexes": []}
+    report = {"rows": [r.to_dict() for r in rows], **told}
     settings = RetrieveCommand(
         benchmark=benchmark, retriever=RetrieverConfig(name="small"),
         model=f"{root}/contrastive/{name}",

@@ -249,6 +249,15 @@ def test_two_databases_are_told_apart(runs, micro, micro_store):
         reported(runs, micro_store.folder.parent)
 
 
+@pytest.mark.parametrize("kind", ["select", "similarity", "retrieve", "two_stage"])
+def test_what_was_built_anew_is_told_from_what_it_was_before(runs, micro_store, kind):
+    [newest] = sorted((runs / kind).iterdir())[-1:]
+    _add(newest / "report.json", build="anew")
+    with pytest.raises(UserError, match=f"{newest.name} measured different builds of .* micro|"
+                       f"{newest.name} and .* measured different builds"):  # fmt: skip
+        reported(runs, micro_store.folder.parent)
+
+
 @pytest.mark.parametrize(
     ("damage", "settings", "said"),
     [
@@ -264,6 +273,14 @@ def test_two_databases_are_told_apart(runs, micro, micro_store):
          {}, "cot/report.json is .* of another version"),
         (lambda runs: _add(runs / "select/cot/report.json", calibration={"reasoning": {"bins": 1}}),
          {}, "cot/report.json is .* of another version"),
+        (lambda runs: _add(runs / "select/cot/report.json", asked=[["reasoning", None]]),
+         {}, "cot/report.json is .* of another version"),
+        (lambda runs: (runs / "select/cot/config.yaml").write_text("model: 5"),
+         {}, "cot/config.yaml is .* of another version"),
+        (lambda runs: (runs / "similarity/clip/config.yaml").write_text("benchmark: {name: micro}"),
+         {}, "clip/report.json is .* of another version"),
+        (lambda runs: (runs / "select/cot/run.json").write_text("{}"), {}, "cot/run.json is miss"),
+        (lambda runs: None, {"runs": ["a**"]}, "a\\*\\* is no pattern of folders"),
         (lambda runs: (runs / "select/cot/metrics.json").unlink(), {"runs": ["select/cot"]},
          "no finished run"),
         (lambda runs: None, {"runs": ["select/cto"]}, "names no run .*; there are .*select/cot"),
