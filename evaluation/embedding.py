@@ -211,7 +211,13 @@ def _embedded(
     preset = embedder.preset
 
     def embed(some: list[Thing]) -> np.ndarray:
-        rows = encode(embedder.load(), some)
+        encoder = embedder.load()
+
+        from train.loop import within_memory
+
+        when = f"where {len(some)} are embedded at once"
+        with within_memory(when, "lower batch, in a run of its own (run=NAME)"):
+            rows = encode(encoder, some)
         if preset.late is None:
             check_widths(preset, rows.shape[1])
         return rows

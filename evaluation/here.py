@@ -12,6 +12,7 @@ from evaluation.answers import Keep, Thing, seed_of
 from train.collate import Collator
 from train.conversation import Sample
 from train.generate import generate, new_tokens
+from train.loop import within_memory
 from train.sampling import sampler
 
 
@@ -27,12 +28,18 @@ def say(
     things: list[Thing],
     keep: Keep,
 ) -> None:
-    """Have a model answer in `mode`, as `sample_of` shows and asks each."""
+    """Have a model answer in `mode`, as `sample_of` shows and asks each.
+
+    Raises:
+        UserError: memory runs out.
+    """
     collator = Collator(processor, cfg.max_length, cfg.thinking)
     limit = new_tokens(mode, cfg)
     for start in range(0, len(things), batch):
         group = things[start : start + batch]
         steps = sampler(cfg, [seed_of(seed, thing, mode) for thing in group])
         inputs = collator([sample_of(thing) for thing in group])
-        written = generate(model, processor, inputs, limit, precision, steps)
+        when = f"where {len(group)} items are answered at once"
+        with within_memory(when, "lower batch, in a run of its own (run=NAME)"):
+            written = generate(model, processor, inputs, limit, precision, steps)
         keep(list(zip(group, written, strict=True)))

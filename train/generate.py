@@ -14,13 +14,12 @@ import torch
 from torch import nn
 from transformers import LogitsProcessorList, ProcessorMixin
 
-from conf.errors import UserError
 from conf.schema import StudentConfig
 from train.backbone import DTYPES
 from train.choice import parse
 from train.collate import Collator
 from train.journal import WRITTEN
-from train.loop import is_out_of_memory
+from train.loop import within_memory
 from train.planned import Samples
 
 log = logging.getLogger(__name__)
@@ -107,16 +106,10 @@ class HeldOutAnswers:
         asked = [samples[k] for k in range(min(self._count, len(samples)))]
         inputs = self._collator([replace(sample, response=None) for sample in asked])
         limit = new_tokens(mode, self._cfg)
-        try:
+        when = f"where the student answers {len(asked)} held-out items after step {step}"
+        lower = "lower train.generated_items, or set it to 0, in a run of its own (run=NAME)"
+        with within_memory(when, lower):
             texts = generate(model, self._processor, inputs, limit, self._precision)
-        except RuntimeError as error:
-            if not is_out_of_memory(error):
-                raise
-            raise UserError(
-                f"out of memory where the student answers {len(asked)} held-out items after step "
-                f"{step}: lower train.generated_items, or set it to 0, in a run of its own "
-                "(run=NAME)"
-            ) from error
         rows = [
             _row(step, mode, sample.sample_id, written, sample.response)
             for sample, written in zip(asked, texts, strict=True)

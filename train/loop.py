@@ -263,6 +263,17 @@ def is_out_of_memory(error: RuntimeError) -> bool:
     )
 
 
+@contextmanager
+def within_memory(when: str, lower: str) -> Iterator[None]:
+    """Turn a lack of memory into a sentence of when it was, and by which keys less is taken."""
+    try:
+        yield
+    except RuntimeError as error:
+        if not is_out_of_memory(error):
+            raise
+        raise UserError(f"out of memory {when}: {lower}") from error
+
+
 def is_unwritten(error: RuntimeError) -> bool:
     """Whether torch could not write a file whole; it has no other sign of a full disk."""
     return "PytorchStreamWriter" in str(error) or "unexpected pos" in str(error)

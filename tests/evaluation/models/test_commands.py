@@ -33,6 +33,7 @@ SMALL = ArchitectureConfig(
     hidden=64, layers=1, heads=2, kv_heads=2, feed_forward=64,
     vision_hidden=64, vision_layers=1, vision_heads=2, vision_feed_forward=64,
 )  # fmt: skip
+RECORD = '{"started": "2026-01-01", "earlier_starts": []}'
 SHARED = {
     "architecture": SMALL, "quantization": "none", "lora": LoraConfig(rank=0), "image_size": 96,
 }  # fmt: skip
@@ -52,6 +53,7 @@ def runs(tmp_path_factory, micro, micro_store) -> Path:
     backbone.save(model, processor, folder / "student", "bf16")
     OmegaConf.save(OmegaConf.structured(sft), folder / "config.yaml")
     (folder / "metrics.json").write_text('{"answer_loss": 1.0, "answer_loss_at_start": 2.0}')
+    (folder / "run.json").write_text(RECORD)
 
     cfg = RetrieverConfig(name="small", widths=[64, 32], **SHARED)
     folder = root / "contrastive" / "run"
@@ -62,6 +64,7 @@ def runs(tmp_path_factory, micro, micro_store) -> Path:
     settings = ContrastiveCommand(benchmark=micro, retriever=cfg)
     OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
     (folder / "metrics.json").write_text("{}")
+    (folder / "run.json").write_text(RECORD)
     return root
 
 
@@ -75,6 +78,7 @@ def finish(run: Run, settings: object, metrics: dict) -> None:
     """Write what a command's entry does around it."""
     OmegaConf.save(OmegaConf.structured(settings), run.folder / "config.yaml")
     (run.folder / "metrics.json").write_text(json.dumps(metrics))
+    (run.folder / "run.json").write_text(RECORD)
 
 
 @pytest.mark.slow

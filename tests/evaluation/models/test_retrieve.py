@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from omegaconf import OmegaConf
 from safetensors.torch import load_file, save_file
 from sentence_transformers import SentenceTransformer
@@ -179,6 +180,17 @@ def test_a_width_that_the_model_lacks_is_refused(world, tmp_path) -> None:
     edit_config(tmp_path / "run", retriever__widths=[4096, 64, 32])
     with pytest.raises(
         UserError, match=r"asks for 4096, .* 64 entries.*retriever\.widths=\[64,32\]"
+    ):
+        world()
+
+
+def test_a_batch_that_does_not_fit_is_told(world, monkeypatch) -> None:
+    def full(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr("evaluation.encoders.JointEncoder.frames", full)
+    with pytest.raises(
+        UserError, match=r"out of memory where \d+ are embedded at once: lower batch"
     ):
         world()
 

@@ -143,6 +143,7 @@ def test_the_report_shows_an_exported_study_alone_too(tmp_path) -> None:
     exported = tmp_path / "export_study" / "pilot"
     exported.mkdir(parents=True)
     (exported / "metrics.json").write_text("{}")
+    (exported / "run.json").write_text('{"started": "2026-01-01", "earlier_starts": []}')
     (exported / "config.yaml").write_text("run: pilot\n")
     votes = [vote(name, k, k % 3, FAMILIES[k % 3]) for k in range(6) for name in ("A1", "A2")]
     found = {"benchmark": "tiny", **summary(votes, 6, ["A1", "A2"])}
