@@ -153,7 +153,7 @@ def check_pooling(saved: str | Path, revision: str | None = None) -> None:
         modules = json.loads(file_of(saved, MODULES, revision).read_text())
         parts = [m["path"] for m in modules if m["type"].endswith(".Pooling")]
         files = [file_of(saved, f"{part}/config.json", revision) for part in parts]
-        modes = [json.loads(file.read_text())["pooling_mode"] for file in files]
+        modes = [mode for file in files for mode in _pooling_modes(json.loads(file.read_text()))]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{saved} is damaged: what it says of its modules cannot be read ({error}); delete "
@@ -166,6 +166,14 @@ def check_pooling(saved: str | Path, revision: str | None = None) -> None:
             f"({POOLING}): give one that is, such as a run of train.contrastive or a "
             "Qwen3-VL-Embedding"
         )
+
+
+def _pooling_modes(config: dict[str, Any]) -> list[str]:
+    if (mode := config.get("pooling_mode")) is not None:
+        return [mode] if isinstance(mode, str) else list(mode)
+    # As sentence-transformers wrote them before its sixth version.
+    flags = {key.removeprefix("pooling_mode_"): on for key, on in config.items() if "_mode_" in key}
+    return [mode for mode, on in flags.items() if on]
 
 
 def check_widths(cfg: RetrieverConfig, entries: int) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from conf.schema import ContrastiveCommand, LoraConfig
 from data import store
 from data.store import load_rows, save_rows, sealed
 from train import contrastive
+from train.compatible import check_pooling
 
 Rows = list[dict]
 
@@ -112,6 +114,29 @@ def test_a_base_that_was_saved_by_another_pooling(
         kinds = json.loads((saved / "modules.json").read_text())[:1]
         (saved / "modules.json").write_text(json.dumps(kinds))
     refused(over(contrastive_settings, saved), tmp_path / "run", rf"saved {said}.* last token")
+
+
+@pytest.mark.parametrize(
+    ("on", "told"),
+    [
+        (["lasttoken"], nullcontext()),
+        (["mean_tokens"], pytest.raises(UserError, match="saved with mean_tokens pooling")),
+        (
+            ["cls_token", "lasttoken"],
+            pytest.raises(UserError, match="saved with cls_token and lasttoken pooling"),
+        ),
+    ],
+)
+def test_pooling_as_earlier_versions_saved_it(saved_base, tmp_path, on, told) -> None:
+    saved = tmp_path / "saved"
+    whole = SentenceTransformer(modules=[Transformer(saved_base), Pooling(64, pooling_mode="mean")])
+    whole.save_pretrained(str(saved), create_model_card=False)
+    names = ("cls_token", "lasttoken", "max_tokens", "mean_tokens")
+    flags = {f"pooling_mode_{name}": name in on for name in names}
+    config = {"word_embedding_dimension": 64, **flags, "include_prompt": True}
+    (saved / "1_Pooling" / "config.json").write_text(json.dumps(config))
+    with told:
+        check_pooling(saved)
 
 
 def test_a_base_of_the_hubs_cache_with_another_pooling(
