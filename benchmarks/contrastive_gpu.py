@@ -20,6 +20,7 @@ import tempfile
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ from benchmarks.sft_gpu import CONFIGS, random_model
 from benchmarks.sft_runs import SEED, device_name
 from conf.compose import compose
 from conf.schema import ArchitectureConfig, ContrastiveCommand
-from data.records import FrameRef, RetrievalQuery
+from data.records import FPS, FRAMES, FrameRef, RetrievalQuery
 from train import mini_batches, retriever, room, towers
 from train.attention import choose_attention
 from train.inputs import Inputs
@@ -165,6 +166,9 @@ class Noise:
 
     def __init__(self, size: int) -> None:
         self._size = size
+
+    def scene(self, scene_id: str) -> SimpleNamespace:
+        return SimpleNamespace(fps=FPS, frames=FRAMES)
 
     def image(self, scene: str, frame: int) -> Image.Image:
         return Image.fromarray(self.stack(scene, [frame])[0])

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 EMBEDDINGS = "embeddings"
 """Folder of them in a store."""
+INPUTS = 2
+"""Rises with what is shown, or told of a clip, so that no earlier embedding is taken for one."""
 MAKERS = ("sentence-transformers", "transformers")
 """Packages that turn a prompt and pixels into a model's input."""
 
@@ -62,6 +64,7 @@ class Embedder:
         preset = self.preset
         return {
             "encoder": preset.encoder,
+            "inputs": INPUTS,
             "weights": self.weights,
             "processor": self.processor,
             "revision": preset.revision,

@@ -21,7 +21,7 @@ from transformers import AutoConfig
 
 from conf.schema import LoraConfig, RetrieverConfig
 from data.frames import Frames
-from data.records import FPS, FRAMES, FrameRef, RetrievalQuery, shown_frames
+from data.records import FrameRef, RetrievalQuery, shown_frames
 from train.attention import choose_attention
 from train.backbone import (
     DTYPES,
@@ -35,6 +35,7 @@ from train.backbone import (
     pin_sizes,
 )
 from train.compatible import PEFT, check_pooling, check_processor, check_tower, is_retriever
+from train.conversation import clip_of
 from train.late import keep_projection_exact, late_modules, load_late
 from train.ranks import from_main
 from train.tiny import build_model, build_processor
@@ -226,9 +227,9 @@ def longest_query(queries: list[RetrievalQuery], tokenizer: Any) -> RetrievalQue
 def query_input(query: RetrievalQuery, frames: Frames, cfg: RetrieverConfig) -> dict[str, Any]:
     """A query as sentence-transformers takes it: the prefix with its true times, then the text."""
     shown = shown_frames(query.prefix_start, query.prefix_stop, cfg.frames)
-    array = torch.from_numpy(frames.stack(query.scene_id, shown)).permute(0, 3, 1, 2)
-    metadata = {"fps": float(FPS), "total_num_frames": FRAMES, "frames_indices": shown}
-    return {"video": {"array": array, "video_metadata": metadata}, "text": query.question}
+    clip = clip_of(query.scene_id, shown, frames)
+    array = torch.from_numpy(clip.pixels).permute(0, 3, 1, 2)
+    return {"video": {"array": array, "video_metadata": clip.metadata}, "text": query.question}
 
 
 def frame_input(frame: FrameRef, frames: Frames) -> Any:

@@ -43,6 +43,20 @@ def test_a_query_is_instruction_then_video_then_text_and_a_generation_prompt(
     assert "of 6 x 3 x 3 tokens" in audit_retriever(model, retriever_cfg, query, frames)
 
 
+def test_a_clip_is_told_at_its_own_rate(
+    micro_store, frames, retriever_cfg, tmp_path, monkeypatch
+) -> None:
+    """As in the suites of other simulators, whose clips have 12 or 30 frames a second."""
+    query = micro_store.retrieval("train")[0]
+    slow = replace(frames.scene(query.scene_id), fps=12)
+    monkeypatch.setattr(frames, "scene", lambda _: slow)
+    model = load(micro_store, retriever_cfg, tmp_path)
+    features = model.preprocess([query_input(query, frames, retriever_cfg)])
+    text = model[0].processor.tokenizer.decode(features["input_ids"][0])
+    shown = shown_frames(query.prefix_start, query.prefix_stop, 12)
+    assert f"<{(shown[0] + shown[1]) / 2 / 12:.1f} seconds>" in text
+
+
 def test_a_long_query_is_refused_and_never_cut(
     micro_store, frames, retriever_cfg, tmp_path
 ) -> None:
