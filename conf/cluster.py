@@ -54,7 +54,7 @@ class SubmititLauncher(ProcessLauncher):
         try:
             import submitit
         except ImportError as error:
-            raise UserError(f"{chosen} needs submitit: pip install 'dynapix[submitit]'") from error
+            raise UserError(f"{chosen} needs submitit: pip install -e '.[submitit]'") from error
         try:
             executor = submitit.AutoExecutor(folder=self.logs, cluster=self.cluster)
             executor.update_parameters(**self.parameters)

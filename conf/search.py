@@ -184,9 +184,7 @@ def open_study(journal: Path, metric: str) -> Study:
         from optuna.storages import JournalStorage
         from optuna.storages.journal import JournalFileBackend
     except ImportError as error:
-        raise UserError(
-            "hydra/sweeper=optuna needs Optuna: pip install 'dynapix[optuna]'"
-        ) from error
+        raise UserError("hydra/sweeper=optuna needs Optuna: pip install -e '.[optuna]'") from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
 
     def opened() -> Study:

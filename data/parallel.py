@@ -110,7 +110,7 @@ def _join_cluster(count: int) -> None:
         import ray
         from ray.util.joblib import register_ray
     except ImportError as error:
-        raise UserError("parallel=ray needs Ray: pip install 'dynapix[ray]'") from error
+        raise UserError("parallel=ray needs Ray: pip install -e '.[ray]'") from error
     if not ray.is_initialized():
         here = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": count}
         ray.init(log_to_driver=False, include_dashboard=False, **here)

@@ -51,7 +51,7 @@ def import_faiss() -> ModuleType:
     try:
         import faiss
     except ImportError as error:
-        raise UserError("index=faiss needs faiss: pip install 'dynapix[index]'") from error
+        raise UserError("index=faiss needs faiss: pip install -e '.[index]'") from error
     return faiss
 
 

@@ -62,7 +62,7 @@ class BlenderRenderer:
     def check() -> None:
         """Raises UserError where Blender's module is not installed, or another release of it."""
         needs = f"renderer=blender needs Blender's module bpy {BPY}"
-        mend = "install it with pip install 'dynapix[blender]', or use renderer=bullet"
+        mend = "install it with pip install -e '.[blender]', or use renderer=bullet"
         try:
             found = importlib.metadata.version("bpy")
         except importlib.metadata.PackageNotFoundError as error:

@@ -21,7 +21,7 @@ def main(cfg: StudyCommand, run: Run) -> None:
         from evaluation.study import accounts, app, serving, storage
     except ImportError as error:
         raise UserError(
-            f"the study's pages need {error.name}: pip install 'dynapix[study]'"
+            f"the study's pages need {error.name}: pip install -e '.[study]'"
         ) from error
     from evaluation.study import preparing
 

@@ -295,7 +295,7 @@ def test_a_search_that_cannot_be_is_told(room, arguments, said):
 
 def test_a_search_without_optuna_is_told(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "optuna", None)
-    with pytest.raises(UserError, match=r"pip install 'dynapix\[optuna\]'"):
+    with pytest.raises(UserError, match=r"pip install -e '\.\[optuna\]'"):
         open_study(tmp_path / JOURNAL, "loss")
 
 

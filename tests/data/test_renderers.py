@@ -176,7 +176,7 @@ def test_without_a_driver_egl_ends_in_a_sentence() -> None:
 
 def test_blender_without_its_module_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(blender, "BPY", "0.0.0")
-    with pytest.raises(UserError, match=r"0\.0\.0.*pip install 'dynapix\[blender\]'"):
+    with pytest.raises(UserError, match=r"0\.0\.0.*pip install -e '\.\[blender\]'"):
         renderer("blender", 48, 32)
 
 

@@ -101,5 +101,5 @@ def test_ranks_are_counted_among_what_was_found() -> None:
 
 def test_without_faiss_it_says_what_to_install(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "faiss", None)
-    with pytest.raises(UserError, match=r"pip install 'dynapix\[index\]'"):
+    with pytest.raises(UserError, match=r"pip install -e '\.\[index\]'"):
         index.import_faiss()
