@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -14,12 +15,14 @@ from safetensors import safe_open
 from conf.errors import UserError
 from conf.runs import write_json
 from conf.schema import RetrieverConfig, StudentConfig
+from data.store import Store
 
 if TYPE_CHECKING:
     from torch import nn
     from transformers import PreTrainedConfig, PreTrainedTokenizerBase, ProcessorMixin
 
 BASE = "base.json"
+DATA = "data.json"
 MODULES = "modules.json"
 """In which sentence-transformers lists a model's parts."""
 PEFT = "base_model.model."
@@ -236,6 +239,30 @@ def note_base(folder: Path, model: str | None) -> None:
     a run that goes on goes on over the same."""
     check_base(folder, model)
     write_json(folder / BASE, weights_digest(model))
+
+
+def note_data(folder: Path, store: Store, *told: Iterable[str]) -> None:
+    """Note in a run's folder a hash of what it learns from, and hold it to an earlier note.
+
+    Args:
+        told: texts in which everything shows that the benchmark does not hold, in their order.
+
+    Raises:
+        UserError: the run was begun on other data.
+    """
+    whole = hashlib.sha256(store.identity.encode())
+    for texts in told:
+        for text in texts:
+            whole.update(hashlib.sha256(text.encode()).digest())
+    digest = whole.hexdigest()[:16]
+    note = folder / DATA
+    if note.exists() and json.loads(note.read_text()) != digest:
+        raise UserError(
+            f"{folder} was begun on other data than {store.folder} holds now: the benchmark, its "
+            "rationales or how they are told have changed. Put those back, or train in a run of "
+            "its own (run=NAME)"
+        )
+    write_json(note, digest)
 
 
 def check_base(folder: Path, model: str | None) -> None:

@@ -37,7 +37,7 @@ from train.inputs import Inputs
 from train.late_loss import LateRankingLoss
 from train.mining import HardNegatives
 from train.negatives import Weighing
-from train.precision import settled
+from train.precision import of_run
 from train.ranking import HeldOutRanking, LateHeldOutRanking
 from train.ranking_loss import RankingLoss
 from train.retriever import ADAPTERS, Retriever
@@ -52,13 +52,14 @@ def train_retriever(
     """Train a retriever in its run's folder and give what it measured there. `share` is a rank's
     part of a step's queries."""
     room.keep_big_blocks()
-    cfg.train.precision = settled(cfg.train.precision)
+    cfg.train.precision = of_run(run.folder, cfg.train.precision)
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
     training, validation = split(cfg, store)
     log.info("loading retriever %s, to compute in %s", cfg.retriever.name, cfg.train.precision)
     if rank() == 0:
         compatible.note_base(run.folder, cfg.retriever.model)
+        compatible.note_data(run.folder, store, (q.query_id for q in (*training, *validation)))
     frames = Frames(store, cfg.retriever.image_size)
     with loop.loading(run.folder, "retriever"):
         model = retriever.load_retriever(

@@ -72,14 +72,15 @@ def main(cfg: ExportModelCommand, run: Run) -> Measured:
     from data.store import digest
     from train.card import text
     from train.compatible import check_base
-    from train.precision import settled
+    from train.precision import of_run
     from train.trained import EXPORT, export_record
 
     adapters = trained.saved / "adapter_model.safetensors"
     if not adapters.exists():
         raise UserError(f"{trained.saved} holds no adapters: delete the run and train again")
     check_base(trained.folder, trained.preset.model)
-    trained.settings.train.precision = settled(trained.settings.train.precision)
+    train = trained.settings.train
+    train.precision = of_run(trained.folder, train.precision)
     weights = digest(adapters)
     folder = run.folder / trained.product
     if folder.exists():

@@ -2,7 +2,26 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import torch
+
+from conf.runs import rank, write_json
+
+PRECISION = "precision.json"
+
+
+def of_run(folder: Path, precision: str) -> str:
+    """`settled` once for a run in `folder`, which notes it: on another machine too it goes on in
+    what it was begun in."""
+    note = folder / PRECISION
+    if note.exists():
+        return json.loads(note.read_text())
+    found = settled(precision)
+    if rank() == 0:
+        write_json(note, found)
+    return found
 
 
 def settled(precision: str) -> str:

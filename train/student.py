@@ -38,7 +38,7 @@ from train.features import Features, Keyed
 from train.generate import HeldOutAnswers
 from train.packing import PackingCollator, rope_of
 from train.planned import ByLength, Samples
-from train.precision import settled
+from train.precision import of_run
 from train.sft_trainer import LetterChoice, StudentTrainer, TokenChoice, token_mean
 from train.sights import SightCollator, SightTrainer, seen_words
 
@@ -50,7 +50,7 @@ def train_student(
 ) -> dict[str, float]:
     """Train a student in its run's folder and give what it measured there."""
     room.keep_big_blocks()
-    cfg.train.precision = settled(cfg.train.precision)
+    cfg.train.precision = of_run(run.folder, cfg.train.precision)
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
     log.info("loading student %s, to compute in %s", cfg.student.name, cfg.train.precision)
@@ -66,6 +66,9 @@ def train_student(
     training, validation = split(cfg, store, rationales)
     ways = ways_of(cfg, model, processor)
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
+    if rank() == 0:
+        accepted = (text for r in rationales for text in (r.item_id, r.text))
+        compatible.note_data(run.folder, store, accepted, map(str, lengths))
     longest = training[lengths.index(max(lengths))]
     log.info(audit(model, processor, cfg.student, longest, ways.collator))
     train = memory.settle(cfg.train, run.folder, model, ways.packs, training, lengths)

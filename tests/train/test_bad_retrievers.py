@@ -43,7 +43,7 @@ def refused(settings: ContrastiveCommand, folder: Path, said: str) -> None:
     folder.mkdir()
     with pytest.raises(UserError, match=said):
         contrastive.main.__wrapped__(settings, Run("run", folder))
-    assert not {p.name for p in folder.iterdir()} - {"untrained", "base.json"}
+    assert not {p.name for p in folder.iterdir()} - {"untrained", "base.json", "data.json"}
 
 
 def twice(rows: Rows) -> Rows:

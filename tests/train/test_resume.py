@@ -70,6 +70,22 @@ def test_a_student_goes_on_as_if_undisturbed(sft_settings, tmp_path) -> None:
 
 
 @pytest.mark.slow
+def test_a_run_does_not_go_on_with_other_data(sft_settings, tmp_path, monkeypatch) -> None:
+    whole, killed = tmp_path / "whole", Run("killed", tmp_path / "killed")
+    whole.mkdir()
+    sft.main.__wrapped__(sft_settings, Run("whole", whole))
+    ignored = shutil.ignore_patterns("metrics.json", "student")
+    shutil.copytree(whole, killed.folder, ignore=ignored)
+    told = samples.supervised_items
+    monkeypatch.setattr(
+        samples, "supervised_items", lambda *given: {m: s[:-1] for m, s in told(*given).items()}
+    )
+    with pytest.raises(UserError, match=r"was begun on other data than .*run=NAME"):
+        sft.main.__wrapped__(sft_settings, killed)
+    assert not (killed.folder / "student").exists()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("steps", "step"), [(4, 2), (6, 3)], ids=["at a border", "within"])
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_student_goes_on_within_a_later_epoch(
