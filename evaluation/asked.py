@@ -113,6 +113,11 @@ def model_served(
         )
     server = replace(cfg.server, model=cfg.server.model or student.model)
     told = served.revision(server)
+    if folder is None and told["parent"]:
+        raise UserError(
+            f"server.model={server.model} is an adapter over {told['parent']} there: give "
+            "model=RUN, the run that trained it, so that it is asked what it was trained to answer"
+        )
     weights = product_folder(folder, "student") if folder else None
     told["weights"] = compatible.weights_digest(told["root"], told["parent"], weights)
 

@@ -45,10 +45,10 @@ def selection_cells(rows: Sequence[SelectionRow]) -> list[list[str]]:
         found = [*(r.families.get(f) for f in FAMILIES)]
         shares = [*(i and i.value for i in found), r.macro, r.micro.value, r.parse_rate]
         cells.append([f"{r.name} ({r.mode})", *map(_percent, shares), f"{r.n:,}"])
-        spans = map(_range, (*found, r.macro_interval, r.micro))
+        spans = map(interval_cell, (*found, r.macro_interval, r.micro))
         cells.append(["  95% interval", *spans, "", ""])
         for horizon, of in r.horizons.items():
-            label = f"  time, {horizon} ({_range(of)})"
+            label = f"  time, {horizon} ({interval_cell(of)})"
             cells.append([label, "", _percent(of.value), "", "", "", "", f"{of.n:,}"])
     return cells
 
@@ -71,7 +71,7 @@ def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> Table:
     rows = []
     for cell in subtypes[modes[0]]:
         found = [subtypes[mode][cell] for mode in modes]
-        shares = [f"{_percent(i.value)} [{_range(i)}]" for i in found]
+        shares = [f"{_percent(i.value)} [{interval_cell(i)}]" for i in found]
         rows.append([cell, *shares, str(found[0].n)])
     head = ["Accuracy by subtype, %", *modes, "Items"]
     return Table("subtypes", "Selection accuracy by subtype (%)", head, {"": rows})
@@ -126,14 +126,14 @@ def position_table(found: dict[str, Positions]) -> Table:
     where each was."""
     cells = []
     for mode, of in found.items():
-        total = sum(of.right.values())
-        for name, counts, wholes in (
-            ("chosen", of.chosen, dict.fromkeys(LETTERS, sum(of.chosen.values()))),
-            ("right", of.right, dict.fromkeys(LETTERS, total)),
-            ("accuracy", of.hits, of.right),
+        chosen, total = sum(of.chosen.values()), sum(of.right.values())
+        for name, counts, wholes, answers in (
+            ("chosen", of.chosen, dict.fromkeys(LETTERS, chosen), chosen),
+            ("right", of.right, dict.fromkeys(LETTERS, total), total),
+            ("accuracy", of.hits, of.right, total),
         ):
             shares = [_percent(counts[x] / wholes[x] if wholes[x] else None) for x in LETTERS]
-            cells.append([f"{mode}: {name}", *shares, f"{sum(counts.values()):,}"])
+            cells.append([f"{mode}: {name}", *shares, f"{answers:,}"])
         if of.p is not None:
             told = f"  chi-square {of.chi_square:.1f}, p = {of.p:.2g}"
             cells.append([told, *[""] * (len(LETTERS) + 1)])
@@ -148,7 +148,7 @@ def calibration_table(mode: str, found: Calibration) -> Table:
             f"{b.low:.1f} to {b.high:.1f}",
             f"{100 * b.confidence:.1f}",
             _percent(b.accuracy.value),
-            _range(b.accuracy),
+            interval_cell(b.accuracy),
             f"{b.accuracy.n:,}",
         ]
         for b in found.bins
@@ -280,14 +280,16 @@ def index_table(indexes: Sequence[dict[str, Any]]) -> Table:
 def human_table(found: dict[str, Any]) -> Table:
     """What `evaluation.study.agreement.summary` found, beside the paper's study."""
 
-    def row(name: str, of: dict[str, Any]) -> list[str]:
-        shares = [of["families"].get(f, {}).get("value") for f in FAMILIES]
-        shares += [of["macro"], of["micro"]["value"]]
-        return [name, *map(_percent, shares), str(of["micro"]["n"])]
+    def rows(name: str, of: dict[str, Any]) -> list[list[str]]:
+        each = [Interval(**told) if (told := of["families"].get(f)) else None for f in FAMILIES]
+        micro = Interval(**of["micro"])
+        shares = [*(i and i.value for i in each), of["macro"], micro.value]
+        spans = [*map(interval_cell, each), "", interval_cell(micro)]
+        return [[name, *map(_percent, shares), str(micro.n)], ["  95% interval", *spans, ""]]
 
-    own = [row(name, of) for name, of in found["accuracy"].items()]
+    own = [row for name, of in found["accuracy"].items() for row in rows(name, of)]
     if found["majority"]:
-        own.append(row("Majority vote", found["majority"]))
+        own += rows("Majority vote", found["majority"])
     times = [found["seconds"].get(f, {}).get("server") for f in FAMILIES]
     own.append(["Median seconds", *("-" if t is None else f"{t:.1f}" for t in times), "", "", ""])
     reference = [
@@ -306,6 +308,7 @@ def _human_notes(found: dict[str, Any]) -> tuple[str, ...]:
     kappa, alpha = found["fleiss_kappa"], found["krippendorff_alpha"]
     undecided = found["majority"]["undecided"] if found["majority"] else 0
     return (
+        "Intervals are Wilson's, over items.",
         f"{found['judgments']:,} judgments of {found['items']:,} items; items by how many answered "
         f"them: {', '.join(depth)}.",
         f"Majority is more than half of an item's votes; items without one, counted wrong: "
@@ -331,10 +334,10 @@ def _values(row: RetrievalRow) -> list[str]:
 
 def _ranges(row: RetrievalRow) -> list[str]:
     found = row.measures
-    recalls = [_range(found[f"recall@{k}"]) for k in RECALLS]
+    recalls = [interval_cell(found[f"recall@{k}"]) for k in RECALLS]
     mrr = f"{row.mrr.low:.2f}-{row.mrr.high:.2f}"
     median = f"{row.median_rank.low:.0f}-{row.median_rank.high:.0f}"
-    return [*recalls, mrr, median, _range(row.tie_rate)]
+    return [*recalls, mrr, median, interval_cell(row.tie_rate)]
 
 
 def _percent(share: float | None) -> str:
@@ -345,5 +348,6 @@ def _printed(percent: float | None) -> str:
     return "-" if percent is None else f"{percent:.1f}"
 
 
-def _range(found: Interval | None) -> str:
+def interval_cell(found: Interval | None) -> str:
+    """An interval's ends in percent, nothing where there is none."""
     return "" if found is None else f"{100 * found.low:.0f}-{100 * found.high:.0f}"

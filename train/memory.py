@@ -285,9 +285,13 @@ def lower(train: SftTrainConfig) -> str:
     named = "student.image_size or student.frames"
     if train.micro_batch != 1:
         named = f"train.micro_batch, which is {train.micro_batch}"
-    return (
-        f"lower {named}, or set train.gradient_checkpointing=true, in a run of its own (run=NAME)"
-    )
+    switched = {"gradient_checkpointing": True, "reuse_features": False}
+    left = [
+        f"set train.{key}={str(spares).lower()}"
+        for key, spares in switched.items()
+        if getattr(train, key) is not spares
+    ]
+    return f"{', or '.join([f'lower {named}', *left])}, in a run of its own (run=NAME)"
 
 
 def gib(size: int) -> str:

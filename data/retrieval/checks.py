@@ -20,12 +20,12 @@ def check_training(store: Store, queries: Sequence[RetrievalQuery], negatives: i
     """
     _check_ids(store, queries)
     tested = {*store.scene_ids("test"), *(q.scene_id for q in store.retrieval("test"))}
-    if shared := [q for q in queries if {q.scene_id, q.target.scene_id} & tested]:
+    if shared := [q for q in queries if _scenes(q) & tested]:
         query = shared[0]
         raise UserError(
-            f"training query {query.query_id} is about scene {query.scene_id}, which is in the "
-            f"test split of {store.folder} too{_more(shared)}: a retriever would be measured on "
-            f"what it was trained on; {_again(store)}"
+            f"training query {query.query_id} is about scene {min(_scenes(query) & tested)}, which "
+            f"is in the test split of {store.folder} too{_more(shared)}: a retriever would be "
+            f"measured on what it was trained on; {_again(store)}"
         )
     if lacking := [q for q in queries if len(q.hard_negatives) < negatives]:
         query = min(lacking, key=lambda q: len(q.hard_negatives))
@@ -35,6 +35,12 @@ def check_training(store: Store, queries: Sequence[RetrievalQuery], negatives: i
             f"{query.query_id} of {store.folder} has{_more(lacking)}: give "
             f"train.hard_negatives={fewest}, or {_again(store)}"
         )
+
+
+def _scenes(query: RetrievalQuery) -> set[str]:
+    """Those that a query, its target and its wrong frames show."""
+    wrong = (frame.scene_id for frame in query.hard_negatives)
+    return {query.scene_id, query.target.scene_id, *wrong}
 
 
 def check_test(

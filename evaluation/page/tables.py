@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from conf.sweep import AT_START
 from evaluation import paper
 from evaluation.formats import Best, Table
+from evaluation.metrics import Interval
 from evaluation.page.gathering import Finished
 from evaluation.page.rows import SUITES, Measured
 from evaluation.rows import SIMILARITY
@@ -16,6 +17,7 @@ from evaluation.tables import (
     RETRIEVAL_NOTE,
     SELECTION_HEAD,
     SELECTION_NOTE,
+    interval_cell,
     retrieval_cells,
     retrieval_references,
     selection_cells,
@@ -150,17 +152,21 @@ def overall_table(
         for m in rows
     ]
     suites = dict.fromkeys(["In domain", *SUITES.values(), *columns])
-    found: dict[str, dict[str, str]] = {}
+    found: dict[str, dict[str, Interval]] = {}
     for m, label, column in zip(rows, labels, columns, strict=True):
-        found.setdefault(label, {})[column] = f"{100 * m.row.micro.value:.1f}"
-    own = [[label, *(of.get(column, "-") for column in suites)] for label, of in found.items()]
+        found.setdefault(label, {})[column] = m.row.micro
+    own = []
+    for label, of in found.items():
+        each = [of.get(column) for column in suites]
+        own.append([label, *(f"{100 * i.value:.1f}" if i else "-" for i in each)])
+        own.append(["  95% interval", *map(interval_cell, each)])
     printed = {
         told: [_overall(r, len(suites)) for r in references]
         for told, references in reference.items()
     }
     head = ["Overall accuracy, %", *suites]
     told = _with_best(head, {"": own, **printed}, dict.fromkeys(suites, max))
-    return Table(name, caption, head, told, (BOLD,))
+    return Table(name, caption, head, told, ("Intervals are Wilson's, over items.", BOLD))
 
 
 def _overall(row: paper.OverallReference, columns: int) -> list[str]:

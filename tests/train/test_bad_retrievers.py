@@ -43,7 +43,8 @@ def refused(settings: ContrastiveCommand, folder: Path, said: str) -> None:
     folder.mkdir()
     with pytest.raises(UserError, match=said):
         contrastive.main.__wrapped__(settings, Run("run", folder))
-    assert not {p.name for p in folder.iterdir()} - {"untrained", "base.json", "data.json"}
+    notes = {"base.json", "data.json", "precision.json"}
+    assert {p.name for p in folder.iterdir()} <= {"untrained", *notes}
 
 
 def twice(rows: Rows) -> Rows:
@@ -56,6 +57,14 @@ def in_both(rows: Rows) -> Rows:
     return [{**r, "scene_id": tested} if r is row else r for r in rows]
 
 
+def shown_wrong(rows: Rows) -> Rows:
+    """A scene of the test split is one of the wrong frames."""
+    tested = next(r["scene_id"] for r in rows if r["split"] == "test" and r["pool"] == "future")
+    (row, *_) = (r for r in rows if r["split"] == "train" and r["pool"] == "future")
+    wrong = [{**row["hard_negatives"][0], "scene_id": tested}, *row["hard_negatives"][1:]]
+    return [{**r, "hard_negatives": wrong} if r is row else r for r in rows]
+
+
 def poor(rows: Rows) -> Rows:
     return [{**r, "hard_negatives": r["hard_negatives"][:1]} for r in rows]
 
@@ -65,6 +74,7 @@ def poor(rows: Rows) -> Rows:
     [
         (twice, r"retrieval\.parquet has query \S+ more than once: delete"),
         (in_both, r"training query \S+ is about scene \S+, which is in the test split of"),
+        (shown_wrong, r"training query \S+ is about scene \S+, which is in the test split of"),
         (poor, r"train\.hard_negatives=2 is more than the 1 that query"),
     ],
 )

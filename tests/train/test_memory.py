@@ -12,6 +12,7 @@ from torch import nn
 
 from conf.entry import Run
 from conf.schema import SftCommand
+from conf.schema.training import SftTrainConfig
 from train import journal, memory, room, sft
 from train.backbone import load_student
 from train.collate import Collator
@@ -224,3 +225,14 @@ def test_what_is_chosen_learns_what_a_given_one_learns(
     for one, two in zip(*journals, strict=True):
         # The library tells the share of the epoch in micro-batches, of which the last are fewer.
         assert one | {"epoch": 0} == pytest.approx(two | {"epoch": 0}, rel=1e-3)
+
+
+def test_what_is_advised_is_what_is_left_to_do() -> None:
+    train = SftTrainConfig(micro_batch=4, gradient_checkpointing=False, reuse_features=True)
+    told = memory.lower(train)
+    assert "lower train.micro_batch, which is 4" in told
+    assert "train.gradient_checkpointing=true, or set train.reuse_features=false" in told
+    spare = replace(train, micro_batch=1, gradient_checkpointing=True, reuse_features=False)
+    assert memory.lower(spare) == (
+        "lower student.image_size or student.frames, in a run of its own (run=NAME)"
+    )

@@ -236,6 +236,10 @@ def test_a_student_is_not_measured_by_its_base(talking, tmp_path) -> None:
     cfg = SelectCommand(server=replace(at(server), model=None), student=STUDENT)
     with pytest.raises(UserError, match=r"give server\.model=NAME"):
         model_served(cfg, tmp_path, STUDENT)
+    # Nor is what it answers taken for a base's.
+    adapter = replace(cfg, server=replace(at(server), model="adapter"))
+    with pytest.raises(UserError, match="is an adapter over weights there: give model=RUN"):
+        model_served(adapter, None, STUDENT)
 
 
 def test_answers_to_other_questions_stay_and_do_not_count(items, tmp_path) -> None:
