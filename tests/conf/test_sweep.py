@@ -24,6 +24,7 @@ from conf.processes import visible_gpus
 from conf.schema import ContrastiveCommand, SftCommand
 from conf.schema.training import REGIMES
 from conf.search import JOURNAL, distribution, open_study
+from tests.conf.test_presets import SCHEMAS
 
 PRESETS = Path(str(files("conf"))) / "sweep"
 SEARCH = ("-m", "x=interval(0.5,3.0)", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=2")
@@ -329,11 +330,20 @@ def test_what_is_typed_is_what_is_drawn_from(typed, drawn):
     assert distribution(override) == drawn
 
 
-def preset_jobs(name: str) -> list[SftCommand]:
+def preset_jobs(name: str) -> list[SftCommand | ContrastiveCommand]:
+    """The jobs of a preset, over the model that its file names."""
+    command, schema, model = told_by(name)
     params = OmegaConf.load(PRESETS / f"{name}.yaml").hydra.sweeper.params
     overrides = [f"{key}={value}" for key, value in params.items()]
     [jobs] = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(overrides), None)
-    return [compose("train.sft", SftCommand, ["student=qwen3_vl_8b", *job]) for job in jobs]
+    return [compose(command, schema, [model, *job]) for job in jobs]
+
+
+def told_by(name: str) -> tuple[str, type, str]:
+    """The command, its settings, and the model of the line in a preset's file."""
+    line = (PRESETS / f"{name}.yaml").read_text().splitlines()[1]
+    _, _, _, command, _, _, model = line.split()
+    return command, SCHEMAS[command], model
 
 
 def test_the_regimes_are_all_that_a_student_can_be_trained_in():
@@ -341,23 +351,25 @@ def test_the_regimes_are_all_that_a_student_can_be_trained_in():
 
 
 @pytest.mark.slow
-def test_the_scale_of_adapters_stays_the_papers_at_every_rank():
-    jobs = preset_jobs("lr_rank")
-    paper = compose("train.sft", SftCommand, ["student=qwen3_vl_8b"])
-    assert len({(job.train.lr, job.student.lora.rank) for job in jobs}) == len(jobs) == 9
-    scales = {job.student.lora.alpha / job.student.lora.rank for job in jobs}
-    assert scales == {paper.student.lora.alpha / paper.student.lora.rank}
-    assert (paper.train.lr, paper.student.lora.rank) in {
-        (job.train.lr, job.student.lora.rank) for job in jobs
-    }
+@pytest.mark.parametrize("name", ["lr_rank", "retriever_lr_rank"])
+def test_the_scale_of_adapters_stays_the_papers_at_every_rank(name):
+    command, schema, model = told_by(name)
+    drawn, [paper] = (
+        [(cfg.train.lr, getattr(cfg, model.partition("=")[0]).lora) for cfg in of]
+        for of in (preset_jobs(name), [compose(command, schema, [model])])
+    )
+    assert len({(lr, lora.rank) for lr, lora in drawn}) == len(drawn) == 9
+    assert {lora.alpha / lora.rank for _, lora in drawn} == {paper[1].alpha / paper[1].rank}
+    assert paper in drawn
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(path.stem for path in PRESETS.glob("*.yaml")))
 def test_a_preset_is_checked_before_it_starts(name):
-    preflight("train.sft", SftCommand, [f"+sweep={name}"], sweep=True)
+    command, schema, model = told_by(name)
+    preflight(command, schema, [f"+sweep={name}", model], sweep=True)
     with pytest.raises(SettingsError, match=rf"\+sweep={name} is a sweep: run it with -m"):
-        preflight("train.sft", SftCommand, [f"+sweep={name}"], sweep=False)
+        preflight(command, schema, [f"+sweep={name}", model], sweep=False)
 
 
 def test_a_preset_of_another_command_is_told():
