@@ -14,6 +14,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -110,8 +111,9 @@ def search(
     with held(folder, f"{folder} is in use by another process; run this again when it is done"):
         if not _is_there(path, built_for):
             log.info("building the index of width %d over %s frames", width, f"{len(names):,}")
-            index = _build(faiss, lambda: _units(shown, names, width), len(names), width)
-            _write(faiss, index, path, built_for)
+            # Not kept by a name: read back below, it would be in memory twice.
+            parts = partial(_units, shown, names, width)
+            _write(faiss, _build(faiss, parts, len(names), width), path, built_for)
         try:
             index = faiss.read_index(str(path))
         except RuntimeError as error:
@@ -126,7 +128,7 @@ def search(
 
 
 def _is_there(path: Path, built_for: dict) -> bool:
-    """Whether there is an index for this model and database.
+    """Whether there is an index for this model and database, built by this faiss.
 
     Raises:
         UserError: there is one for another.
@@ -137,9 +139,11 @@ def _is_there(path: Path, built_for: dict) -> bool:
         return False
     if not path.exists():
         return False
-    other = [key for key in built_for if there.get(key) != built_for[key]]
-    if other:
+    if other := [key for key in built_for if there.get(key) != built_for[key]]:
         key = other[0]
+        if key == "faiss":
+            log.info("%s was built by faiss %s; building it anew", path, there.get(key))
+            return False
         raise UserError(
             f"{path} was built for another model or database ({key} is {there.get(key)} there and "
             f"{built_for[key]} here): delete it; one for these is then built"

@@ -5,6 +5,7 @@ Needs faiss, which the extra `test` brings.
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -69,6 +70,16 @@ def test_an_index_of_another_model_is_refused(tmp_path) -> None:
         UserError, match=r"was built for another model or database \(weights is one"
     ):
         ranks(tmp_path, 4, "another")
+
+
+def test_an_index_of_an_earlier_faiss_is_built_anew(tmp_path) -> None:
+    ranks(tmp_path, 4)
+    notes = sorted((embeddings(tmp_path).folder / "index").glob("*.json"))
+    before = [note.read_text() for note in notes]
+    for note in notes:
+        note.write_text(json.dumps(json.loads(note.read_text()) | {"faiss": "1.0"}))
+    ranks(tmp_path, 4)
+    assert [note.read_text() for note in notes] == before
 
 
 def test_what_a_kill_left_of_an_index_is_built_again(tmp_path) -> None:
