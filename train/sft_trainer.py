@@ -3,9 +3,10 @@ of samples and of their candidates in an epoch, and the measure of the answer's 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
@@ -48,15 +49,15 @@ def token_losses(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
 
 
 STOPPED = "stopped.json"
-"""Names the samples whose loss was no number; another rank than the main one has its number in
-front."""
+"""Names the samples whose loss or gradient was no number; another rank than the main one has its
+number in front."""
 
 
 class StudentTrainer(Trainer):
     """A Trainer that takes its samples in an `order` of ours and makes training batches with a
     `training_collator`, measures an evaluation by a `choice` that is told the samples and by the
-    `answers` that the student writes, if any are to be written, and stops where a loss is no
-    number.
+    `answers` that the student writes, if any are to be written, and stops where a loss or a
+    gradient is no number.
 
     The loss of an evaluation is the mean over all supervised tokens of its samples; the trainer's
     own would hang on how they are split into micro-batches and ranks.
@@ -85,6 +86,7 @@ class StudentTrainer(Trainer):
         self._features = features
         self._answers = answers
         self._asked = False
+        self._stepped: tuple[int, list[str]] = (-1, [])
 
     def get_train_dataloader(self) -> DataLoader:
         # An evaluation's samples are measured by their rows.
@@ -140,15 +142,29 @@ class StudentTrainer(Trainer):
         found = super().compute_loss(model, inputs, return_outputs, **settings)
         loss = found[0] if return_outputs else found
         if not torch.isfinite(loss):
-            name = f"{rank()}-{STOPPED}" if rank() else STOPPED
-            step, path = self.state.global_step, Path(self.args.output_dir) / name
-            write_json(path, {"step": step, "loss": str(loss.item()), "samples": ids})
-            raise UserError(
-                f"the loss is {loss.item()} after step {step}; {path} names the samples. A lower "
-                "train.lr or train.precision=fp32 may help; what was trained up to the last "
-                "checkpoint is kept"
-            )
+            self._stop("loss", loss.item(), ids)
+        if model.training:
+            step, before = self._stepped
+            now = self.state.global_step
+            self._stepped = (now, [*(before if step == now else []), *ids])
         return found
+
+    def log(self, logs: dict[str, float], *args: Any, **settings: Any) -> None:
+        """Raises UserError for a gradient that is no number, before weights of it are saved."""
+        super().log(logs, *args, **settings)
+        norm = logs.get("grad_norm")
+        if norm is not None and not math.isfinite(norm):
+            self._stop("gradient", norm, self._stepped[1])
+
+    def _stop(self, what: str, found: float, ids: list[str]) -> NoReturn:
+        name = f"{rank()}-{STOPPED}" if rank() else STOPPED
+        step, path = self.state.global_step, Path(self.args.output_dir) / name
+        write_json(path, {"step": step, what: str(found), "samples": ids})
+        raise UserError(
+            f"the {what} is {found} after step {step}; {path} names the samples. A lower train.lr "
+            "or train.precision=fp32 may help, in a run of its own (run=NAME); what was trained up "
+            "to the last checkpoint is kept"
+        )
 
 
 class TokenChoice:

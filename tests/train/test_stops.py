@@ -18,6 +18,7 @@ from data.records import SelectionItem
 from data.store import Store
 from train import samples, sft
 from train.samples import shows_only, splits
+from train.sft_trainer import token_mean
 
 
 @pytest.fixture
@@ -34,6 +35,31 @@ def test_a_loss_that_is_no_number_stops_with_its_samples(settings, micro_store, 
     named = {f"{item.item_id} (answer)" for item in micro_store.selection("train")}
     assert len(told["samples"]) == 2
     assert set(told["samples"]) <= named
+
+
+class Spoilt(torch.autograd.Function):
+    """A loss that is a number, with a gradient that is none."""
+
+    @staticmethod
+    def forward(ctx: Any, loss: torch.Tensor) -> torch.Tensor:
+        return loss.clone()
+
+    @staticmethod
+    def backward(ctx: Any, given: torch.Tensor) -> torch.Tensor:
+        return given * torch.nan
+
+
+@pytest.mark.slow
+def test_a_gradient_that_is_no_number_stops_with_its_steps_samples(
+    settings, tmp_path, monkeypatch
+) -> None:
+    spoilt = lambda *given, **named: Spoilt.apply(token_mean(*given, **named))  # noqa: E731
+    monkeypatch.setattr("train.student.token_mean", spoilt)
+    with pytest.raises(UserError, match=r"the gradient is nan after step 1; .*stopped\.json names"):
+        sft.main.__wrapped__(settings, Run("run", tmp_path))
+    told = json.loads((tmp_path / "stopped.json").read_text())
+    assert len(told["samples"]) == settings.train.batch
+    assert not list(tmp_path.glob("checkpoint-*"))
 
 
 @pytest.mark.slow
