@@ -53,7 +53,9 @@ class Spoilt(torch.autograd.Function):
 def test_a_gradient_that_is_no_number_stops_with_its_steps_samples(
     settings, tmp_path, monkeypatch
 ) -> None:
-    spoilt = lambda *given, **named: Spoilt.apply(token_mean(*given, **named))  # noqa: E731
+    def spoilt(*given: Any, **named: Any) -> torch.Tensor:
+        return Spoilt.apply(token_mean(*given, **named))
+
     monkeypatch.setattr("train.student.token_mean", spoilt)
     with pytest.raises(UserError, match=r"the gradient is nan after step 1; .*stopped\.json names"):
         sft.main.__wrapped__(settings, Run("run", tmp_path))
