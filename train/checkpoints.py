@@ -10,6 +10,8 @@ from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 
+from conf.errors import UserError
+
 log = logging.getLogger(__name__)
 
 STATE = "trainer_state.json"
@@ -35,6 +37,17 @@ def newest_checkpoint(folder: Path) -> Path | None:
         instead = "going on from the one before it" if k + 1 < len(numbered) else "starting anew"
         log.warning("%s was cut off (%s): %s", path, problem, instead)
     return None
+
+
+def check_best(checkpoint: Path) -> None:
+    """Raises UserError where the checkpoint that was the best before `checkpoint` is not whole: the
+    library would keep the last weights in its place without a word, or fail in the end."""
+    best = json.loads((checkpoint / STATE).read_text())["best_global_step"]
+    if best and (problem := cut_off(kept := checkpoint.with_name(f"checkpoint-{best}"))):
+        raise UserError(
+            f"{kept}, the best checkpoint so far, was lost or cut off ({problem}): put it back, or "
+            f"delete {checkpoint.parent} and train again"
+        )
 
 
 def cut_off(checkpoint: Path) -> str | None:

@@ -30,7 +30,7 @@ from conf.errors import UserError
 from conf.runs import rank, run_id
 from conf.schema import TrainConfig
 from train.backbone import unwritten
-from train.checkpoints import STATE
+from train.checkpoints import STATE, check_best
 from train.journal import Bar, Journal, NamedMeasure
 from train.ranks import sharded
 
@@ -169,6 +169,7 @@ class Epochs(TrainerCallback):
 def fit(trainer: Trainer, checkpoint: Path | None) -> None:
     """Train to the last step, from the start or a checkpoint."""
     if checkpoint is not None:
+        check_best(checkpoint)
         log.info("going on from %s", checkpoint)
     if checkpoint is not None and is_last(checkpoint):
         # The trainer would take a step more.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -222,3 +223,20 @@ def test_a_retriever_of_adapters_goes_on_as_if_undisturbed(
         same_weights(best / name, whole / "retriever" / name)
         same_weights(*(f / "retriever" / name for f in (whole, killed)))
     same_journals(whole, killed)
+
+
+@pytest.mark.slow
+def test_a_best_checkpoint_that_was_lost_is_told(contrastive_settings, tmp_path) -> None:
+    train = replace(contrastive_settings.train, best="mrr")
+    settings = replace(contrastive_settings, train=train)
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    whole.mkdir()
+    contrastive.main.__wrapped__(settings, Run("whole", whole))
+    kept = shutil.copytree(whole / "checkpoint-4", killed / "checkpoint-4")
+    state = json.loads((kept / "trainer_state.json").read_text())
+    state["best_global_step"] = 2
+    (kept / "trainer_state.json").write_text(json.dumps(state))
+    with pytest.raises(
+        UserError, match=r"checkpoint-2, the best .* was lost or cut off \(its file"
+    ):
+        contrastive.main.__wrapped__(settings, Run("killed", killed))
