@@ -143,7 +143,8 @@ class Frames:
         missing = [f for f in dict.fromkeys(frames) if (scene_id, f) not in self._kept]
         if missing:
             for frame, pixels in zip(missing, self._load(scene_id, missing), strict=True):
-                self._kept[scene_id, frame] = pixels
+                # Its own: a part of the stack would keep all of that.
+                self._kept[scene_id, frame] = pixels.copy()
                 self._bytes += pixels.nbytes
         stack = np.stack([self._kept[scene_id, frame] for frame in frames])
         for frame in frames:
