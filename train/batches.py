@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate
 
 import numpy as np
@@ -33,8 +34,13 @@ class Batch:
 
     def groups(self, first: int, last: int) -> list[list[RetrievalQuery]]:
         """The queries of a range of prefixes, prefix by prefix."""
-        bounds = [0, *accumulate(self.prefixes)]
+        bounds = self._bounds
         return [self.queries[bounds[k] : bounds[k + 1]] for k in range(first, last)]
+
+    @cached_property
+    def _bounds(self) -> list[int]:
+        # Made once: mining asks for every range of a whole pool.
+        return [0, *accumulate(self.prefixes)]
 
     def query_names(self, first: int, last: int) -> list[str]:
         """Of the queries of a range of prefixes."""

@@ -41,8 +41,8 @@ class TrainConfig:
     eval_recall@10; a loss is best when least, all others when greatest. null takes the last
     step."""
     workers: int = 0
-    """Processes that prepare batches while the model computes; 0 leaves it to the trainer's own
-    process."""
+    """Processes that prepare batches while the model computes; for a retriever, mini-batches that a
+    thread prepares ahead. 0 leaves it to the trainer's own process."""
     report_to: list[str] = field(default_factory=list)
     """Trackers of transformers' Trainer, such as tensorboard, wandb or trackio."""
 
