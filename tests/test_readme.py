@@ -24,6 +24,7 @@ def folder_of(command: str, overrides: list[str]) -> str:
     return f"{kind}/{run_name(told.get('run'), overrides)}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "overrides"), TOLD, ids=lambda v: str(v).replace("/", "-"))
 def test_it_composes(command: str, overrides: list[str]) -> None:
     sweep = "-m" in overrides
