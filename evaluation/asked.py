@@ -71,7 +71,7 @@ def model_here(
     """
     weights = None
     if folder is not None:
-        compatible.check_base(folder, student.model)
+        compatible.check_base(folder, student)
         weights = product_folder(folder, "student")
 
     @cache
@@ -90,7 +90,7 @@ def model_here(
         return answer
 
     revision = {
-        "weights": compatible.weights_digest(student.model, weights),
+        "weights": compatible.weights_digest(compatible.pinned(student), weights),
         "revision": student.revision,
         "quantization": student.quantization,
         "precision": precision,

@@ -27,6 +27,7 @@ from train.compatible import (
     check_base,
     check_pooling,
     check_widths,
+    pinned,
     processor_digest,
     weights_digest,
 )
@@ -100,7 +101,7 @@ def trained_embedder(folder: Path, preset: RetrieverConfig, precision: str) -> E
     Raises:
         UserError: it is over another base than `preset` names, or saved by another pooling.
     """
-    check_base(folder, preset.model)
+    check_base(folder, preset)
     saved = product_folder(folder, "retriever")
     if preset.late is None:
         check_pooling(saved)
@@ -111,7 +112,7 @@ def trained_embedder(folder: Path, preset: RetrieverConfig, precision: str) -> E
 
         return trained_encoder(preset, precision, saved)
 
-    digests = weights_digest(preset.model, saved), processor_digest(saved)
+    digests = weights_digest(pinned(preset), saved), processor_digest(saved)
     return Embedder(run_title(folder), preset, precision, *digests, load)
 
 
@@ -137,10 +138,11 @@ def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Em
 
         return released_encoder(preset, precision, run / "untrained")
 
-    weights = weights_digest(preset.model, preset.image_model)
+    base = pinned(preset)
     name = f"{UNTRAINED} {preset.name}" if preset.encoder == "qwen3_vl" else preset.name
     name += ", late" if preset.late is not None else ""
-    return Embedder(name, preset, precision, weights, processor_digest(preset.model), load)
+    digests = weights_digest(base, preset.image_model), processor_digest(base)
+    return Embedder(name, preset, precision, *digests, load)
 
 
 def embed_queries(

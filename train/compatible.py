@@ -192,7 +192,8 @@ def check_widths(cfg: RetrieverConfig, entries: int) -> None:
 def weights_digest(*models: str | Path | None) -> str:
     """A short hash of the safetensors of models in folders, wherever the folder is, by each file's
     name and size, the names and shapes of its tensors, and a block of each tensor's middle: what is
-    trained, or merged, changes all of a tensor. A hub's name stands for itself."""
+    trained, or merged, changes all of a tensor. A hub's name stands for itself, with its commit or
+    without."""
     whole = hashlib.sha256()
     for k, model in enumerate(models):
         folder = model is not None and Path(model).is_dir()
@@ -234,11 +235,24 @@ def processor_digest(model: str | Path | None) -> str:
     return whole.hexdigest()[:16]
 
 
-def note_base(folder: Path, model: str | None) -> None:
+def pinned(cfg: StudentConfig | RetrieverConfig) -> str | None:
+    """The model that a preset names, a hub's as NAME@COMMIT: a name alone may mean other weights
+    tomorrow. A hub that cannot be asked, and has left nothing here, has no model to load either;
+    the name stands then as it is."""
+    if cfg.model is None or Path(cfg.model).is_dir():
+        return cfg.model
+    try:
+        # Within a cache, files stand in a folder that goes by the commit.
+        return f"{cfg.model}@{file_of(cfg.model, 'config.json', cfg.revision).parent.name}"
+    except (OSError, ValueError):
+        return cfg.model
+
+
+def note_base(folder: Path, cfg: StudentConfig | RetrieverConfig) -> None:
     """Note in a run's folder which weights it is trained over, and hold them to an earlier note:
     a run that goes on goes on over the same."""
-    check_base(folder, model)
-    write_json(folder / BASE, weights_digest(model))
+    check_base(folder, cfg)
+    write_json(folder / BASE, _identity(cfg))
 
 
 def note_data(folder: Path, store: Store, *told: Iterable[str]) -> None:
@@ -265,11 +279,28 @@ def note_data(folder: Path, store: Store, *told: Iterable[str]) -> None:
     write_json(note, digest)
 
 
-def check_base(folder: Path, model: str | None) -> None:
+def check_base(folder: Path, cfg: StudentConfig | RetrieverConfig) -> None:
     """Raises UserError where a run's base is not the one that it was trained over."""
     note = folder / BASE
-    if note.exists() and json.loads(note.read_text()) != weights_digest(model):
+    if not note.exists() or json.loads(note.read_text()) == (here := _identity(cfg)):
+        return
+    if here == cfg.model:
+        # A hub's that is not here: what loads it tells that.
+        return
+    there = json.loads(note.read_text())
+    group = "student" if isinstance(cfg, StudentConfig) else "retriever"
+    if (name := f"{cfg.model}@") in there:
         raise UserError(
-            f"the weights in {model} are not those that {folder} is trained over: put those back, "
-            "or delete that run and train again"
+            f"{folder} is trained over {there}, and what is had of it is {here}: give "
+            f"{group}.revision={there.removeprefix(name)}, or train in a run of its own (run=NAME)"
         )
+    raise UserError(
+        f"the weights in {cfg.model} are not those that {folder} is trained over: put those back, "
+        "or delete that run and train again"
+    )
+
+
+def _identity(cfg: StudentConfig | RetrieverConfig) -> str:
+    """By which a run knows its base: a hub's by name and commit, a folder's by its weights."""
+    model = pinned(cfg)
+    return model if model and not Path(model).is_dir() else weights_digest(model)

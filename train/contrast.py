@@ -58,7 +58,7 @@ def train_retriever(
     training, validation = split(cfg, store)
     log.info("loading retriever %s, to compute in %s", cfg.retriever.name, cfg.train.precision)
     if rank() == 0:
-        compatible.note_base(run.folder, cfg.retriever.model)
+        compatible.note_base(run.folder, cfg.retriever)
         compatible.note_data(run.folder, store, (q.query_id for q in (*training, *validation)))
     frames = Frames(store, cfg.retriever.image_size)
     with loop.loading(run.folder, "retriever"):

@@ -78,7 +78,7 @@ def main(cfg: ExportModelCommand, run: Run) -> Measured:
     adapters = trained.saved / "adapter_model.safetensors"
     if not adapters.exists():
         raise UserError(f"{trained.saved} holds no adapters: delete the run and train again")
-    check_base(trained.folder, trained.preset.model)
+    check_base(trained.folder, trained.preset)
     train = trained.settings.train
     train.precision = of_run(trained.folder, train.precision)
     weights = digest(adapters)

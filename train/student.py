@@ -55,7 +55,7 @@ def train_student(
     set_seed(cfg.seed)
     log.info("loading student %s, to compute in %s", cfg.student.name, cfg.train.precision)
     if rank() == 0:
-        compatible.note_base(run.folder, cfg.student.model)
+        compatible.note_base(run.folder, cfg.student)
     with loop.loading(run.folder, "student"):
         model, processor = backbone.load_student(
             cfg.student, cfg.train.precision, lambda: samples.corpus(store, rationales)

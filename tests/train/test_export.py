@@ -53,7 +53,7 @@ def finished_run(settings: SftCommand, root: Path) -> Path:
     """A run of train.sft as it ends, with adapters that weigh as much as their base."""
     folder = root / "sft" / "run"
     open_run(Run("run", folder), asdict(settings), "train.sft", [])
-    compatible.note_base(folder, settings.student.model)
+    compatible.note_base(folder, settings.student)
     torch.manual_seed(0)
     model, processor = backbone.load_student(settings.student, settings.train.precision, list)
     with torch.no_grad():

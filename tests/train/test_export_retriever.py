@@ -51,7 +51,7 @@ def runs(settings, tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("checkpoints")
     folder = root / "contrastive" / "run"
     open_run(Run("run", folder), asdict(settings), "train.contrastive", [])
-    compatible.note_base(folder, settings.retriever.model)
+    compatible.note_base(folder, settings.retriever)
     torch.manual_seed(0)
     model = load_retriever(settings.retriever, "fp32", [], folder)
     with torch.no_grad():

@@ -14,7 +14,7 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import LateConfig, LoraConfig, SftCommand
+from conf.schema import LateConfig, LoraConfig, RetrieverConfig, SftCommand, StudentConfig
 from train import contrastive, samples, sft
 from train.checkpoints import newest_checkpoint
 from train.compatible import check_base, note_base
@@ -165,13 +165,38 @@ def test_a_run_killed_after_its_last_step_takes_no_other(sft_settings, tmp_path)
 def test_a_run_holds_to_its_base(saved_base, tmp_path) -> None:
     base = tmp_path / "base"
     shutil.copytree(saved_base, base)
-    note_base(tmp_path, str(base))
-    check_base(tmp_path, str(base))
+    cfg = StudentConfig(name="own", model=str(base))
+    note_base(tmp_path, cfg)
+    check_base(tmp_path, cfg)
     weights = load_file(base / "model.safetensors")
     changed = {name: weight + 1e-3 for name, weight in weights.items()}
     save_file(changed, base / "model.safetensors", metadata={"format": "pt"})
     with pytest.raises(UserError, match="are not those that"):
-        check_base(tmp_path, str(base))
+        check_base(tmp_path, cfg)
+
+
+def test_a_run_holds_to_the_commit_of_a_hubs_base(tmp_path, monkeypatch) -> None:
+    """A hub's name stands for other weights once its owner changes them."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    cached = tmp_path / "models--lab--base"
+    for commit in ("a1", "b2"):
+        (cached / "snapshots" / commit).mkdir(parents=True)
+        (cached / "snapshots" / commit / "config.json").write_text("{}")
+    (cached / "refs").mkdir()
+    (cached / "refs" / "main").write_text("a1")
+    cfg = RetrieverConfig(name="own", model="lab/base")
+    note_base(tmp_path, cfg)
+    check_base(tmp_path, cfg)
+    (cached / "refs" / "main").write_text("b2")
+    with pytest.raises(UserError, match=r"over lab/base@a1, .* lab/base@b2: .*revision=a1"):
+        check_base(tmp_path, cfg)
+    # Named by a branch or a tag, commits are still told apart.
+    (cached / "refs" / "main").write_text("a1")
+    check_base(tmp_path, replace(cfg, revision="main"))
+    # What is not here is told by what loads it.
+    shutil.rmtree(cached)
+    check_base(tmp_path, cfg)
 
 
 def test_a_batch_beyond_the_queries_is_refused(contrastive_settings, tmp_path) -> None:
