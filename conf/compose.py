@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
+from functools import partial
 from typing import Any
 
 from hydra import compose as hydra_compose
@@ -17,6 +18,7 @@ from hydra import initialize_config_module
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
+from hydra.core.default_element import GroupDefault
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -90,11 +92,29 @@ def _check_sweep(
 def options(command: str, schema: type) -> dict[str, list[str]]:
     """The groups that a command takes, and the names to choose from in each."""
     with _hydra(command, schema) as loader:
-        return {
-            group: loader.get_group_options(group)
-            for group in loader.list_groups("")
-            if (has_key(schema, group) or group in OVERLAYS) and loader.get_group_options(group)
-        }
+        groups = {g: loader.get_group_options(g) for g in loader.list_groups("")}
+        for group in OVERLAYS:
+            lies = partial(_lies_over, schema, loader, group)
+            groups[group] = list(filter(lies, groups[group]))
+        return {g: groups[g] for g in groups if groups[g] and (g in OVERLAYS or has_key(schema, g))}
+
+
+def _lies_over(schema: type, loader: ConfigLoader, group: str, overlay: str) -> bool:
+    """Whether a schema has the keys that an overlay sets, chooses presets for, or sweeps over."""
+    told = loader.repository.load_config(f"{group}/{overlay}")
+    chosen = [d.group.lstrip("/") for d in told.defaults_list if isinstance(d, GroupDefault)]
+    own = OmegaConf.to_container(told.config)
+    swept = own.pop("hydra", {}).get("sweeper", {}).get("params", {})
+    return all(has_key(schema, key) for key in (*chosen, *_dotted(own), *swept))
+
+
+def _dotted(settings: dict[str, Any]) -> Iterator[str]:
+    """The keys of nested settings, as a command line has them."""
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            yield from (f"{key}.{name}" for name in _dotted(value))
+        else:
+            yield key
 
 
 def strict(cfg: DictConfig, schema: type) -> Any:

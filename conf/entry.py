@@ -71,7 +71,7 @@ def _start(name: str, schema: type, main: Main) -> None:
     register(name, schema)
     args = get_args_parser().parse_args()
     if args.help:
-        print(help_text(name, schema, args.overrides))
+        _print(help_text(name, schema, args.overrides))
         return
     if not (args.hydra_help or args.info or args.shell_completion):
         sweep = args.multirun or "hydra.mode=MULTIRUN" in args.overrides
@@ -88,6 +88,15 @@ def _start(name: str, schema: type, main: Main) -> None:
     # Hydra would print its own, shortened report of an error and swallow the error.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     hydra.main(version_base="1.3", config_path="pkg://conf", config_name=short(name))(task)()
+
+
+def _print(text: str) -> None:
+    """Print to whoever reads it, as far as they do: `| head` reads a few lines."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        # Python would try the rest again as it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None:

@@ -20,8 +20,8 @@ def help_text(command: str, schema: type, overrides: list[str]) -> str:
     groups = options(command, schema)
     lines += ["Presets, chosen as GROUP=NAME:"]
     lines += [f"  {g}: {', '.join(groups[g])}" for g in groups if g not in OVERLAYS]
-    lines += ["Overlays, laid over as +GROUP=NAME:"]
-    lines += [f"  {g}: {', '.join(groups[g])}" for g in groups if g in OVERLAYS]
+    overlays = [f"  {g}: {', '.join(groups[g])}" for g in groups if g in OVERLAYS]
+    lines += ["Overlays, laid over as +GROUP=NAME:", *overlays] if overlays else []
     lines += ["", "Settings, changed as KEY=VALUE, or as KEY=VALUE,VALUE with -m for a sweep:"]
     lines += [_line(schema, settings, key) for key in keys(schema) if _is_leaf(settings, key)]
     lines += ["", "-m runs a sweep, one process a job; --cfg job prints the settings and ends."]

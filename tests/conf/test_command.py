@@ -98,3 +98,11 @@ def test_help_tells_the_settings_and_imports_nothing_heavy(room):
         line.split() == ["x", "=", "5.0", "How", "much."] for line in done.stdout.split("\n")
     )
     assert not (room / "checkpoints").exists()
+
+
+def test_help_may_be_read_in_part(room):
+    command = "set -o pipefail; python -m toy --help | true"
+    done = subprocess.run(
+        ["bash", "-c", command.replace("python", sys.executable)], cwd=room, capture_output=True
+    )
+    assert (done.returncode, done.stderr) == (0, b"")

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from conf import schema
-from conf.compose import compose, short
+from conf.compose import compose, options, short
+from conf.errors import SettingsError
 
 CONF = Path(str(files("conf")))
 SCHEMAS = {
@@ -52,6 +53,21 @@ def test_a_file_names_a_command_that_composes_it(path):
         assert ("--multirun" in line) == (group == "sweep")
     elif path.parent == CONF and path.stem != "run_folder":
         assert line == f"# python -m {next(c for c in SCHEMAS if short(c) == path.stem)}"
+
+
+@pytest.mark.parametrize("command", ["train.sft", "train.contrastive"])
+def test_a_command_offers_the_overlays_that_compose_there(command):
+    def composes(overlay: str) -> bool:
+        try:
+            compose(command, SCHEMAS[command], [f"+exp={overlay}"])
+        except SettingsError:
+            return False
+        return True
+
+    offered = options(command, SCHEMAS[command])["exp"]
+    assert offered == [
+        path.stem for path in sorted((CONF / "exp").iterdir()) if composes(path.stem)
+    ]
 
 
 def test_a_student_brings_its_recipe():
