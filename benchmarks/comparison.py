@@ -6,8 +6,8 @@ parts, each over three seeds, on a test split of over a thousand items.
 Trains and measures what is missing, each by the project's own commands and in runs of their own, so
 that it may be stopped and started again, and prints one table. A figure is the mean over the seeds
 with its 95% interval when whole scenes are drawn again; so is a difference, of the same items.
-The letters that each student gave are kept in benchmarks/letters/: a run that is kept there is not
-made again, and `--table` reads no more than them.
+The letters that each student gave are kept in benchmarks/letters/, by the hash of the base that it
+was trained over: a run that is kept there is not made again, and `--table` reads no more than them.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ import numpy as np
 from benchmarks.jobs import run, run_all
 from conf.compose import compose
 from conf.runs import write_text
-from conf.schema import SelectCommand
+from conf.schema import SelectCommand, SftCommand
 from data.records import FAMILIES
 from data.store import open_store
 from evaluation.metrics import macro_by_scene
+from train.compatible import weights_digest
 
 REGIMES = ("answer_only", "cot", "cot_no_candidate_analysis", "cot_no_match_layout")
 MODES = {"answer_only": ["answer"]}
@@ -60,7 +61,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=len(SEEDS))
     parser.add_argument("--table", action="store_true", help="of the answers that are kept")
     args = parser.parse_args()
-    plan = Plan(args.benchmark, args.student, args.store, Path(args.checkpoints), args.letters)
+    base = compose("train.sft", SftCommand, [f"student={args.student}"]).student.model
+    letters = args.letters / weights_digest(base)
+    plan = Plan(args.benchmark, args.student, args.store, Path(args.checkpoints), letters)
     seeds = SEEDS[: args.seeds]
     if not args.table:
         run(plan.built())
