@@ -122,7 +122,7 @@ format: setup ## Format and mend style
 
 base: setup ## Train the tiny base anew and put it into checkpoints/bases/tiny
 	$(BIN)/python -m train.sft +exp=base
-	mkdir -p checkpoints/bases/tiny
+	rm -rf checkpoints/bases/tiny && mkdir -p checkpoints/bases/tiny
 	cp -r checkpoints/sft/exp-base/student/. checkpoints/bases/tiny/
 	cp checkpoints/sft/exp-base/config.yaml checkpoints/sft/exp-base/run.json \
 	   checkpoints/sft/exp-base/metrics.jsonl checkpoints/sft/exp-base/curves.png checkpoints/bases/tiny/
