@@ -16,14 +16,19 @@ log = logging.getLogger(__name__)
 
 STATE = "trainer_state.json"
 NEEDED = {
-    "file of weights": ("**/*.safetensors", "pytorch_model_fsdp*"),
-    "optimizer": ("optimizer*",),
+    "file of weights": (
+        "**/*.safetensors",
+        "pytorch_model_fsdp*.bin",
+        "pytorch_model_fsdp*/.metadata",
+    ),
+    "optimizer": ("optimizer.*", "optimizer_*/.metadata"),
     "schedule": ("scheduler.pt",),
     "random state": ("rng_state*.pth",),
     "trainer's state": (STATE,),
 }
 """What a checkpoint must hold, each under one of its patterns: without some of them the trainer
-would go on all the same, from a new optimizer or another chance."""
+would go on all the same, from a new optimizer or another chance. Where several ranks write parts
+of one, the list of the parts is written last."""
 
 
 def newest_checkpoint(folder: Path) -> Path | None:

@@ -25,6 +25,7 @@ from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import ContrastiveCommand, LateConfig, SftCommand
 from train import contrastive, journal, ranks, samples, sft
+from train.checkpoints import cut_off
 from train.collate import IGNORED, Collator
 from train.conversation import selection_sample
 from train.journal import read_journal
@@ -190,6 +191,12 @@ def test_two_ranks_are_one(settings, contrastive_settings, few, tmp_path) -> Non
     same(one, fewer, step=2)
     with pytest.raises(UserError, match="was written with FSDP: start the run with it again"):
         alone(settings, runs / "mixed", after=runs / "parts" / "checkpoint-2")
+    for what, folder in (("file of weights", "pytorch_model_fsdp_0"), ("optimizer", "optimizer_0")):
+        parts = runs / "parts" / "checkpoint-4" / folder / ".metadata"
+        listed = parts.rename(runs / "listed")
+        assert cut_off(runs / "parts" / "checkpoint-4") == f"its {what} is missing"
+        listed.rename(parts)
+    assert cut_off(runs / "parts" / "checkpoint-4") is None
     record = json.loads((runs / "two" / "run.json").read_text())
     assert (record["ranks"], record["earlier_starts"]) == (2, [])
     assert (runs / "two" / "run.log").read_text().count("loading student") == 1
