@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -26,6 +27,8 @@ from train.trained import product_folder, run_title
 if TYPE_CHECKING:
     from torch import nn
     from transformers import ProcessorMixin
+
+log = logging.getLogger(__name__)
 
 SampleOf = Callable[[str, Thing], Sample]
 """Shows and asks a thing in a mode."""
@@ -117,6 +120,14 @@ def model_served(
         raise UserError(
             f"server.model={server.model} is an adapter over {told['parent']} there: give "
             "model=RUN, the run that trained it, so that it is asked what it was trained to answer"
+        )
+    if folder is not None and told["parent"] and student.quantization == "nf4":
+        log.warning(
+            "%s has the adapters of %s over a base that is not rounded to NF4, over which they "
+            "were trained: it answers somewhat otherwise than the student, or than its merged "
+            "export (python -m train.export)",
+            server.model,
+            folder,
         )
     weights = product_folder(folder, "student") if folder else None
     told["weights"] = compatible.weights_digest(told["root"], told["parent"], weights)

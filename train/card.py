@@ -19,6 +19,11 @@ WHAT = {
     "fp32": "merged into its base; weights in fp32.",
     "adapter": "the LoRA adapters, to be laid over their base.",
 }
+OVER_NF4 = (
+    "The adapters go with the base in NF4, as bitsandbytes rounds it. Over a base that is not "
+    "rounded, as a server lays them, they give something else than was trained; the merged weights "
+    "do not (`python -m train.export run=... format=bf16`)."
+)
 MEASURED = {
     "student": "On the items of training scenes that it was not trained on, {count} at most, "
     "before the first step and {kept}. A letter is chosen by the letters' logits, with what stands "
@@ -44,7 +49,7 @@ def text(
 
     `measured` is how far the exported weights are from the trained student or retriever.
     """
-    product = product_of(settings)
+    product, preset = product_of(settings), preset_of(settings)
     metrics = json.loads((folder / "metrics.json").read_text())
     train = settings.train
     count = train.validation_items if product == "student" else train.validation_queries
@@ -54,6 +59,7 @@ def text(
         f"A {product} of DynaPix: {WHAT[format]}",
         "## How it was trained",
         _table(("", ""), _training(settings, folder)),
+        *([OVER_NF4] if format == "adapter" and preset.quantization == "nf4" else []),
         "## How it was measured",
         MEASURED[product].format(count=count, kept=_kept(settings, metrics)),
         _table(("", "start", "end"), _curve(metrics)),

@@ -264,6 +264,8 @@ def test_a_card_says_what_the_run_says(settings, runs, forms) -> None:
         "| answer loss | 2.5 | 0.375 |",
     ):
         assert told in card.text
+    # A server lays adapters over the base as it was released.
+    assert "The adapters go with the base in NF4" in card.text
     hub = replace(settings, student=replace(settings.student, model="Qwen/Qwen3-VL-2B-Instruct"))
     folder = runs / "sft" / "run"
     from train.card import text
@@ -271,6 +273,7 @@ def test_a_card_says_what_the_run_says(settings, runs, forms) -> None:
     named = ModelCard(text("run", hub, folder, "bf16", {"answer_logit_difference": 0.0125}))
     assert named.data.base_model == "Qwen/Qwen3-VL-2B-Instruct"
     assert "| answer logit difference | 0.0125 |" in named.text
+    assert "NF4" not in named.text
 
 
 def test_differences_are_shares_of_the_logits_size() -> None:

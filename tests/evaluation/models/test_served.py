@@ -242,6 +242,14 @@ def test_a_student_is_not_measured_by_its_base(talking, tmp_path) -> None:
         model_served(adapter, None, STUDENT)
 
 
+def test_adapters_over_another_rounding_are_told(talking, tmp_path, caplog) -> None:
+    cfg = SelectCommand(server=replace(at(talking(lambda _: FULL)), model="adapter"))
+    model_served(cfg, tmp_path, replace(STUDENT, quantization="none"))
+    assert not caplog.text
+    model_served(cfg, tmp_path, STUDENT)
+    assert "over a base that is not rounded to NF4" in caplog.text
+
+
 def test_answers_to_other_questions_stay_and_do_not_count(items, tmp_path) -> None:
     path, [item, *_] = tmp_path / "answers.jsonl", items
     first = AnswerLog(path, {"record": {"seed": 0}}, items)
