@@ -45,12 +45,14 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "plain, by tokens": {"plain": True, "mini_batch_tokens": 4096},
     "ours, nothing shared": ALONE,
     "  each frame once": {**ALONE, "distinct_frames": True},
+    "  each shared prefix once": {**ALONE, "shared_prefixes": True},
     "  the tower's features reused": {**ALONE, "reuse_features": True},
     "  by tokens": {**ALONE, "mini_batch_tokens": 4096},
     "  a thread that makes inputs": {**ALONE, "workers": 2},
     "ours, all but prefixes": {
         "shared_prefixes": False, "reuse_features": True, "mini_batch_tokens": 4096,
     },
+    "ours, but no features kept": {"mini_batch_tokens": 4096},
     "ours, prefixes too": {"reuse_features": True, "mini_batch_tokens": 4096},
 }  # fmt: skip
 
@@ -99,7 +101,7 @@ def measure_speed(args: argparse.Namespace) -> None:
 
 def measure_growth(args: argparse.Namespace) -> None:
     print(f"{'':<34}{'batch':>6}{'queries/s':>11}{'GiB':>7}")
-    for name in (PLAIN, "ours, nothing shared", "ours, prefixes too"):
+    for name in (PLAIN, "ours, nothing shared", "ours, but no features kept", "ours, prefixes too"):
         for batch in (32, 128, 512):
             found = [
                 in_process(args, batch=batch, batches="random", **VARIANTS[name])
