@@ -79,7 +79,11 @@ def settle(
         return Passes(model, collator, training, lengths, train, share)
 
     asked = Choice(train.micro_batch, train.gradient_checkpointing)
-    return replace(train, **asdict(decide(asked, train.batch, folder, model, trial, "micro-batch")))
+    # The features kept take half of the machine's memory, which on a CPU is a step's too.
+    halved = train.reuse_features and not torch.cuda.is_available()
+    spare = SHARE / 2 if halved else SHARE
+    found = decide(asked, train.batch, folder, model, trial, "micro-batch", spare)
+    return replace(train, **asdict(found))
 
 
 def decide(
@@ -89,9 +93,11 @@ def decide(
     model: nn.Module,
     trial: Callable[[int], Trial],
     named: str,
+    spare: float = SHARE,
 ) -> Choice:
     """What was asked for, with a number and a truth in the place of auto; `trial` tries what a rank
-    takes of a step of `batch` samples, and `named` is how its parts are called."""
+    takes of a step of `batch` samples, `spare` is the share of the free memory that it may have,
+    and `named` is how its parts are called."""
     if "auto" not in (asked.micro_batch, asked.gradient_checkpointing):
         return asked
     if sharded():
@@ -106,7 +112,7 @@ def decide(
     model.to(state.device)
     # Ranks on CPUs share one memory.
     sharing = state.num_processes if state.device.type == "cpu" else 1
-    limit = int(SHARE * available(state.device) / sharing) - optimizer_bytes(model)
+    limit = int(spare * available(state.device) / sharing) - optimizer_bytes(model)
     with probing(model):
         choice, needed = choose(trial(share), asked, share, limit)
     # All ranks have to make the same steps.

@@ -186,6 +186,25 @@ def test_where_memory_is_short_activations_are_recomputed(
     assert (found.micro_batch, found.gradient_checkpointing) == (1, True)
 
 
+def test_features_that_are_kept_leave_a_step_the_other_half(
+    settings, student, tmp_path, monkeypatch
+) -> None:
+    """On a CPU both are in the machine's memory."""
+    free, limits = 1 << 40, {}
+    monkeypatch.setattr(memory, "available", lambda _: free)
+    for reuse in (False, True):
+
+        def note(trial, asked, share, limit, reuse=reuse):
+            limits[reuse] = limit
+            return Choice(1, False), limit
+
+        monkeypatch.setattr(memory, "choose", note)
+        (folder := tmp_path / str(reuse)).mkdir()
+        settle(replace(settings.train, reuse_features=reuse), folder, *student)
+    assert limits[True] + free // 2 <= free
+    assert limits[False] + free // 2 > free
+
+
 def test_a_run_that_goes_on_takes_what_was_noted(settings, student, tmp_path, monkeypatch) -> None:
     memory.write_json(tmp_path / memory.NOTE, {"micro_batch": 2, "gradient_checkpointing": True})
     monkeypatch.setattr(memory, "Passes", None)
