@@ -23,7 +23,7 @@ from torch.utils.data import BatchSampler
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import ContrastiveCommand, LateConfig, SftCommand
+from conf.schema import ContrastiveCommand, LateConfig, LoraConfig, SftCommand
 from train import contrastive, journal, ranks, samples, sft
 from train.checkpoints import cut_off
 from train.collate import IGNORED, Collator
@@ -83,13 +83,21 @@ def planned(settings: SftCommand, folder: Path, **changes: Any) -> dict[str, Any
 def ranking(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]:
     """What launched.py is told of a retriever's run."""
     retriever = settings.retriever
-    late = retriever.late
+    late, sizes = retriever.late, retriever.architecture
+    built = (
+        [f"retriever.architecture.{key}={value}" for key, value in asdict(sizes).items()]
+        if sizes
+        else [
+            f"retriever.model={retriever.model}",
+            "retriever.architecture=null",
+            f"retriever.lora.rank={retriever.lora.rank}",
+        ]
+    )
     overrides = [
         *(["+exp=late_interaction", f"retriever.late.width={late.width}"] if late else []),
         "retriever=tiny", "benchmark=micro", f"store={settings.store}", f"run={folder.name}",
         f"checkpoints={folder.parents[1]}", "workers=1",
-        *(f"retriever.architecture.{key}={value}"
-          for key, value in asdict(retriever.architecture).items()),
+        *built,
         f"retriever.image_size={retriever.image_size}", f"retriever.widths={retriever.widths}",
         *(f"train.{key}={'null' if value is None else value}"
           for key, value in asdict(settings.train).items() if key != "report_to"),
@@ -139,7 +147,7 @@ def said(ended: subprocess.CompletedProcess[str]) -> list[str]:
 
 
 @pytest.mark.slow
-def test_two_ranks_are_one(settings, contrastive_settings, few, tmp_path) -> None:
+def test_two_ranks_are_one(settings, contrastive_settings, saved_base, few, tmp_path) -> None:
     """A student's are one with twice the accumulation, a retriever's one with the whole batch; so
     are a student's where FSDP gives each a part of the weights, after a kill, and where one rank
     began and two go on, or the reverse. What goes wrong on one rank ends both with one sentence.
@@ -156,7 +164,12 @@ def test_two_ranks_are_one(settings, contrastive_settings, few, tmp_path) -> Non
     near_masked = replace(contrastive_settings, train=train)
     many = replace(near_masked.retriever, late=LateConfig(width=24))
     late = replace(near_masked, retriever=many, train=replace(train, scale=1.0))
-    wholes = {"one": near_masked, "late": late}
+    # By tokens, ranks have not the same number of mini-batches.
+    train = replace(train, mine_every=2, mini_batch_tokens=500, reuse_features=True)
+    base = {"architecture": None, "model": saved_base, "lora": LoraConfig(rank=4)}
+    adapted = replace(near_masked.retriever, **base)
+    mined = replace(near_masked, retriever=adapted, train=train)
+    wholes = {"one": near_masked, "mined": mined, "late": late}
     for name, alone_settings in wholes.items():
         (whole := tmp_path / "contrastive" / name).mkdir(parents=True)
         contrastive.main.__wrapped__(alone_settings, Run(name, whole))
@@ -182,7 +195,8 @@ def test_two_ranks_are_one(settings, contrastive_settings, few, tmp_path) -> Non
     for name in wholes:
         whole = tmp_path / "contrastive" / name
         same_journals(whole, whole.with_name(f"{name}-two"))
-        same_weights(whole, whole.with_name(f"{name}-two"), "retriever/model.safetensors")
+        weights = "adapter_model" if name == "mined" else "model"
+        same_weights(whole, whole.with_name(f"{name}-two"), f"retriever/{weights}.safetensors")
     same_weights(whole, whole.with_name(f"{name}-two"), "retriever/1_Dense/model.safetensors")
     for name in ("more", "on"):
         same(one, runs / name, step=2)
