@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 
 import numpy as np
@@ -40,6 +41,19 @@ def credits(scores: np.ndarray, answers: Sequence[int]) -> np.ndarray:
     0."""
     greater, tied = ranks_of(scores, np.asarray(answers))
     return expected_hits(greater, tied, np.ones(len(scores), bool), 1)
+
+
+def told(name: str, items: Sequence[SelectionItem], scores: np.ndarray) -> list[str]:
+    """The scores (items, candidates) that the embedder called `name` gave, a JSON line an item; no
+    score is null."""
+    return [
+        json.dumps({"by": name, "item_id": item.item_id, "scores": [_number(s) for s in row]})
+        for item, row in zip(items, scores, strict=True)
+    ]
+
+
+def _number(score: np.float32) -> float | None:
+    return float(score) if np.isfinite(score) else None
 
 
 def letters(scores: np.ndarray) -> list[str | None]:

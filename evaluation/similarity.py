@@ -41,7 +41,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     candidates = {FrameRef(c.scene_id, c.frame) for item in items for c in item.candidates}
     frames = Frames(store, preset.image_size)
     precision = settled(trained.train.precision)
-    rows, subtypes, letters, apart = [], {}, {}, []
+    rows, told, subtypes, letters, apart = [], [], {}, {}, []
     for embedder in embedding.embedders(folder, preset, precision, store, run.folder):
         asked = embedding.embed_queries(embedder, items, store, frames, cfg.batch)
         shown = embedding.embed_frames(embedder, candidates, store, frames, cfg.batch)
@@ -49,6 +49,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         scores = nearest.candidate_scores(items, asked, shown, preset)
         right = nearest.credits(scores, [item.answer for item in items])
         name = embedder.name
+        told += nearest.told(name, items, scores)
         how = (None, cfg.seed, cfg.suite)
         rows.append(selection_row(store.name, name, SIMILARITY, items, right, *how))
         subtypes[name] = by_subtype(items, right)
@@ -57,6 +58,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
             credits = {item.item_id: credit for item, credit in zip(items, right, strict=True)}
             apart.append((name, anchors(items, credits, cfg.seed)))
 
+    write_text(run.folder / "scores.jsonl", "".join(f"{line}\n" for line in told))
     parts = [tables.selection_table(rows), *([tables.paired_table(apart)] if apart else [])]
     log.info("%s", "\n\n".join(map(str, parts)))
     parts += [tables.subtype_table(subtypes), tables.position_table(letters)]

@@ -6,13 +6,13 @@ from collections.abc import Iterator, Mapping
 
 from data.records import SelectionItem
 from evaluation.page.rows import Measured
-from evaluation.page.said import Said
+from evaluation.page.said import Said, Scored
 from evaluation.page.tables import ABLATED, REGIMES
 from evaluation.paired import Paired, compare
 
 
 def apart(
-    answered: Mapping[str, tuple[Measured, Mapping[str, Said]]],
+    answered: Mapping[str, tuple[Measured, Mapping[str, Said | Scored]]],
     items: Mapping[str, SelectionItem],
     seed: int,
 ) -> list[list[Paired]]:
@@ -30,11 +30,7 @@ def apart(
         for label in (one, other):
             given = answered[label][1]
             credits.append(
-                {
-                    k: float(said.choice.letter == items[k].letter)
-                    for k, said in given.items()
-                    if k in items
-                }
+                {k: said.credit(items[k].letter) for k, said in given.items() if k in items}
             )
         asked = [item for name, item in items.items() if name in credits[0]]
         if asked:
@@ -44,9 +40,17 @@ def apart(
 
 def pairs(models: Mapping[str, Measured]) -> Iterator[tuple[str, str]]:
     """What the paper's claims hold against each other: a student and its base asked in the same
-    mode, rationales and answers alone, and the full student and one without a part. Students of a
-    pair have the same base and seed."""
+    mode, rationales and answers alone, the full student and one without a part, and a retriever and
+    what it began from. Students of a pair have the same base and seed."""
     for label, m in models.items():
+        if m.run.kind == "similarity" and m.trained:
+            # Once, a base's row stands under the run that measured it first.
+            began = {row["name"] for row in m.run.report["rows"]} - {m.known_by}
+            yield from (
+                (label, name)
+                for name, o in models.items()
+                if not o.trained and o.known_by in began and (o.reported is None or o.run == m.run)
+            )
         if m.regime not in REGIMES:
             continue
         kin = [(name, other) for name, other in models.items() if other.base == m.base]

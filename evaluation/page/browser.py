@@ -14,18 +14,17 @@ from data.controls import MATCHED
 from data.store import Store, open_store
 from evaluation.page import items, plots
 from evaluation.page.apart import apart
-from evaluation.page.gathering import unreadable
 from evaluation.page.rows import Measured, once
 from evaluation.page.said import (
     Asked,
     Said,
+    Scored,
     answers_of,
     check_same_items,
 )
 from evaluation.paired import Paired
-from evaluation.select import chosen_items
 
-RunAnswers = Mapping[Path, Mapping[Asked, Mapping[str, Said]]]
+RunAnswers = Mapping[Path, Mapping[Asked, Mapping[str, Said | Scored]]]
 """What was said in each run's folder."""
 
 
@@ -51,10 +50,9 @@ def browser_of(choices: Sequence[Measured], stores: Path, bound: int, seed: int)
     Raises:
         UserError: two runs measured different items, or builds, of one benchmark.
     """
-    said = {m.run.folder: answers_of(m.run) for m in choices if m.run.kind == "select"}
+    said = {run.folder: answers_of(run) for run in {m.run.folder: m.run for m in choices}.values()}
     opened = {name: _open(stores / name) for name in dict.fromkeys(m.benchmark for m in choices)}
-    ids = [_item_ids(m, said, opened[m.benchmark]) for m in choices]
-    check_same_items(choices, ids)
+    check_same_items(choices, [_answers(m, said) or None for m in choices])
     browser = Browser()
     for name, store in opened.items():
         answered = [m for m in once(choices) if m.benchmark == name and _answers(m, said)]
@@ -75,8 +73,8 @@ def _add(
 ) -> None:
     """Add a benchmark's items and what `answered` models said to them."""
     every = {i.item_id: i for suite in (None, MATCHED) for i in store.selection("test", suite)}
-    answers: dict[str, Mapping[str, Said]] = {}
-    models: dict[str, dict[str, tuple[Measured, Mapping[str, Said]]]] = {}
+    answers: dict[str, Mapping[str, Said | Scored]] = {}
+    models: dict[str, dict[str, tuple[Measured, Mapping[str, Said | Scored]]]] = {}
     for m in answered:
         label = ", ".join([m.label, *m.ways])
         answers[label] = given = _answers(m, said)
@@ -104,22 +102,9 @@ def _add(
     browser.notes += [f"Frames are missing: {why}." for why in gone[:1]]
 
 
-def _answers(m: Measured, said: RunAnswers) -> Mapping[str, Said]:
+def _answers(m: Measured, said: RunAnswers) -> Mapping[str, Said | Scored]:
     of_run = said.get(m.run.folder, {})
-    return of_run.get((m.row.mode, m.row.control), {})
-
-
-def _item_ids(m: Measured, said: RunAnswers, store: Store | str) -> Mapping[str, object] | None:
-    """The items that a row is of; None where neither answers nor a store tell."""
-    if m.run.kind == "select":
-        return _answers(m, said) or None
-    if isinstance(store, str):
-        return None
-    try:
-        chosen = [m.run.config[key] for key in ("suite", "limit", "seed")]
-    except KeyError as error:
-        raise unreadable(m.run.folder) from error
-    return {i.item_id: i for i in chosen_items(store, *chosen)}
+    return of_run.get((m.known_by, m.row.control), {})
 
 
 def _open(folder: Path) -> Store | str:

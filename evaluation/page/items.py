@@ -15,7 +15,7 @@ from conf.errors import UserError
 from data.frames import Frames
 from data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, shown_frames
 from data.store import Store
-from evaluation.page.said import Said
+from evaluation.page.said import Said, Scored
 
 OBSERVED = 6
 """Frames of a prefix that are shown."""
@@ -26,7 +26,7 @@ QUALITY = 70
 TEXT = 4000
 """Characters of an answer that are shown."""
 
-Answers = Mapping[str, Mapping[str, Said]]
+Answers = Mapping[str, Mapping[str, Said | Scored]]
 """What each model said, by its label and by item."""
 
 
@@ -102,7 +102,7 @@ def truth(item: SelectionItem, store: Store) -> list[str]:
     return told
 
 
-def _told(label: str, said: Said, item: SelectionItem) -> dict[str, Any]:
+def _told(label: str, said: Said | Scored, item: SelectionItem) -> dict[str, Any]:
     choice = said.choice
     text = said.text
     if len(text) > TEXT:

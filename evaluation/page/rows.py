@@ -74,11 +74,16 @@ class Measured:
     def label(self) -> str:
         return f"{self.row.name} ({self.row.mode})"
 
+    @property
+    def known_by(self) -> str:
+        """What the run of a selection row knows it by: the mode in which its one model was asked,
+        or which of its embedders chose."""
+        name = self.reported or self.row.name
+        return name if self.run.kind == "similarity" else self.row.mode
+
     def told(self, kind: str) -> Any:
         """What else the run reports of a selection row's model, such as its subtypes."""
-        name = self.reported or self.row.name
-        key = name if self.run.kind == "similarity" else self.row.mode
-        return self.run.report.get(kind, {}).get(key)
+        return self.run.report.get(kind, {}).get(self.known_by)
 
     @property
     def column(self) -> str:

@@ -1,5 +1,5 @@
-"""What models said to which items, read from the runs of evaluation.select, and whether runs
-measured the same items."""
+"""What models said to which items and embedders made of them, read from the runs' folders, and
+whether runs measured the same items."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from conf.errors import UserError
+from data.records import LETTERS
 from evaluation.page.gathering import Finished, json_lines, unreadable
 from evaluation.page.rows import Measured
 from evaluation.paired import same_items
-from train.choice import Choice, parse
+from train.choice import Choice, Reason, parse
 
 Asked = tuple[str, str | None]
-"""How a model was asked: the mode, and the control by which the items were shown."""
+"""How items were asked: the mode, or the embedder that chose, and the control by which they were
+shown."""
 
 
 @dataclass(frozen=True)
@@ -28,14 +30,62 @@ class Said:
     def choice(self) -> Choice:
         return parse(self.text, cut=self.cut)
 
+    def credit(self, letter: str) -> float:
+        """What it is worth where `letter` is right."""
+        return float(self.choice.letter == letter)
 
-def answers_of(run: Finished) -> dict[Asked, dict[str, Said]]:
-    """What the model of a run said, by item: what its report is of. What it said when it was asked
-    otherwise is left out, as are lines that a kill tore.
+
+@dataclass(frozen=True)
+class Scored:
+    """How near an embedder finds an item's candidates to its query; None where it has no score."""
+
+    scores: tuple[float | None, ...]
+    cut: bool = False
+
+    @property
+    def text(self) -> str:
+        told = ("no score" if s is None else f"{s:.4f}" for s in self.scores)
+        return ", ".join(f"{letter} {s}" for letter, s in zip(LETTERS, told, strict=True))
+
+    @property
+    def choice(self) -> Choice:
+        nearest = self._nearest
+        return Choice(nearest) if len(nearest) == 1 else Choice(None, Reason.SEVERAL)
+
+    def credit(self, letter: str) -> float:
+        """A tie among m is worth 1/m."""
+        return (letter in self._nearest) / max(1, len(self._nearest))
+
+    @property
+    def _nearest(self) -> str:
+        """The letters of the candidates that score highest."""
+        known = [s for s in self.scores if s is not None]
+        return "".join(
+            x for x, s in zip(LETTERS, self.scores, strict=True) if s in known and s == max(known)
+        )
+
+
+def answers_of(run: Finished) -> dict[Asked, dict[str, Said | Scored]]:
+    """What was said or chosen in a run, by item: what its report is of. What a model said when it
+    was asked otherwise is left out, as are lines that a kill tore.
 
     Raises:
         UserError: the report is of another version.
     """
+    return _scored(run) if run.kind == "similarity" else _said(run)
+
+
+def _scored(run: Finished) -> dict[Asked, dict[str, Scored]]:
+    found: dict[Asked, dict[str, Scored]] = {}
+    try:
+        for row in json_lines(run.folder / "scores.jsonl"):
+            found.setdefault((row["by"], None), {})[row["item_id"]] = Scored(tuple(row["scores"]))
+    except (KeyError, TypeError) as error:
+        raise unreadable(run.folder, "scores.jsonl") from error
+    return found
+
+
+def _said(run: Finished) -> dict[Asked, dict[str, Said]]:
     try:
         asked = {key: (mode, control) for mode, control, key in run.report["asked"]}
         said: dict[Asked, dict[str, Said]] = {how: {} for how in asked.values()}

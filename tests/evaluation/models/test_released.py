@@ -218,6 +218,10 @@ def test_the_nearest_candidate_is_chosen_once_and_read_back(
     assert set(report["subtypes"]["clip"]) == {f"{i.family}/{i.subtype}" for i in items}
     chosen = report["positions"]["clip"]["chosen"]
     assert chosen == {x: int((scores.argmax(1) == k).sum()) for k, x in enumerate(LETTERS)}
+    lines = (tmp_path / "first" / "scores.jsonl").read_text().splitlines()
+    kept = [json.loads(line) for line in lines]
+    assert [k["item_id"] for k in kept] == [item.item_id for item in items]
+    assert np.array([k["scores"] for k in kept]) == pytest.approx(scores, abs=1e-5)
     text = (tmp_path / "first" / "report.txt").read_text()
     assert "SigLIP 2" in text
     assert all(subtype in text for subtype in report["subtypes"]["clip"])

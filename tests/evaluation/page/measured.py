@@ -24,6 +24,7 @@ from conf.schema import (
 from conf.schema.training import SftTrainConfig
 from data.records import SelectionItem
 from data.store import Store
+from evaluation import nearest
 from evaluation.confidence import positions
 from evaluation.measures import recall_curves, retrieval_rows
 from evaluation.metrics import accuracy_by, accuracy_table
@@ -113,21 +114,38 @@ def select_run(
 
 
 def similarity_run(
-    root: Path, store: Store, benchmark, name: str, limit: int | None = None
+    root: Path,
+    store: Store,
+    benchmark,
+    name: str,
+    limit: int | None = None,
+    model: str | None = None,
 ) -> Path:
-    """A run of evaluation.similarity that always chooses the first candidate."""
+    """A run of evaluation.similarity in which what is untrained always chooses the first candidate;
+    `model` is a run of train.contrastive, which always chooses the right one."""
     items = spread(store.selection("test"), limit, 0)
     settings = SimilarityCommand(
-        benchmark=benchmark, retriever=RetrieverConfig(name=name), limit=limit
-    )
-    credits = [float(i.answer == 0) for i in items]
-    accuracy = accuracy_table([i.family for i in items], credits)
-    row = SelectionRow.of(store.name, f"untrained {name}", SIMILARITY, accuracy, None)
-    cells = accuracy_by([f"{i.family}/{i.subtype}" for i in items], credits)
-    told = {f"untrained {name}": {cell: vars(found) for cell, found in cells.items()}}
-    report = {"build": store.identity, "rows": [row.to_dict()], "subtypes": told}
-    finish(root / "similarity" / name, settings, report)
-    return root / "similarity" / name
+        benchmark=benchmark, retriever=RetrieverConfig(name=name), limit=limit,
+        model=None if model is None else f"{root}/contrastive/{model}",
+    )  # fmt: skip
+    answers = np.array([item.answer for item in items])
+    first = np.tile(np.float32([0.5, 0.25, 0.125, 0]), (len(items), 1))
+    scores = {f"untrained {name}": first}
+    if model is not None:
+        scores = {model: np.eye(4, dtype=np.float32)[answers], **scores}
+    rows, told, lines = [], {}, []
+    for title, of in scores.items():
+        credits = nearest.credits(of, answers)
+        accuracy = accuracy_table([i.family for i in items], credits)
+        rows.append(SelectionRow.of(store.name, title, SIMILARITY, accuracy, None))
+        cells = accuracy_by([f"{i.family}/{i.subtype}" for i in items], credits)
+        told[title] = {cell: vars(found) for cell, found in cells.items()}
+        lines += nearest.told(title, items, of)
+    report = {"build": store.identity, "rows": [r.to_dict() for r in rows], "subtypes": told}
+    folder = root / "similarity" / (model or name)
+    finish(folder, settings, report)
+    (folder / "scores.jsonl").write_text("".join(f"{line}\n" for line in lines))
+    return folder
 
 
 def retrieve_run(

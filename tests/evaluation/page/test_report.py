@@ -7,13 +7,16 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import ReportCommand
 from data.controls import MATCHED
+from data.records import LETTERS
 from evaluation import report
+from evaluation.page.said import Scored
 from tests.evaluation.page.measured import retrieve_run, right, select_run, similarity_run
 
 
@@ -65,7 +68,7 @@ def test_everything_is_written_in_the_papers_shape(runs, micro_store):
     }  # fmt: skip
     data = page_data(folder)
     assert len(data["items"]) == 12
-    assert all(len(item["said"]) == 4 for item in data["items"])
+    assert all(len(item["said"]) == 5 for item in data["items"])
 
 
 def test_students_are_held_against_what_they_should_surpass(runs, micro, micro_store):
@@ -232,15 +235,42 @@ def test_two_item_sets_are_told_apart(runs, micro, micro_store):
     assert reported(runs, micro_store.folder.parent, runs=["select/few"], items=1)
 
 
-def test_a_retrievers_items_are_told_from_its_settings(runs, micro, micro_store, tmp_path):
-    similarity_run(runs, micro_store, micro, "few", limit=9)
+def test_a_retrievers_items_are_told_from_its_scores(runs, micro, micro_store, tmp_path):
+    folder = similarity_run(runs, micro_store, micro, "few", limit=9)
     of = ["select/base", "similarity/few"]
     with pytest.raises(UserError, match=r"\d+ only in .*base \(such as"):
         reported(runs, micro_store.folder.parent, runs=of)
-    # Without the benchmark, their number has to do.
-    with pytest.raises(UserError, match=r"answered (\d+ and 9|9 and \d+) items"):
-        reported(runs, tmp_path / "nowhere", runs=of)
     assert reported(runs, micro_store.folder.parent, runs=["similarity/few"])
+    # Without them, their number has to do.
+    (folder / "scores.jsonl").unlink()
+    with pytest.raises(UserError, match=r"answered (\d+ and 9|9 and \d+) items"):
+        reported(runs, micro_store.folder.parent, runs=of)
+
+
+def test_a_retriever_is_held_against_what_it_began_from(runs, micro, micro_store):
+    similarity_run(runs, micro_store, micro, "small", model="emb")
+    # What it began from was measured by itself, too: a row of the same name.
+    similarity_run(runs, micro_store, micro, "small")
+    of = ["similarity/emb", "similarity/small"]
+    folder = reported(runs, micro_store.folder.parent, runs=of, items=40)
+    table = (folder / "tables" / "apart-micro.md").read_text()
+    assert "less untrained small (similarity)" in table
+    assert table.count("| emb (similarity) |") == 1
+    first = np.mean([item.answer == 0 for item in micro_store.selection("test")])
+    assert f"| {100 * (1 - first):+.1f} |" in table
+    shown = page_data(folder)["items"]
+    told = {s["by"]: s for s in shown[0]["said"]}
+    assert told["emb (similarity)"]["verdict"] == "right"
+    assert told["untrained small (similarity)"]["text"] == "A 0.5000, B 0.2500, C 0.1250, D 0.0000"
+    assert {s["letter"] for i in shown for s in i["said"] if "untrained" in s["by"]} == {"A"}
+
+
+def test_a_tie_is_worth_its_share():
+    both = Scored((0.5, None, 0.5, 0.25))
+    assert [both.credit(x) for x in LETTERS] == [0.5, 0, 0.5, 0]
+    assert (both.choice.letter, str(both.choice.reason)) == (None, "several")
+    assert both.text == "A 0.5000, B no score, C 0.5000, D 0.2500"
+    assert Scored((None,) * 4).credit("A") == 0
 
 
 def test_two_databases_are_told_apart(runs, micro, micro_store):
@@ -277,8 +307,8 @@ def test_what_was_built_anew_is_told_from_what_it_was_before(runs, micro_store, 
          {}, "cot/report.json is .* of another version"),
         (lambda runs: (runs / "select/cot/config.yaml").write_text("model: 5"),
          {}, "cot/config.yaml is .* of another version"),
-        (lambda runs: (runs / "similarity/clip/config.yaml").write_text("benchmark: {name: micro}"),
-         {}, "clip/report.json is .* of another version"),
+        (lambda runs: (runs / "similarity/clip/scores.jsonl").write_text('{"by": "clip"}'),
+         {}, "clip/scores.jsonl is .* of another version"),
         (lambda runs: (runs / "select/cot/run.json").write_text("{}"), {}, "cot/run.json is miss"),
         (lambda runs: None, {"runs": ["a**"]}, "a\\*\\* is no pattern of folders"),
         (lambda runs: (runs / "select/cot/metrics.json").unlink(), {"runs": ["select/cot"]},
