@@ -3,7 +3,8 @@ choice among candidates, by family and subtype, with its interval."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,28 @@ def retrieval_rows(
             cost = (ranks.bytes and ranks.bytes[k], ranks.seconds and ranks.seconds[k])
             rows.append(RetrievalRow(benchmark, name, width, builder, *found, *sizes, *cost))
     return rows
+
+
+def ranks_apart(
+    ranked: Mapping[str, Ranks], queries: Sequence[RetrievalQuery], seed: int
+) -> list[dict[str, Any]]:
+    """The first of some retrievers less each other one, at every width, over the same queries:
+    `left`, `right`, `width`, and by measure the mean difference with its interval. The scenes of
+    the intervals are drawn by `seed`."""
+    (left, one), *others = ranked.items()
+    scenes = SceneBootstrap([q.scene_id for q in queries], seed)
+    found = []
+    for right, other in others:
+        for k, width in enumerate(one.widths):
+            each = [
+                query_measures(r.greater[k], r.tied[k], r.found[k], r.frames, RECALLS)
+                for r in (one, other)
+            ]
+            names = [*(f"recall@{k}" for k in RECALLS), "mrr"]
+            apart = {name: _measured(name, each[0][name] - each[1][name], scenes) for name in names}
+            told = {name: asdict(interval) for name, interval in apart.items()}
+            found.append({"left": left, "right": right, "width": width, "measures": told})
+    return found
 
 
 def _measured(measure: str, values: np.ndarray, scenes: SceneBootstrap) -> Interval:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,24 @@ def ranks_of(
 
         return late_ranks(asked, targets, database, preset.late.width)
     return exact_ranks(asked, targets, database, preset.widths)
+
+
+def write_ranks(
+    folder: Path, found: Mapping[str, Ranks], queries: Sequence[RetrievalQuery]
+) -> None:
+    """Write ranks.jsonl: for each retriever and query how many frames stand before its target, and
+    how many more score just as it does, at each width; null where it was not found."""
+    lines = []
+    for name, ranks in found.items():
+        for k, query in enumerate(queries):
+            there = ranks.found[:, k]
+            counts = {
+                what: [int(n) if known else None for n, known in zip(of[:, k], there, strict=True)]
+                for what, of in (("before", ranks.greater), ("tied", ranks.tied))
+            }
+            told = {"by": name, "query_id": query.query_id, "widths": ranks.widths, **counts}
+            lines.append(json.dumps(told))
+    write_text(folder / "ranks.jsonl", "".join(f"{line}\n" for line in lines))
 
 
 def write_report(

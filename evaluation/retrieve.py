@@ -41,7 +41,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     ids = [q.query_id for q in queries]
     names = [f.name for f in database]
     targets = [q.target.name for q in queries]
-    rows, curves, indexes = [], [], []
+    rows, curves, indexes, found = [], [], [], {}
     precision = settled(trained.train.precision)
     for embedder in embedding.embedders(folder, preset, precision, store, run.folder):
         asked = embedding.embed_queries(embedder, queries, store, frames, cfg.batch).rows(ids)
@@ -57,11 +57,16 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
                 asked, targets, shown, names, preset.widths, cfg.probes, cfg.seed
             )
             indexes += [{"name": name, **of_width} for of_width in told]
+        found[name] = ranks
         rows += measures.retrieval_rows(store.name, name, ranks, queries, cfg.seed)
         curves += measures.recall_curves(name, ranks, queries)
 
-    told = [tables.index_table(indexes)] if indexes else []
-    ranked.write_report(run.folder, rows, curves, told, build=store.identity, indexes=indexes)
+    apart = measures.ranks_apart(found, queries, cfg.seed)
+    told = [tables.ranks_apart_table(apart)] if apart else []
+    told += [tables.index_table(indexes)] if indexes else []
+    ranked.write_ranks(run.folder, found, queries)
+    also = {"build": store.identity, "indexes": indexes, "apart": apart}
+    ranked.write_report(run.folder, rows, curves, told, **also)
     return {name: found.value for name, found in rows[0].measures.items() if name != "tie_rate"}
 
 

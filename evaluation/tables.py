@@ -220,6 +220,29 @@ def retrieval_references(rows: Sequence[paper.RetrievalReference]) -> list[list[
     ]
 
 
+def ranks_apart_table(apart: Sequence[dict[str, Any]]) -> Table:
+    """What `evaluation.measures.ranks_apart` tells: under the retrievers' names two lines a width,
+    the second with the intervals."""
+    parts: dict[str, list[list[str]]] = {}
+    for of in apart:
+        gaps = [_rank_gap(name, measured) for name, measured in of["measures"].items()]
+        width = "-" if of["width"] is None else str(of["width"])
+        lines = parts.setdefault(f"{of['left']} less {of['right']}", [])
+        lines.append([f"at width {width}", *(value for value, _ in gaps)])
+        lines.append(["  95% interval", *(interval for _, interval in gaps)])
+    head = ["Recall apart, %", *(f"R@{k}" for k in RECALLS), "MRR"]
+    note = "Query by query; intervals are bootstrapped over scenes."
+    return Table(
+        "ranks-apart", "How far retrievers are apart, query by query", head, parts, (note,)
+    )
+
+
+def _rank_gap(measure: str, m: dict[str, float]) -> tuple[str, str]:
+    scale, form = (1, "+.3f") if measure == "mrr" else (100, "+.1f")
+    value, low, high = (f"{scale * m[key]:{form}}" for key in ("value", "low", "high"))
+    return value, f"{low} to {high}"
+
+
 def cost_table(rows: Sequence[RetrievalRow]) -> Table:
     """What the rows over all queries cost beside what they give, those that give most first."""
     every = [r for r in rows if r.builder is None]

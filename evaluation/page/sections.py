@@ -106,6 +106,9 @@ def distillation(
     for benchmark, rows in by_items(ranks).items():
         if any(m.trained for m in rows):
             section.tables.append(shaped.retrieval_distilled(benchmark, widest(rows)))
+        runs = {m.run.folder: m.run for m in rows if m.trained}
+        if told := [of for run in runs.values() for of in run.report.get("apart", [])]:
+            section.tables.append(_renamed(tables.ranks_apart_table(told), benchmark))
     return section
 
 

@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from evaluation.figures import (
     retrieval_figure,
     selection_figure,
 )
-from evaluation.measures import recall_curves, selection_row
+from evaluation.measures import ranks_apart, recall_curves, selection_row
 from evaluation.measures import retrieval_rows as retrieval_rows_of
 from evaluation.metrics import (
     accuracy_table,
@@ -27,6 +28,7 @@ from evaluation.tables import (
     builder_tables,
     cost_table,
     index_table,
+    ranks_apart_table,
     retrieval_table,
     selection_table,
 )
@@ -253,3 +255,22 @@ def test_the_frame_says_what_was_right(tmp_path):
     for chosen, wrong in (("B", False), ("C", True), (None, True)):
         assert (pixels[chosen] == green).all(1).any()
         assert (pixels[chosen] == red).all(1).any() == wrong
+
+
+def test_retrievers_are_apart_query_by_query():
+    rng = np.random.default_rng(0)
+    greater, found = rng.integers(40, size=(1, 60)), np.ones((1, 60), bool)
+    none = np.zeros_like(greater)
+    one = Ranks((8,), greater, none, found, 41)
+    # Every target stands one place further back.
+    other = Ranks((8,), greater + 1, none, found, 41)
+    scenes = [SimpleNamespace(scene_id=f"s{k // 3}") for k in range(60)]
+    (same,) = ranks_apart({"one": one, "again": one}, scenes, 0)
+    for measured in same["measures"].values():
+        assert (measured["value"], measured["low"], measured["high"]) == (0, 0, 0)
+    (apart,) = ranks_apart({"one": one, "other": other}, scenes, 0)
+    assert apart["measures"]["recall@1"]["value"] == (greater == 0).mean()
+    assert all(0 <= m["low"] <= m["value"] <= m["high"] for m in apart["measures"].values())
+    text = str(ranks_apart_table([same, apart]))
+    assert "one less again" in text
+    assert "+0.0 to +0.0" in text

@@ -30,7 +30,7 @@ from data.frames import Frames
 from data.store import open_store
 from evaluation import retrieve
 from evaluation.embedding import EMBEDDINGS, embed_frames, embed_queries, embedders
-from evaluation.metrics import rank_metrics
+from evaluation.metrics import metrics_from_counts, rank_metrics
 from train import retriever
 
 CFG = RetrieverConfig(
@@ -114,6 +114,24 @@ def test_it_is_measured_once_and_read_back(world, tmp_path, micro_store) -> None
         assert row["mrr"]["value"] == pytest.approx(
             rank_metrics(scores, gold, [1])["mrr"], rel=0.01
         )
+    # What is apart is what the rows are apart; and the ranks that are kept make up the rows.
+    every = {(r["name"], r["width"]): r for r in first["rows"] if r["builder"] is None}
+    lines = (tmp_path / "one" / "ranks.jsonl").read_text().splitlines()
+    kept = [json.loads(line) for line in lines]
+    assert [k["query_id"] for k in kept] == 2 * [q.query_id for q in queries]
+    for k, of in enumerate(first["apart"]):
+        sides = [every[of[side], of["width"]] for side in ("left", "right")]
+        assert "untrained" not in of["left"]
+        for name, found in of["measures"].items():
+            key = name.replace("@", "_")
+            apart = sides[0][key]["value"] - sides[1][key]["value"]
+            assert found["value"] == pytest.approx(apart, abs=1e-12)
+        own = [line for line in kept if line["by"] == of["left"]]
+        before, tied = (np.array([line[w][k] for line in own]) for w in ("before", "tied"))
+        every_found = np.ones(len(own), bool)
+        counted = metrics_from_counts(before, tied, every_found, len(database), [1])
+        assert counted["mrr"] == pytest.approx(sides[0]["mrr"]["value"])
+    assert [of["width"] for of in first["apart"]] == CFG.widths
     for picture in ("retrieval.png", "builders.png"):
         assert (tmp_path / "one" / picture).stat().st_size > 10_000
     text = (tmp_path / "one" / "report.txt").read_text()

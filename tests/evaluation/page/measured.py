@@ -26,7 +26,7 @@ from data.records import SelectionItem
 from data.store import Store
 from evaluation import nearest
 from evaluation.confidence import positions
-from evaluation.measures import recall_curves, retrieval_rows
+from evaluation.measures import ranks_apart, recall_curves, retrieval_rows
 from evaluation.metrics import accuracy_by, accuracy_table
 from evaluation.ranking import Ranks
 from evaluation.rows import SIMILARITY, SelectionRow
@@ -156,16 +156,19 @@ def retrieve_run(
     finish(root / "contrastive" / name, trained, None)
     queries = store.standard_test()
     rng = np.random.default_rng(0)
-    rows, curves = [], []
+    rows, curves, found = [], [], {}
     for title in (name, "untrained small"):
         greater = rng.integers(frames, size=(2, len(queries)))
-        found = np.ones(greater.shape, bool)
+        every = np.ones(greater.shape, bool)
         sizes = ((frames * 256, frames * 128), (0.5, 0.5))
-        ranks = Ranks((64, 32), greater, np.zeros_like(greater), found, frames, *sizes)
+        ranks = Ranks((64, 32), greater, np.zeros_like(greater), every, frames, *sizes)
+        found[title] = ranks
         rows += retrieval_rows(store.name, title, ranks, queries, 0)
         curves += recall_curves(title, ranks, queries)
     told = {"build": store.identity, "curves": curves, "indexes": []}
     report = {"rows": [r.to_dict() for r in rows], **told}
+    if kind == "retrieve":
+        report["apart"] = ranks_apart(found, queries, 0)
     settings = RetrieveCommand(
         benchmark=benchmark, retriever=RetrieverConfig(name="small"),
         model=f"{root}/contrastive/{name}",

@@ -46,7 +46,8 @@ def test_everything_is_written_in_the_papers_shape(runs, micro_store):
     assert names == {path.stem for path in (folder / "tables").glob("*.md")}
     assert names == {
         "selection-micro", "retrieval-micro", "distillation-selection-micro",
-        "distillation-retrieval-micro", "apart-micro", "paired-micro", "ablation", "costs-micro",
+        "distillation-retrieval-micro", "ranks-apart-micro", "apart-micro", "paired-micro",
+        "ablation", "costs-micro",
         "widths-micro", "subtypes-micro", "readings-micro", "positions-micro", "training",
     }  # fmt: skip
     table = (folder / "tables" / "distillation-selection-micro.md").read_text()
