@@ -18,7 +18,7 @@ from evaluation.drawn import draw
 from evaluation.embedding import Embedder, embed_frames, embed_images, embed_texts
 from evaluation.foreseen import TEXTS, Route, Texts
 from evaluation.metrics import query_measures
-from evaluation.ranked import ranks_of
+from evaluation.ranked import in_parts, ranks_of
 from evaluation.ranking import Ranks
 
 
@@ -67,8 +67,7 @@ def ranks(
     else:
         frames = Frames(store, preset.image_size)
         shown = embed_frames(matcher, database, store, frames, batch)
-        parts = (part for _, part in shown.parts(names))
-        found = ranks_of(preset, asked, shown.rows(targets), parts)
+        found = ranks_of(preset, asked, shown.rows(targets), in_parts(shown, names))
     return with_misses(found, np.array(there), len(names))
 
 

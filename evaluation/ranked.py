@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from conf.runs import write_text
 from conf.schema import RetrieverConfig
@@ -16,6 +17,7 @@ from data.records import FrameRef, RetrievalQuery
 from data.retrieval.checks import check_test
 from data.store import Store
 from evaluation import figures, paper, tables
+from evaluation.cache import Embeddings
 from evaluation.formats import Table
 from evaluation.ranking import Ranks, exact_ranks
 from evaluation.rows import RetrievalRow
@@ -28,6 +30,14 @@ def standard_test(store: Store) -> tuple[list[RetrievalQuery], list[FrameRef]]:
     queries, database = store.standard_test(), store.database("test")
     check_test(store, queries, database)
     return queries, database
+
+
+def in_parts(shown: Embeddings, names: Sequence[str]) -> Iterator[np.ndarray]:
+    """The embeddings of `names`, in no order, a file at a time, with how many are through."""
+    with tqdm(total=len(names), desc="ranking", unit="frame", leave=False) as bar:
+        for numbers, rows in shown.parts(names):
+            yield rows
+            bar.update(len(numbers))
 
 
 def ranks_of(

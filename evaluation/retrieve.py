@@ -48,8 +48,8 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
         shown = embedding.embed_frames(embedder, database, store, frames, cfg.batch)
         name = embedder.name
         log.info("ranking %s frames with %s", f"{len(names):,}", name)
-        parts = (part for _, part in shown.parts(names))
         if cfg.index == "exact":
+            parts = ranked.in_parts(shown, names)
             ranks = ranked.ranks_of(preset, asked, shown.rows(targets), parts)
         else:
             name = f"{name} ({cfg.index})"

@@ -30,6 +30,7 @@ def from_main(make: Callable[[], Made]) -> Made:
     waiting = torch.distributed.new_group(backend="gloo", timeout=PATIENCE)
     made = [make() if rank() == 0 else None]
     torch.distributed.broadcast_object_list(made, src=0, group=waiting)
+    torch.distributed.destroy_process_group(waiting)
     return made[0]
 
 
