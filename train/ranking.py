@@ -29,7 +29,8 @@ class Slice:
     """What an evaluator of the library's needs to rank a slice of queries; recall and reciprocal
     rank at the full width, under the names that the evaluation command uses.
 
-    It holds names. Pixels are read a mini-batch a rank at a time, which the library deals out.
+    Frames that score alike stand in the order of their names, as the library has it; the command
+    shares the places out among them. It holds names. Pixels are read a mini-batch a rank at a time, which the library deals out.
     """
 
     score = staticmethod(cos_sim)
