@@ -6,8 +6,9 @@ parts, each over three seeds, on a test split of over a thousand items.
 Trains and measures what is missing, each by the project's own commands and in runs of their own, so
 that it may be stopped and started again, and prints one table. A figure is the mean over the seeds
 with its 95% interval when whole scenes are drawn again; so is a difference, of the same items.
-The letters that each student gave are kept in benchmarks/letters/, by the hash of the base that it
-was trained over: a run that is kept there is not made again, and `--table` reads no more than them.
+Runs are in checkpoints/, and the letters that each student gave are kept in benchmarks/letters/,
+both by the hash of the base that it was trained over: a run whose letters are kept is not made
+again, and `--table` reads no more than them.
 """
 
 from __future__ import annotations
@@ -62,8 +63,9 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="of the answers that are kept")
     args = parser.parse_args()
     base = compose("train.sft", SftCommand, [f"student={args.student}"]).student.model
-    letters = args.letters / weights_digest(base)
-    plan = Plan(args.benchmark, args.student, args.store, Path(args.checkpoints), letters)
+    known_by = weights_digest(base)
+    folders = Path(args.checkpoints) / known_by, args.letters / known_by
+    plan = Plan(args.benchmark, args.student, args.store, *folders)
     seeds = SEEDS[: args.seeds]
     if not args.table:
         run(plan.built())

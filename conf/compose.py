@@ -33,7 +33,7 @@ from conf.keys import dict_above, has_key, keys, keys_like, nearest
 OWN_NAMES = {"train.export": "export_model", "evaluation.study.export": "export_study"}
 """Commands that do not go by the last part of their name, because data.export does."""
 OVERLAYS = ("exp", "sweep")
-"""Groups that any command takes, as `+exp=cot`."""
+"""Groups that are laid over what a command has, as `+exp=cot`."""
 
 
 def register(command: str, schema: type) -> None:

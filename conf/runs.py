@@ -24,7 +24,7 @@ from conf.errors import SettingsError, UserError
 
 log = logging.getLogger(__name__)
 
-ELSEWHERE = ("run", "store", "checkpoints", "workers", "host", "port", "public")
+ELSEWHERE = ("run", "store", "checkpoints", "workers", "train.workers", "host", "port", "public")
 """Keys that say where and how fast a run goes, not what comes out of it."""
 
 TRAINERS = {"student": "sft", "retriever": "contrastive"}

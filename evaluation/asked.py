@@ -73,7 +73,9 @@ def model_here(
         UserError: it cannot be loaded, or its base is not the one that it was trained over.
     """
     weights = None
-    if folder is not None:
+    if folder is None:
+        student = compatible.pinned(student)
+    else:
         compatible.check_base(folder, student)
         weights = product_folder(folder, "student")
 
@@ -93,7 +95,7 @@ def model_here(
         return answer
 
     revision = {
-        "weights": compatible.weights_digest(compatible.pinned(student), weights),
+        "weights": compatible.weights_digest(compatible.named(student), weights),
         "revision": student.revision,
         "quantization": student.quantization,
         "precision": precision,

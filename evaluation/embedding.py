@@ -27,6 +27,7 @@ from train.compatible import (
     check_base,
     check_pooling,
     check_widths,
+    named,
     pinned,
     processor_digest,
     weights_digest,
@@ -112,7 +113,7 @@ def trained_embedder(folder: Path, preset: RetrieverConfig, precision: str) -> E
 
         return trained_encoder(preset, precision, saved)
 
-    digests = weights_digest(pinned(preset), saved), processor_digest(saved)
+    digests = weights_digest(named(preset), saved), processor_digest(saved)
     return Embedder(run_title(folder), preset, precision, *digests, load)
 
 
@@ -132,13 +133,15 @@ def built_base(
 def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Embedder:
     """The preset's base, or another model as it was released."""
 
+    preset = pinned(preset) if preset.image_model is None else preset
+
     @cache
     def load() -> Encoder:
         from evaluation.encoders import released_encoder
 
         return released_encoder(preset, precision, run / "untrained")
 
-    base = pinned(preset)
+    base = named(preset)
     name = f"{UNTRAINED} {preset.name}" if preset.encoder == "qwen3_vl" else preset.name
     name += ", late" if preset.late is not None else ""
     digests = weights_digest(base, preset.image_model), processor_digest(base)

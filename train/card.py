@@ -10,7 +10,7 @@ from huggingface_hub import ModelCardData
 
 from conf.schema import ContrastiveCommand, RetrieverConfig, SftCommand, StudentConfig
 from conf.sweep import AT_START
-from train.compatible import BASE
+from train.compatible import BASE, in_hub
 from train.journal import BEST_STEP
 
 SHOWN_PACKAGES = ("torch", "transformers", "sentence-transformers", "peft", "bitsandbytes")
@@ -22,7 +22,7 @@ WHAT = {
 OVER_NF4 = (
     "The adapters go with the base in NF4, as bitsandbytes rounds it. Over a base that is not "
     "rounded, as a server lays them, they give something else than was trained; the merged weights "
-    "do not (`python -m train.export run=... format=bf16`)."
+    "do not (`python -m train.export run={run} product={product} format=bf16`)."
 )
 MEASURED = {
     "student": "On the items of training scenes that it was not trained on, {count} at most, "
@@ -59,7 +59,11 @@ def text(
         f"A {product} of DynaPix: {WHAT[format]}",
         "## How it was trained",
         _table(("", ""), _training(settings, folder)),
-        *([OVER_NF4] if format == "adapter" and preset.quantization == "nf4" else []),
+        *(
+            [OVER_NF4.format(run=name, product=product)]
+            if format == "adapter" and preset.quantization == "nf4"
+            else []
+        ),
         "## How it was measured",
         MEASURED[product].format(count=count, kept=_kept(settings, metrics)),
         _table(("", "start", "end"), _curve(metrics)),
@@ -96,7 +100,7 @@ def _training(settings: Settings, folder: Path) -> Iterable[tuple[str, str]]:
     student = isinstance(settings, SftCommand)
     record = json.loads((folder / "run.json").read_text())
     yield "base", f"{preset.model}{f' at {preset.revision}' if preset.revision else ''}"
-    if (folder / BASE).exists():
+    if not in_hub(preset.model) and (folder / BASE).exists():
         yield "hash of the base's weights", json.loads((folder / BASE).read_text())
     yield "quantisation of the base", preset.quantization
     lora = preset.lora

@@ -7,8 +7,9 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 from safetensors import safe_open
 
@@ -20,6 +21,8 @@ from data.store import Store
 if TYPE_CHECKING:
     from torch import nn
     from transformers import PreTrainedConfig, PreTrainedTokenizerBase, ProcessorMixin
+
+Preset = TypeVar("Preset", StudentConfig, RetrieverConfig)
 
 BASE = "base.json"
 DATA = "data.json"
@@ -235,24 +238,59 @@ def processor_digest(model: str | Path | None) -> str:
     return whole.hexdigest()[:16]
 
 
-def pinned(cfg: StudentConfig | RetrieverConfig) -> str | None:
-    """The model that a preset names, a hub's as NAME@COMMIT: a name alone may mean other weights
-    tomorrow. A hub that cannot be asked, and has left nothing here, has no model to load either;
-    the name stands then as it is."""
-    if cfg.model is None or Path(cfg.model).is_dir():
-        return cfg.model
+def pinned(cfg: Preset) -> Preset:
+    """A preset with its hub model's commit as the revision: a name stands for other weights once
+    its owner changes them. A commit in the cache comes first. Where none can be known the preset
+    stays as it is, and what loads the model tells why it cannot be had."""
+    if not in_hub(cfg.model):
+        return cfg
+    return replace(cfg, revision=_commit(cfg.model, cfg.revision) or cfg.revision)
+
+
+def _commit(model: str, revision: str | None) -> str | None:
+    from huggingface_hub import model_info, try_to_load_from_cache
+
     try:
-        # Within a cache, files stand in a folder that goes by the commit.
-        return f"{cfg.model}@{file_of(cfg.model, 'config.json', cfg.revision).parent.name}"
-    except (OSError, ValueError):
-        return cfg.model
+        # Adapters have no settings of a whole model beside them.
+        for file in ("config.json", "adapter_config.json"):
+            there = try_to_load_from_cache(model, file, revision=revision)
+            if isinstance(there, str):
+                # Within the cache, files stand in a folder that goes by the commit.
+                return Path(there).parent.name
+        return model_info(model, revision=revision, timeout=10).sha
+    except Exception:
+        # The hub's client raises errors of whichever HTTP library it has.
+        return None
 
 
-def note_base(folder: Path, cfg: StudentConfig | RetrieverConfig) -> None:
-    """Note in a run's folder which weights it is trained over, and hold them to an earlier note:
-    a run that goes on goes on over the same."""
+def in_hub(model: str | None) -> bool:
+    """Whether a preset's model is a hub's, and neither a folder here nor built from a seed."""
+    return model is not None and not Path(model).is_dir()
+
+
+def named(cfg: Preset) -> str | None:
+    """A preset's model: its folder, or the hub's name with the revision."""
+    at = f"@{cfg.revision}" if in_hub(cfg.model) and cfg.revision else ""
+    return cfg.model and f"{cfg.model}{at}"
+
+
+def based(folder: Path, cfg: Preset) -> Preset:
+    """A run's preset with the commit that the run has noted of its hub's base, where there is a
+    note: whatever the hub has by then, the run goes on, and is measured, over the same weights."""
+    note = folder / BASE
+    there = json.loads(note.read_text()) if note.exists() else ""
+    name, _, commit = there.rpartition("@")
+    return replace(cfg, revision=commit) if name and name == cfg.model else cfg
+
+
+def note_base(folder: Path, cfg: Preset) -> None:
+    """Note in a run's folder which weights it is trained over, a hub's by name and commit, others
+    by their hash, and hold these to an earlier note: a run that goes on goes on over the same."""
     check_base(folder, cfg)
-    write_json(folder / BASE, _identity(cfg))
+    if not in_hub(cfg.model):
+        write_json(folder / BASE, weights_digest(cfg.model))
+    elif cfg.revision:
+        write_json(folder / BASE, named(cfg))
 
 
 def note_data(folder: Path, store: Store, *told: Iterable[str]) -> None:
@@ -279,28 +317,14 @@ def note_data(folder: Path, store: Store, *told: Iterable[str]) -> None:
     write_json(note, digest)
 
 
-def check_base(folder: Path, cfg: StudentConfig | RetrieverConfig) -> None:
-    """Raises UserError where a run's base is not the one that it was trained over."""
+def check_base(folder: Path, cfg: Preset) -> None:
+    """Raises UserError where a run's base is in a folder, and not the one that it was trained
+    over."""
     note = folder / BASE
-    if not note.exists() or json.loads(note.read_text()) == (here := _identity(cfg)):
+    if in_hub(cfg.model) or not note.exists():
         return
-    if here == cfg.model:
-        # A hub's that is not here: what loads it tells that.
-        return
-    there = json.loads(note.read_text())
-    group = "student" if isinstance(cfg, StudentConfig) else "retriever"
-    if (name := f"{cfg.model}@") in there:
+    if json.loads(note.read_text()) != weights_digest(cfg.model):
         raise UserError(
-            f"{folder} is trained over {there}, and what is had of it is {here}: give "
-            f"{group}.revision={there.removeprefix(name)}, or train in a run of its own (run=NAME)"
+            f"the weights in {cfg.model} are not those that {folder} is trained over: put those "
+            "back, or delete that run and train again"
         )
-    raise UserError(
-        f"the weights in {cfg.model} are not those that {folder} is trained over: put those back, "
-        "or delete that run and train again"
-    )
-
-
-def _identity(cfg: StudentConfig | RetrieverConfig) -> str:
-    """By which a run knows its base: a hub's by name and commit, a folder's by its weights."""
-    model = pinned(cfg)
-    return model if model and not Path(model).is_dir() else weights_digest(model)

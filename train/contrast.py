@@ -56,6 +56,8 @@ def train_retriever(
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
     training, validation = split(cfg, store)
+    preset = cfg.retriever
+    cfg.retriever = ranks.from_main(lambda: compatible.pinned(compatible.based(run.folder, preset)))
     log.info("loading retriever %s, to compute in %s", cfg.retriever.name, cfg.train.precision)
     if rank() == 0:
         compatible.note_base(run.folder, cfg.retriever)

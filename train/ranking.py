@@ -30,7 +30,8 @@ class Slice:
     rank at the full width, under the names that the evaluation command uses.
 
     Frames that score alike stand in the order of their names, as the library has it; the command
-    shares the places out among them. It holds names. Pixels are read a mini-batch a rank at a time, which the library deals out.
+    shares the places out among them. It holds names: pixels are read a mini-batch a rank at a time,
+    which the library deals out.
     """
 
     score = staticmethod(cos_sim)

@@ -53,6 +53,9 @@ def train_student(
     cfg.train.precision = of_run(run.folder, cfg.train.precision)
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
+    cfg.student = ranks.from_main(
+        lambda: compatible.pinned(compatible.based(run.folder, cfg.student))
+    )
     log.info("loading student %s, to compute in %s", cfg.student.name, cfg.train.precision)
     if rank() == 0:
         compatible.note_base(run.folder, cfg.student)

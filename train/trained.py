@@ -12,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from conf.errors import UserError
+from train.compatible import based
 
 EXPORT = "export.json"
 """Stands in a folder that `train.export` wrote, and there only."""
@@ -70,7 +71,7 @@ def settings_of(folder: Path, schema: type[Command], product: str, key: str = "m
             raise UserError(
                 f"{key}={folder} is not finished: run its command again to go on with it"
             )
-        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), there))
+        settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), there))
     except FileNotFoundError as error:
         raise UserError(
             f"{key}={folder} is no run folder of a trained {product}: {config} is missing; give "
@@ -81,6 +82,8 @@ def settings_of(folder: Path, schema: type[Command], product: str, key: str = "m
         raise UserError(
             f"{config} is damaged or of another version of DynaPix ({first}); train again"
         ) from error
+    setattr(settings, product, based(folder, getattr(settings, product)))
+    return settings
 
 
 def measured(

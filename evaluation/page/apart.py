@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 from data.records import SelectionItem
 from evaluation.page.rows import Measured
 from evaluation.page.said import Said, Scored
 from evaluation.page.tables import ABLATED, REGIMES
 from evaluation.paired import Paired, compare
+from evaluation.rows import SelectionRow
 
 
 def apart(
@@ -45,11 +47,11 @@ def pairs(models: Mapping[str, Measured]) -> Iterator[tuple[str, str]]:
     for label, m in models.items():
         if m.run.kind == "similarity" and m.trained:
             # Once, a base's row stands under the run that measured it first.
-            began = {row["name"] for row in m.run.report["rows"]} - {m.known_by}
+            began = [SelectionRow.from_dict(row) for row in m.run.report["rows"]]
             yield from (
                 (label, name)
                 for name, o in models.items()
-                if not o.trained and o.known_by in began and (o.reported is None or o.run == m.run)
+                if not o.trained and replace(o.row, name=o.known_by) in began
             )
         if m.regime not in REGIMES:
             continue

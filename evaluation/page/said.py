@@ -127,7 +127,9 @@ def check_same_items(rows: Sequence[Measured], ids: Sequence[Mapping[str, object
         UserError: two runs measured different items; the difference is told.
     """
     first: dict[str, int] = {}
-    for k, m in enumerate(rows):
+    # One whose items are known tells most.
+    for k in sorted(range(len(rows)), key=lambda k: ids[k] is None):
+        m = rows[k]
         j = first.setdefault(m.items, k)
         names = (str(rows[j].run.folder), str(m.run.folder))
         try:

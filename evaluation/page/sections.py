@@ -107,9 +107,20 @@ def distillation(
         if any(m.trained for m in rows):
             section.tables.append(shaped.retrieval_distilled(benchmark, widest(rows)))
         runs = {m.run.folder: m.run for m in rows if m.trained}
-        if told := [of for run in runs.values() for of in run.report.get("apart", [])]:
+        names = Counter(of["left"] for run in runs.values() for of in _widest_apart(run))
+        told = [
+            of if names[of["left"]] == 1 else {**of, "left": f"{of['left']}, {run.name}"}
+            for run in runs.values()
+            for of in run.report.get("apart", [])
+        ]
+        if told:
             section.tables.append(_renamed(tables.ranks_apart_table(told), benchmark))
     return section
+
+
+def _widest_apart(run: Finished) -> list[dict[str, Any]]:
+    """Of what a run's retrievers are apart, what they are at the widest width."""
+    return run.report.get("apart", [])[:1]
 
 
 def ablation(choices: Sequence[Measured]) -> Section:

@@ -191,6 +191,7 @@ def test_features_that_are_kept_leave_a_step_the_other_half(
 ) -> None:
     """On a CPU both are in the machine's memory."""
     free, limits = 1 << 40, {}
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(memory, "available", lambda _: free)
     for reuse in (False, True):
 

@@ -17,7 +17,7 @@ from conf.errors import UserError
 from conf.schema import LateConfig, LoraConfig, RetrieverConfig, SftCommand, StudentConfig
 from train import contrastive, samples, sft
 from train.checkpoints import newest_checkpoint
-from train.compatible import check_base, note_base
+from train.compatible import based, check_base, named, note_base, pinned
 from train.journal import read_journal
 from train.loop import Epochs
 from train.planned import ByLength, Planned, Samples
@@ -176,26 +176,43 @@ def test_a_run_holds_to_its_base(saved_base, tmp_path) -> None:
 
 
 def test_a_run_holds_to_the_commit_of_a_hubs_base(tmp_path, monkeypatch) -> None:
-    """A hub's name stands for other weights once its owner changes them."""
+    """A hub's name stands for other weights once its owner changes them: what a run began over, it
+    goes on over, and is measured over."""
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    cached = tmp_path / "models--lab--base"
-    for commit in ("a1", "b2"):
+    cached, commits = tmp_path / "models--lab--base", ("a" * 40, "b" * 40)
+    for commit in commits:
         (cached / "snapshots" / commit).mkdir(parents=True)
         (cached / "snapshots" / commit / "config.json").write_text("{}")
     (cached / "refs").mkdir()
-    (cached / "refs" / "main").write_text("a1")
+    (cached / "refs" / "main").write_text(commits[0])
     cfg = RetrieverConfig(name="own", model="lab/base")
+    first = pinned(based(tmp_path, cfg))
+    assert (first.revision, named(first)) == (commits[0], f"lab/base@{commits[0]}")
+    note_base(tmp_path, first)
+    (cached / "refs" / "main").write_text(commits[1])
+    assert pinned(cfg).revision == commits[1]
+    assert pinned(based(tmp_path, cfg)) == first
+    # A preset's own revision is one by which it is known.
+    assert pinned(replace(cfg, revision=commits[0])) == first
+    # Another model of the settings is another base.
+    other = replace(cfg, model="lab/other")
+    assert based(tmp_path, other) == other
+
+
+def test_a_base_that_is_away_for_a_while_leaves_its_note(saved_base, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
+    base = tmp_path / "base"
+    shutil.copytree(saved_base, base)
+    cfg = StudentConfig(name="own", model=str(base))
     note_base(tmp_path, cfg)
-    check_base(tmp_path, cfg)
-    (cached / "refs" / "main").write_text("b2")
-    with pytest.raises(UserError, match=r"over lab/base@a1, .* lab/base@b2: .*revision=a1"):
-        check_base(tmp_path, cfg)
-    # Named by a branch or a tag, commits are still told apart.
-    (cached / "refs" / "main").write_text("a1")
-    check_base(tmp_path, replace(cfg, revision="main"))
-    # What is not here is told by what loads it.
-    shutil.rmtree(cached)
+    noted = (tmp_path / "base.json").read_text()
+    base.rename(tmp_path / "away")
+    # What loads it tells that it is gone.
+    note_base(tmp_path, pinned(based(tmp_path, cfg)))
+    assert (tmp_path / "base.json").read_text() == noted
+    (tmp_path / "away").rename(base)
     check_base(tmp_path, cfg)
 
 

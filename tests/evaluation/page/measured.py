@@ -120,17 +120,17 @@ def similarity_run(
     name: str,
     limit: int | None = None,
     model: str | None = None,
+    untrained: Sequence[float] = (0.5, 0.25, 0.125, 0),
 ) -> Path:
-    """A run of evaluation.similarity in which what is untrained always chooses the first candidate;
-    `model` is a run of train.contrastive, which always chooses the right one."""
+    """A run of evaluation.similarity in which what is `untrained` gives every item's candidates
+    these scores; `model` is a run of train.contrastive, which always chooses the right one."""
     items = spread(store.selection("test"), limit, 0)
     settings = SimilarityCommand(
         benchmark=benchmark, retriever=RetrieverConfig(name=name), limit=limit,
         model=None if model is None else f"{root}/contrastive/{model}",
     )  # fmt: skip
     answers = np.array([item.answer for item in items])
-    first = np.tile(np.float32([0.5, 0.25, 0.125, 0]), (len(items), 1))
-    scores = {f"untrained {name}": first}
+    scores = {f"untrained {name}": np.tile(np.float32(untrained), (len(items), 1))}
     if model is not None:
         scores = {model: np.eye(4, dtype=np.float32)[answers], **scores}
     rows, told, lines = [], {}, []

@@ -242,6 +242,11 @@ def test_a_retrievers_items_are_told_from_its_scores(runs, micro, micro_store, t
     with pytest.raises(UserError, match=r"\d+ only in .*base \(such as"):
         reported(runs, micro_store.folder.parent, runs=of)
     assert reported(runs, micro_store.folder.parent, runs=["similarity/few"])
+    # A run of which they are not known hides no difference of others.
+    similarity_run(runs, micro_store, micro, "old", limit=9)
+    (runs / "similarity" / "old" / "scores.jsonl").unlink()
+    with pytest.raises(UserError, match=r"\d+ only in .*base \(such as"):
+        reported(runs, micro_store.folder.parent, runs=["similarity/old", *of])
     # Without them, their number has to do.
     (folder / "scores.jsonl").unlink()
     with pytest.raises(UserError, match=r"answered (\d+ and 9|9 and \d+) items"):
@@ -252,18 +257,29 @@ def test_a_retriever_is_held_against_what_it_began_from(runs, micro, micro_store
     similarity_run(runs, micro_store, micro, "small", model="emb")
     # What it began from was measured by itself, too: a row of the same name.
     similarity_run(runs, micro_store, micro, "small")
-    of = ["similarity/emb", "similarity/small"]
+    # And another of that name answered otherwise.
+    similarity_run(runs, micro_store, micro, "small", model="other", untrained=(0, 1, 0, 0))
+    of = ["similarity/*"]
     folder = reported(runs, micro_store.folder.parent, runs=of, items=40)
     table = (folder / "tables" / "apart-micro.md").read_text()
-    assert "less untrained small (similarity)" in table
-    assert table.count("| emb (similarity) |") == 1
+    parts = re.split(r"^\| \*less (.*?)\*.*$", table, flags=re.MULTILINE)[1:]
+    below = dict(zip(parts[::2], parts[1::2], strict=True))
+    assert set(below) == {
+        "untrained small, emb (similarity)", "untrained small, other (similarity)"
+    }  # fmt: skip
+    assert all(text.count("(similarity) |") == 1 for text in below.values())
     first = np.mean([item.answer == 0 for item in micro_store.selection("test")])
     assert f"| {100 * (1 - first):+.1f} |" in table
     shown = page_data(folder)["items"]
     told = {s["by"]: s for s in shown[0]["said"]}
     assert told["emb (similarity)"]["verdict"] == "right"
-    assert told["untrained small (similarity)"]["text"] == "A 0.5000, B 0.2500, C 0.1250, D 0.0000"
-    assert {s["letter"] for i in shown for s in i["said"] if "untrained" in s["by"]} == {"A"}
+    assert (
+        told["untrained small, emb (similarity)"]["text"]
+        == "A 0.5000, B 0.2500, C 0.1250, D 0.0000"
+    )
+    assert {s["letter"] for i in shown for s in i["said"] if "untrained small, emb" in s["by"]} == {
+        "A"
+    }
 
 
 def test_a_tie_is_worth_its_share():
