@@ -115,6 +115,35 @@ def test_features_of_a_frozen_tower_move_no_gradient(
     assert_same(ours(trained, queries, frames, micro_store, reuse_features=True), library)
 
 
+def test_bf16_moves_gradients_by_its_rounding_alone(
+    micro_store, retriever_cfg, saved_base, queries, frames, tmp_path
+) -> None:
+    """As on GPUs: the base in bf16 and adapters in fp32, computed under autocast."""
+    over = {"architecture": None, "model": saved_base, "lora": LoraConfig(rank=4)}
+    cfg = replace(retriever_cfg, **over)
+    losses, moved = {}, {}
+    for precision in ("fp32", "bf16"):
+        torch.manual_seed(0)
+        model = load_retriever(cfg, precision, [], tmp_path).train()
+        for name, weight in model.named_parameters():
+            if "lora_B" in name:
+                weight.data.normal_(std=0.05)
+        inputs = Inputs(model, frames, cfg, precision)
+        settings = {"mini_batch_tokens": 400, "reuse_features": True, "scale": SCALE}
+        ranking = RankingLoss(
+            model, inputs, weighing=Weighing(micro_store), mini_batch=5, **settings
+        )
+        loss = MatryoshkaLoss(model, ranking, cfg.widths, WEIGHTS)
+        batch = batch_of(queries, NEGATIVES, distinct=True, shared=True)
+        with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
+            losses[precision], found = gradients(model, loss, [batch])
+        assert {gradient.dtype for gradient in found.values()} == {torch.float32}
+        moved[precision] = torch.cat([gradient.flatten() for gradient in found.values()])
+    assert losses["bf16"] == pytest.approx(losses["fp32"], rel=0.02)
+    assert losses["bf16"] != losses["fp32"]
+    assert torch.cosine_similarity(moved["bf16"], moved["fp32"], dim=0) > 0.98
+
+
 def test_weights_that_are_all_one_change_nothing(
     trained, queries, frames, micro_store, library
 ) -> None:
