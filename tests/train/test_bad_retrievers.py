@@ -154,11 +154,12 @@ def test_a_base_of_the_hubs_cache_with_another_pooling(
 ) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    commit = "a1" * 20
     cached = tmp_path / "models--lab--embedder"
     whole = SentenceTransformer(modules=[Transformer(saved_base), Pooling(64, pooling_mode="mean")])
-    whole.save_pretrained(str(cached / "snapshots" / "a1"), create_model_card=False)
+    whole.save_pretrained(str(cached / "snapshots" / commit), create_model_card=False)
     (cached / "refs").mkdir()
-    (cached / "refs" / "main").write_text("a1")
+    (cached / "refs" / "main").write_text(commit)
     cfg = over(contrastive_settings, "lab/embedder")
     refused(cfg, tmp_path / "run", r"lab/embedder was saved with mean pooling.* last token")
 
