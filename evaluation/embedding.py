@@ -27,6 +27,7 @@ from train.compatible import (
     check_base,
     check_pooling,
     check_widths,
+    image_named,
     named,
     pinned,
     processor_digest,
@@ -132,8 +133,7 @@ def built_base(
 
 def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Embedder:
     """The preset's base, or another model as it was released."""
-
-    preset = pinned(preset) if preset.image_model is None else preset
+    preset = pinned(preset)
 
     @cache
     def load() -> Encoder:
@@ -144,7 +144,7 @@ def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Em
     base = named(preset)
     name = f"{UNTRAINED} {preset.name}" if preset.encoder == "qwen3_vl" else preset.name
     name += ", late" if preset.late is not None else ""
-    digests = weights_digest(base, preset.image_model), processor_digest(base)
+    digests = weights_digest(base, image_named(preset)), processor_digest(base)
     return Embedder(name, preset, precision, *digests, load)
 
 

@@ -86,7 +86,7 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
             f"retriever.frames={preset.frames}, and {preset.model} takes clips of {times} frames: "
             f"give retriever.frames={times}"
         )
-    image_config = _config(preset.image_model, None, "image_model")
+    image_config = _config(preset.image_model, preset.image_revision, "image_model")
     check_size(preset, video_config)
     check_size(preset, image_config)
     try:
@@ -98,7 +98,10 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
     except UNREADABLE as error:
         raise load_failure("retriever", preset.model, error) from error
     try:
-        image = whole(CLIPModel, preset.image_model, precision, "image_model", config=image_config)
+        origin = {"revision": preset.image_revision}
+        image = whole(
+            CLIPModel, preset.image_model, precision, "image_model", config=image_config, **origin
+        )
     except UNREADABLE as error:
         raise load_failure("retriever", preset.image_model, error, "image_model") from error
     check_words(preset, video_config, tokenizer)

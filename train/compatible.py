@@ -239,12 +239,15 @@ def processor_digest(model: str | Path | None) -> str:
 
 
 def pinned(cfg: Preset) -> Preset:
-    """A preset with its hub model's commit as the revision: a name stands for other weights once
-    its owner changes them. A commit in the cache comes first. Where none can be known the preset
-    stays as it is, and what loads the model tells why it cannot be had."""
-    if not in_hub(cfg.model):
-        return cfg
-    return replace(cfg, revision=_commit(cfg.model, cfg.revision) or cfg.revision)
+    """A preset with the commits of its hub's models as their revisions: a name stands for other
+    weights once its owner changes them. A commit in the cache comes first. Where none can be known
+    the preset stays as it is, and what loads the model tells why it cannot be had."""
+    commits = {}
+    for model, revision in (("model", "revision"), ("image_model", "image_revision")):
+        if in_hub(name := getattr(cfg, model, None)):
+            asked = getattr(cfg, revision)
+            commits[revision] = _commit(name, asked) or asked
+    return replace(cfg, **commits)
 
 
 def _commit(model: str, revision: str | None) -> str | None:
@@ -270,8 +273,17 @@ def in_hub(model: str | None) -> bool:
 
 def named(cfg: Preset) -> str | None:
     """A preset's model: its folder, or the hub's name with the revision."""
-    at = f"@{cfg.revision}" if in_hub(cfg.model) and cfg.revision else ""
-    return cfg.model and f"{cfg.model}{at}"
+    return _named(cfg.model, cfg.revision)
+
+
+def image_named(cfg: RetrieverConfig) -> str | None:
+    """The same of what embeds frames alone."""
+    return _named(cfg.image_model, cfg.image_revision)
+
+
+def _named(model: str | None, revision: str | None) -> str | None:
+    at = f"@{revision}" if in_hub(model) and revision else ""
+    return model and f"{model}{at}"
 
 
 def based(folder: Path, cfg: Preset) -> Preset:

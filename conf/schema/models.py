@@ -104,6 +104,7 @@ class RetrieverConfig:
     image_model: str | None = None
     """Of languagebind: what embeds frames, where `model` embeds prefixes and questions."""
     revision: str | None = None
+    image_revision: str | None = None
     trust_remote_code: bool = False
     architecture: ArchitectureConfig | None = None
     quantization: str = "nf4"

@@ -37,15 +37,16 @@ class Said:
 
 @dataclass(frozen=True)
 class Scored:
-    """How near an embedder finds an item's candidates to its query; None where it has no score."""
+    """How near an embedder finds an item's candidates to its query, by letter; None where it has no
+    score."""
 
-    scores: tuple[float | None, ...]
+    scores: Mapping[str, float | None]
     cut: bool = False
 
     @property
     def text(self) -> str:
-        told = ("no score" if s is None else f"{s:.4f}" for s in self.scores)
-        return ", ".join(f"{letter} {s}" for letter, s in zip(LETTERS, told, strict=True))
+        told = {x: "no score" if s is None else f"{s:.4f}" for x, s in self.scores.items()}
+        return ", ".join(f"{letter} {s}" for letter, s in told.items())
 
     @property
     def choice(self) -> Choice:
@@ -59,10 +60,8 @@ class Scored:
     @property
     def _nearest(self) -> str:
         """The letters of the candidates that score highest."""
-        known = [s for s in self.scores if s is not None]
-        return "".join(
-            x for x, s in zip(LETTERS, self.scores, strict=True) if s in known and s == max(known)
-        )
+        known = {x: s for x, s in self.scores.items() if s is not None}
+        return "".join(x for x, s in known.items() if s == max(known.values()))
 
 
 def answers_of(run: Finished) -> dict[Asked, dict[str, Said | Scored]]:
@@ -79,8 +78,9 @@ def _scored(run: Finished) -> dict[Asked, dict[str, Scored]]:
     found: dict[Asked, dict[str, Scored]] = {}
     try:
         for row in json_lines(run.folder / "scores.jsonl"):
-            found.setdefault((row["by"], None), {})[row["item_id"]] = Scored(tuple(row["scores"]))
-    except (KeyError, TypeError) as error:
+            scores = dict(zip(LETTERS, row["scores"], strict=True))
+            found.setdefault((row["by"], None), {})[row["item_id"]] = Scored(scores)
+    except (KeyError, TypeError, ValueError) as error:
         raise unreadable(run.folder, "scores.jsonl") from error
     return found
 

@@ -63,9 +63,9 @@ def sections_of(
     every = [m for m in ranks if m.row.builder is None]
     found = [
         zero_shot(plain, every, folder),
-        distillation(plain, every, apart),
+        distillation(plain, every, apart, folder),
         ablation(plain),
-        transfer(plain, apart),
+        transfer(plain, apart, folder),
         controls([m for m in choices if m.ways], runs),
         *(study(run) for run in runs if run.kind in STUDIES),
         choices_in_detail(plain, confusions, folder),
@@ -81,14 +81,9 @@ def zero_shot(choices: Sequence[Measured], ranks: Sequence[Measured], folder: Pa
     for benchmark, rows in by_items(m for m in choices if not m.trained).items():
         if benchmark not in abroad:
             section.tables.append(shaped.selection_zero_shot(benchmark, rows))
+            section.figures.append(_families(folder, "zero-shot", benchmark, rows))
     for benchmark, rows in by_items(m for m in ranks if not m.trained).items():
         section.tables.append(shaped.retrieval_zero_shot(benchmark, widest(rows)))
-    for benchmark, rows in by_items(choices).items():
-        caption = f"Accuracy by family on {benchmark}, with 95% intervals."
-        drawn = _draw(
-            folder, f"families-{benchmark}", figures.selection_figure, [m.row for m in rows]
-        )
-        section.figures.append(Figure(drawn, caption))
     return section
 
 
@@ -96,12 +91,14 @@ def distillation(
     choices: Sequence[Measured],
     ranks: Sequence[Measured],
     apart: Mapping[str, Sequence[Sequence[Paired]]],
+    folder: Path,
 ) -> Section:
     section = Section("Distillation")
     abroad = transfers(choices)
     for benchmark, rows in by_items(choices).items():
         if benchmark not in abroad and any(m.trained for m in rows):
             section.tables.append(shaped.selection_distilled(benchmark, rows))
+            section.figures.append(_families(folder, "families", benchmark, rows))
             _add_apart(section, benchmark, apart)
     for benchmark, rows in by_items(ranks).items():
         if any(m.trained for m in rows):
@@ -136,7 +133,7 @@ def ablation(choices: Sequence[Measured]) -> Section:
 
 
 def transfer(
-    choices: Sequence[Measured], apart: Mapping[str, Sequence[Sequence[Paired]]]
+    choices: Sequence[Measured], apart: Mapping[str, Sequence[Sequence[Paired]]], folder: Path
 ) -> Section:
     """Students on benchmarks that they were not trained on, and the models that they began from."""
     section = Section("Transfer")
@@ -151,6 +148,7 @@ def transfer(
     for benchmark, rows in by_items(choices).items():
         if benchmark in abroad:
             section.tables.append(shaped.selection_transfer(benchmark, rows))
+            section.figures.append(_families(folder, "families", benchmark, rows))
             _add_apart(section, benchmark, apart)
     return section
 
@@ -308,6 +306,12 @@ def training(runs: Sequence[Finished], folder: Path) -> Section:
 def _renamed(table: Table, benchmark: str, name: str | None = None) -> Table:
     caption = f"{table.caption}, on {benchmark}"
     return replace(table, name=f"{name or table.name}-{benchmark}", caption=caption)
+
+
+def _families(folder: Path, name: str, benchmark: str, rows: Sequence[Measured]) -> Figure:
+    shown = [m.row for m in rows]
+    drawn = _draw(folder, f"{name}-{benchmark}", figures.selection_figure, shown)
+    return Figure(drawn, f"Accuracy by family on {benchmark}, with 95% intervals.")
 
 
 def _draw(folder: Path, name: str, draw: Callable[..., None], what: Any) -> Path:

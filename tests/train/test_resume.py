@@ -17,7 +17,7 @@ from conf.errors import UserError
 from conf.schema import LateConfig, LoraConfig, RetrieverConfig, SftCommand, StudentConfig
 from train import contrastive, samples, sft
 from train.checkpoints import newest_checkpoint
-from train.compatible import based, check_base, named, note_base, pinned
+from train.compatible import based, check_base, image_named, named, note_base, pinned
 from train.journal import read_journal
 from train.loop import Epochs
 from train.planned import ByLength, Planned, Samples
@@ -195,6 +195,9 @@ def test_a_run_holds_to_the_commit_of_a_hubs_base(tmp_path, monkeypatch) -> None
     assert pinned(based(tmp_path, cfg)) == first
     # A preset's own revision is one by which it is known.
     assert pinned(replace(cfg, revision=commits[0])) == first
+    # What embeds frames alone has a commit of its own.
+    two = pinned(replace(cfg, image_model="lab/base", image_revision=commits[0]))
+    assert (named(two), image_named(two)) == tuple(f"lab/base@{c}" for c in reversed(commits))
     # Another model of the settings is another base.
     other = replace(cfg, model="lab/other")
     assert based(tmp_path, other) == other

@@ -64,8 +64,8 @@ def test_everything_is_written_in_the_papers_shape(runs, micro_store):
     assert "untrained clip (similarity)" in scorers
     assert max(map(len, text.splitlines())) <= 100
     assert {path.stem for path in (folder / "figures").glob("*.svg")} >= {
-        "families-micro", "horizons-micro", "positions-micro", "widths-micro", "recall-micro",
-        "training-sft-cot",
+        "zero-shot-micro", "families-micro", "horizons-micro", "positions-micro", "widths-micro",
+        "recall-micro", "training-sft-cot",
     }  # fmt: skip
     data = page_data(folder)
     assert len(data["items"]) == 12
@@ -283,11 +283,11 @@ def test_a_retriever_is_held_against_what_it_began_from(runs, micro, micro_store
 
 
 def test_a_tie_is_worth_its_share():
-    both = Scored((0.5, None, 0.5, 0.25))
+    both = Scored(dict(zip(LETTERS, (0.5, None, 0.5, 0.25), strict=True)))
     assert [both.credit(x) for x in LETTERS] == [0.5, 0, 0.5, 0]
     assert (both.choice.letter, str(both.choice.reason)) == (None, "several")
     assert both.text == "A 0.5000, B no score, C 0.5000, D 0.2500"
-    assert Scored((None,) * 4).credit("A") == 0
+    assert Scored(dict.fromkeys(LETTERS)).credit("A") == 0
 
 
 def test_two_databases_are_told_apart(runs, micro, micro_store):
@@ -325,6 +325,10 @@ def test_what_was_built_anew_is_told_from_what_it_was_before(runs, micro_store, 
         (lambda runs: (runs / "select/cot/config.yaml").write_text("model: 5"),
          {}, "cot/config.yaml is .* of another version"),
         (lambda runs: (runs / "similarity/clip/scores.jsonl").write_text('{"by": "clip"}'),
+         {}, "clip/scores.jsonl is .* of another version"),
+        (lambda runs: (runs / "similarity/clip/scores.jsonl").write_text(
+            '{"by": "clip", "item_id": "a", "scores": [0.5]}'
+         ),
          {}, "clip/scores.jsonl is .* of another version"),
         (lambda runs: (runs / "select/cot/run.json").write_text("{}"), {}, "cot/run.json is miss"),
         (lambda runs: None, {"runs": ["a**"]}, "a\\*\\* is no pattern of folders"),
