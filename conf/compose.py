@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
-from functools import partial
 from typing import Any
 
 from hydra import compose as hydra_compose
@@ -92,11 +91,16 @@ def _check_sweep(
 def options(command: str, schema: type) -> dict[str, list[str]]:
     """The groups that a command takes, and the names to choose from in each."""
     with _hydra(command, schema) as loader:
-        groups = {g: loader.get_group_options(g) for g in loader.list_groups("")}
-        for group in OVERLAYS:
-            lies = partial(_lies_over, schema, loader, group)
-            groups[group] = list(filter(lies, groups[group]))
+        groups = {g: _options_in(schema, loader, g) for g in loader.list_groups("")}
         return {g: groups[g] for g in groups if groups[g] and (g in OVERLAYS or has_key(schema, g))}
+
+
+def _options_in(schema: type, loader: ConfigLoader, group: str) -> list[str]:
+    """A group's names, of overlays those that a schema can take."""
+    names = loader.get_group_options(group)
+    if group not in OVERLAYS:
+        return names
+    return [name for name in names if _lies_over(schema, loader, group, name)]
 
 
 def _lies_over(schema: type, loader: ConfigLoader, group: str, overlay: str) -> bool:
@@ -179,8 +183,9 @@ def _override_problems(
             return [f"{override.input_line}: a {root} is chosen already, leave out the +"]
         if root in OVERLAYS and not (override.is_add() or override.is_force_add()):
             return [f"{override.input_line}: lay it over with a +, as +{override.input_line}"]
+        fitting = ", ".join(_options_in(schema, loader, key))
         return [
-            f"{_typed_key(override)}={name}: no such {key}, the options are {', '.join(options)}"
+            f"{_typed_key(override)}={name}: no such {key}, the options are {fitting}"
             for name in chosen
             if name not in options
         ]

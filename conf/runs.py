@@ -27,6 +27,9 @@ log = logging.getLogger(__name__)
 ELSEWHERE = ("run", "store", "checkpoints", "workers", "train.workers", "host", "port", "public")
 """Keys that say where and how fast a run goes, not what comes out of it."""
 
+OPENED = {"config.yaml", "run.json", "run.log"}
+"""Files of a run's folder before the command makes any."""
+
 TRAINERS = {"student": "sft", "retriever": "contrastive"}
 """The folders of runs below checkpoints/, by what they train."""
 
@@ -118,16 +121,19 @@ OmegaConf.register_new_resolver("runs_of", runs_of, replace=True)
 
 
 def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[str]) -> None:
-    """Write a run's settings and record, first or again.
+    """Write a run's settings and record, first or again. A run that ended before it had made
+    anything may be started with other settings.
 
     Raises SettingsError where the folder holds a run with other settings, and UserError where it
     cannot be written.
     """
     if other := differences(run.folder, settings):
-        raise SettingsError(
-            f"{run.folder} holds a run with other settings: {'; '.join(other[:3])}. "
-            "Choose another folder with run=NAME, or delete this one."
-        )
+        if {path.name for path in run.folder.iterdir()} - OPENED:
+            raise SettingsError(
+                f"{run.folder} holds a run with other settings: {'; '.join(other[:3])}. "
+                "Choose another folder with run=NAME, or delete this one."
+            )
+        (run.folder / "run.json").unlink(missing_ok=True)
     try:
         run.folder.mkdir(parents=True, exist_ok=True)
         write_text(run.folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(settings)))

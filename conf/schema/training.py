@@ -191,6 +191,7 @@ class ContrastiveTrainConfig(TrainConfig):
             self,
             "train.",
             {
+                "batch": 1,
                 "hard_negatives": 0,
                 "validation_queries": 1,
                 "scene_queries": 1,

@@ -47,6 +47,15 @@ def test_a_run_leaves_its_record_and_can_be_run_again(room):
     )
 
 
+def test_a_run_that_made_nothing_takes_other_settings(room):
+    assert toy(room, "end=mistake", "run=one").returncode == 1
+    assert toy(room, "x=3", "run=one").returncode == 0
+    folder = room / "checkpoints/toy/one"
+    assert json.loads((folder / "metrics.json").read_text())["loss"] == 9
+    record = json.loads((folder / "run.json").read_text())
+    assert (record["overrides"], record["earlier_starts"]) == (["x=3", "run=one"], [])
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [

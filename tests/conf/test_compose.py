@@ -56,7 +56,7 @@ def test_all_unknown_keys_are_told_at_once():
             "student=nope",
             "student=nope: no such student, the options are qwen3_5_27b, qwen3_6_27b, ",
         ),
-        ("+exp=nope", "+exp=nope: no such exp, the options are answer_only, base, candidate_only"),
+        ("+exp=nope", "+exp=nope: no such exp, the options are answer_only, base, cot, "),
         ("exp=cot", "exp=cot: lay it over with a +, as +exp=cot"),
         ("+student=tiny", "+student=tiny: a student is chosen already, leave out the +"),
         ("retriever=tiny", "retriever: train.sft takes no retriever"),

@@ -55,6 +55,7 @@ def test_a_run_is_recorded_and_each_start_kept(tmp_path):
 def test_other_settings_are_refused_with_both_values(tmp_path):
     run = Run("r", tmp_path / "r")
     open_run(run, SETTINGS | {"train": {"lr": 1.0}}, "train.sft", [])
+    (run.folder / "metrics.jsonl").touch()
     with pytest.raises(SettingsError) as caught:
         open_run(run, SETTINGS | {"train": {"lr": 2.0}}, "train.sft", [])
     assert "train.lr is 1.0 there and 2.0 now" in str(caught.value)
