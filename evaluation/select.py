@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from train.trained import check_modes, measured
 
-    folder, trained = measured(cfg, SftCommand, "student")
+    folder, trained = measured(cfg, cfg.benchmark, SftCommand, "student")
     student, regime = trained.student, trained.train.regime
     modes = cfg.modes or default_modes(cfg, regime)
     if folder is not None:

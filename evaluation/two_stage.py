@@ -21,8 +21,10 @@ log = logging.getLogger(__name__)
 def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from train.trained import measured, modes_of
 
-    folder, trained = measured(cfg, SftCommand, "student")
-    matched_by, frozen = measured(cfg.matcher, ContrastiveCommand, "retriever", "matcher.model")
+    folder, trained = measured(cfg, cfg.benchmark, SftCommand, "student")
+    matched_by, frozen = measured(
+        cfg.matcher, cfg.benchmark, ContrastiveCommand, "retriever", "matcher.model"
+    )
     if frozen.retriever.late is not None:
         raise UserError(
             "a matcher by late interaction (retriever.late) scores the tokens of images and clips "

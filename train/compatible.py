@@ -45,6 +45,10 @@ PROCESSOR = (
 """Files, beside the weights, that say how text and pixels become a model's input."""
 METADATA = "__metadata__"
 """What stands among the tensors in a file's head and is none."""
+UNTRAINED_MODULES = ("Transformer", "Pooling", "Normalize")
+"""Kinds of modules that a retriever of one vector here has, of which the first alone is trained."""
+DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)
+"""What reading a file of modules raises that is not whole."""
 POOLING = "lasttoken"
 """How the library calls what makes a retriever's one vector."""
 
@@ -152,19 +156,30 @@ def is_retriever(model: str | Path, revision: str | None = None) -> bool:
         return False
 
 
+def check_modules(saved: str | Path, revision: str | None = None) -> None:
+    """Raises UserError where a saved retriever, which is to be a base, has trained modules after
+    its backbone: a new retriever would begin without them."""
+    try:
+        kinds = [m["type"].rpartition(".")[2] for m in _modules(saved, revision)]
+    except DAMAGED as error:
+        raise _damaged(saved, error) from error
+    if lost := [kind for kind in kinds if kind not in UNTRAINED_MODULES]:
+        raise UserError(
+            f"{saved} has modules after its backbone that a retriever trained over it would lose "
+            f"({', '.join(lost)}): give a base, or measure it as the run that trained it "
+            "(model=RUN)"
+        )
+
+
 def check_pooling(saved: str | Path, revision: str | None = None) -> None:
     """Raises UserError where a saved retriever, in a folder or of the hub, does not pool the last
     token."""
     try:
-        modules = json.loads(file_of(saved, MODULES, revision).read_text())
-        parts = [m["path"] for m in modules if m["type"].endswith(".Pooling")]
+        parts = [m["path"] for m in _modules(saved, revision) if m["type"].endswith(".Pooling")]
         files = [file_of(saved, f"{part}/config.json", revision) for part in parts]
         modes = [mode for file in files for mode in _pooling_modes(json.loads(file.read_text()))]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{saved} is damaged: what it says of its modules cannot be read ({error}); delete "
-            "what wrote it and train or fetch it again"
-        ) from error
+    except DAMAGED as error:
+        raise _damaged(saved, error) from error
     if modes != [POOLING]:
         told = f"with {' and '.join(map(str, modes))} pooling" if modes else "without pooling"
         raise UserError(
@@ -172,6 +187,17 @@ def check_pooling(saved: str | Path, revision: str | None = None) -> None:
             f"({POOLING}): give one that is, such as a run of train.contrastive or a "
             "Qwen3-VL-Embedding"
         )
+
+
+def _modules(saved: str | Path, revision: str | None) -> list[dict[str, Any]]:
+    return json.loads(file_of(saved, MODULES, revision).read_text())
+
+
+def _damaged(saved: str | Path, error: Exception) -> UserError:
+    return UserError(
+        f"{saved} is damaged: what it says of its modules cannot be read ({error}); delete what "
+        "wrote it and train or fetch it again"
+    )
 
 
 def _pooling_modes(config: dict[str, Any]) -> list[str]:

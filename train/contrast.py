@@ -38,7 +38,7 @@ from train.late_loss import LateRankingLoss
 from train.mining import HardNegatives
 from train.negatives import Weighing
 from train.precision import of_run
-from train.ranking import HeldOutRanking, LateHeldOutRanking
+from train.ranking import HeldOutRanking, LateHeldOutRanking, slice_database
 from train.ranking_loss import RankingLoss
 from train.retriever import ADAPTERS, Retriever
 from train.samples import held_out_scenes, shuffled
@@ -94,7 +94,11 @@ def train_retriever(
         args=arguments(cfg, run, checkpoint, share),
         train_dataset=Dataset.from_list([{"query": k} for k in range(len(training))]),
         evaluator=(LateHeldOutRanking if late else HeldOutRanking)(
-            validation, frames, cfg.retriever, cfg.train.mini_batch
+            validation,
+            slice_database(validation, store),
+            frames,
+            cfg.retriever,
+            cfg.train.mini_batch,
         ),
         loss=loss_of(cfg, model, inputs, store),
         data_collator=ByName(preprocess_fn=model.preprocess),

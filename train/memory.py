@@ -79,11 +79,15 @@ def settle(
         return Passes(model, collator, training, lengths, train, share)
 
     asked = Choice(train.micro_batch, train.gradient_checkpointing)
-    # The features kept take half of the machine's memory, which on a CPU is a step's too.
-    halved = train.reuse_features and not torch.cuda.is_available()
-    spare = SHARE / 2 if halved else SHARE
+    spare = spare_beside(train.reuse_features)
     found = decide(asked, train.batch, folder, model, trial, "micro-batch", spare)
     return replace(train, **asdict(found))
+
+
+def spare_beside(features: bool) -> float:
+    """The share of the free memory that a step may have where features are kept beside it, or are
+    not: on a CPU they take half of what is the step's too."""
+    return SHARE / 2 if features and not torch.cuda.is_available() else SHARE
 
 
 def decide(

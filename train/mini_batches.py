@@ -46,7 +46,8 @@ def settle(
         )
         size = max(1, train.mini_batch_tokens // max(inputs.prefix_lengths(names)))
     asked = memory.Choice(size, train.gradient_checkpointing)
-    found = memory.decide(asked, train.batch, folder, model[0].model, trial, "mini-batch")
+    spare = memory.spare_beside(train.reuse_features)
+    found = memory.decide(asked, train.batch, folder, model[0].model, trial, "mini-batch", spare)
     return replace(
         train,
         mini_batch=train.mini_batch if train.mini_batch_tokens is not None else found.micro_batch,

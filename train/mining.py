@@ -22,6 +22,7 @@ from conf.runs import rank, write_text
 from conf.schema import ContrastiveTrainConfig
 from data.geometry import displacements
 from data.records import FrameRef, RetrievalQuery
+from data.retrieval.database import TWIN
 from data.store import Store
 from train.batches import Batch, batch_of
 from train.finite import check_finite
@@ -129,15 +130,15 @@ class HardNegatives(TrainerCallback):
 def wrong(
     query: RetrievalQuery, ranked: Sequence[FrameRef], store: Store, margin: float, count: int
 ) -> list[FrameRef]:
-    """The first `count` of the ranked frames that are not the query's target or near it; the
-    benchmark's own where there are not so many."""
-    target = query.target
+    """The first `count` of the ranked frames that are not the query's target, its twins, or nearer
+    to it than `margin`; the benchmark's own where there are not so many."""
+    target, least = query.target, max(margin, TWIN)
     apart = displacements(store.scene(target.scene_id))[target.frame]
     far = [
         frame
         for frame in [*ranked, *query.hard_negatives]
         if frame.scene_id != target.scene_id
-        or (frame.frame != target.frame and apart[frame.frame] >= margin)
+        or (frame.frame != target.frame and apart[frame.frame] >= least)
     ]
     return [*dict.fromkeys([*far, *query.hard_negatives])][:count]
 

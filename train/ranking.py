@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from operator import attrgetter
 from typing import Any
 
 import torch
@@ -15,7 +17,9 @@ from sentence_transformers.util.similarity import maxsim
 from conf.runs import ranks
 from conf.schema import RetrieverConfig
 from data.frames import Frames
-from data.records import FRAMES, FrameRef, RetrievalQuery
+from data.records import FrameRef, RetrievalQuery
+from data.retrieval.database import Album
+from data.store import Store
 from train.batches import frame_title, query_title
 from train.finite import check_finite
 from train.retriever import Retriever, frame_input, query_input
@@ -25,9 +29,23 @@ STEP = 6
 RECALLS = (1, 10, 50)
 
 
+def slice_database(queries: Sequence[RetrievalQuery], store: Store) -> list[FrameRef]:
+    """The targets of the queries and, of their scenes, every few frames that show what no other
+    frame of the database shows; in the order of their scenes."""
+    album = Album(store.scene)
+    for query in queries:
+        album.add(query.target)
+    for scene_id in sorted({q.scene_id for q in queries}):
+        for frame in range(0, store.scene(scene_id).frames, STEP):
+            album.add(FrameRef(scene_id, frame))
+    return sorted(
+        album.frames.keys() | {q.target for q in queries}, key=attrgetter("scene_id", "frame")
+    )
+
+
 class Slice:
-    """What an evaluator of the library's needs to rank a slice of queries; recall and reciprocal
-    rank at the full width, under the names that the evaluation command uses.
+    """What an evaluator of the library's needs to rank a database for a slice of queries; recall
+    and reciprocal rank at the full width, under the names that the evaluation command uses.
 
     Frames that score alike stand in the order of their names, as the library has it; the command
     shares the places out among them. It holds names: pixels are read a mini-batch a rank at a time,
@@ -37,19 +55,21 @@ class Slice:
     score = staticmethod(cos_sim)
 
     def __init__(
-        self, queries: list[RetrievalQuery], frames: Frames, cfg: RetrieverConfig, batch: int
+        self,
+        queries: Sequence[RetrievalQuery],
+        database: Sequence[FrameRef],
+        frames: Frames,
+        cfg: RetrieverConfig,
+        batch: int,
     ) -> None:
         self._frames, self._cfg = frames, cfg
-        database = {q.target for q in queries}
-        database |= {FrameRef(q.scene_id, f) for q in queries for f in range(0, FRAMES, STEP)}
-        ordered = sorted(database, key=lambda f: (f.scene_id, f.frame))
         super().__init__(
             queries={q.query_id: q for q in queries},
-            corpus={f.name: f for f in ordered},
+            corpus={f.name: f for f in database},
             relevant_docs={q.query_id: {q.target.name} for q in queries},
             accuracy_at_k=list(RECALLS),
             precision_recall_at_k=[1],
-            mrr_at_k=[len(ordered)],
+            mrr_at_k=[len(database)],
             ndcg_at_k=[1],
             map_at_k=[1],
             batch_size=batch,

@@ -34,7 +34,14 @@ from train.backbone import (
     nothing_adapted,
     pin_sizes,
 )
-from train.compatible import PEFT, check_pooling, check_processor, check_tower, is_retriever
+from train.compatible import (
+    PEFT,
+    check_modules,
+    check_pooling,
+    check_processor,
+    check_tower,
+    is_retriever,
+)
 from train.conversation import clip_of
 from train.late import keep_projection_exact, late_modules, load_late
 from train.ranks import from_main
@@ -68,8 +75,10 @@ def load_retriever(
     if cfg.architecture is not None:
         source = from_main(partial(built, cfg, corpus, folder))
     check_reachable("retriever", source)
-    if cfg.late is None and is_retriever(source, cfg.revision):
-        check_pooling(source, cfg.revision)
+    if is_retriever(source, cfg.revision):
+        check_modules(source, cfg.revision)
+        if cfg.late is None:
+            check_pooling(source, cfg.revision)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     try:
         config = AutoConfig.from_pretrained(source, **origin)

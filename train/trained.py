@@ -12,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from conf.errors import UserError
+from conf.schema import BenchmarkConfig
 from train.compatible import based
 
 EXPORT = "export.json"
@@ -87,14 +88,40 @@ def settings_of(folder: Path, schema: type[Command], product: str, key: str = "m
 
 
 def measured(
-    cfg: Any, schema: type[Command], product: str, key: str = "model"
+    cfg: Any,
+    benchmark: BenchmarkConfig,
+    schema: type[Command],
+    product: str,
+    key: str = "model",
 ) -> tuple[Path | None, Any]:
-    """The folder that `cfg.model` names and the settings of what was trained there; None and `cfg`
-    itself, which has a preset's, where it names none. Errors are those of `settings_of`."""
+    """The folder that `cfg.model` names and the settings of what was trained there, to be measured
+    on a benchmark; None and `cfg` itself, which has a preset's, where it names none.
+
+    Raises:
+        UserError: what `settings_of` and `check_unseen` raise.
+    """
     if cfg.model is None:
         return None, cfg
     folder = Path(cfg.model)
-    return folder, settings_of(folder, schema, product, key)
+    settings = settings_of(folder, schema, product, key)
+    check_unseen(f"{key}={folder}", settings.benchmark, benchmark)
+    return folder, settings
+
+
+def check_unseen(model: str, trained: BenchmarkConfig, asked: BenchmarkConfig) -> None:
+    """Hold a benchmark to the one that `model`, as it is called, was trained on. By one seed both
+    simulate the same scenes, and split them alike as long as they test the same share.
+
+    Raises:
+        UserError: scenes of training may be among those that are tested.
+    """
+    same = all(getattr(trained, k) == getattr(asked, k) for k in ("simulator", "standin", "seed"))
+    if same and trained.simulator == "bullet" and trained.test_share != asked.test_share:
+        raise UserError(
+            f"{model} was trained with benchmark.test_share={trained.test_share}, and may have "
+            f"seen scenes that benchmark.test_share={asked.test_share} of the same seed tests: "
+            "give the same share, or another benchmark.seed"
+        )
 
 
 def modes_of(regime: str) -> list[str]:

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file, save_file
 from sentence_transformers import SentenceTransformer
-from sentence_transformers.sentence_transformer.modules import Pooling, Transformer
+from sentence_transformers.sentence_transformer.modules import Dense, Pooling, Transformer
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import ContrastiveCommand, LoraConfig
+from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
 from data import store
 from data.store import load_rows, save_rows, sealed
 from train import contrastive
@@ -98,6 +98,7 @@ def test_a_batch_that_is_too_small_for_what_it_needs(contrastive_settings) -> No
     for change, said in (
         ({"batch": 1, "mini_batch": 1, "hard_negatives": 0}, "leaves no negatives"),
         ({"batches": "scenes", "scene_queries": 5}, "train.scene_queries=5 must be at most"),
+        ({"batch": 0, "mini_batch": "auto"}, "train.batch=0 must be 1 or more"),
         ({"mini_batch": 5}, "train.mini_batch=5 must lie between 1 and train.batch=4"),
         ({"mine_every": 2, "hard_negatives": 0}, "mines nothing"),
     ):
@@ -124,6 +125,19 @@ def test_a_base_that_was_saved_by_another_pooling(
         kinds = json.loads((saved / "modules.json").read_text())[:1]
         (saved / "modules.json").write_text(json.dumps(kinds))
     refused(over(contrastive_settings, saved), tmp_path / "run", rf"saved {said}.* last token")
+
+
+def test_a_base_whose_last_modules_would_be_lost(
+    contrastive_settings, saved_base, tmp_path
+) -> None:
+    saved = tmp_path / "saved"
+    parts = [Transformer(saved_base), Pooling(64, pooling_mode="lasttoken"), Dense(64, 8)]
+    SentenceTransformer(modules=parts).save_pretrained(str(saved), create_model_card=False)
+    said = r"after its backbone .* would lose \(Dense\): give a base"
+    refused(over(contrastive_settings, saved), tmp_path / "run", said)
+    late = over(contrastive_settings, saved)
+    late.retriever.late = LateConfig(width=8)
+    refused(late, tmp_path / "late", said)
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,15 @@ def test_the_benchmarks_own_fill_what_is_lacking(micro_store) -> None:
     assert wrong(query, [query.target], micro_store, 1e9, 2) == list(query.hard_negatives[:2])
 
 
+def test_no_margin_takes_a_frame_that_shows_what_the_target_shows(micro_store) -> None:
+    for query in micro_store.retrieval("train"):
+        scene, target = query.target.scene_id, query.target.frame
+        apart = displacements(micro_store.scene(scene))[target]
+        ranked = [FrameRef(scene, f) for f in np.argsort(apart, kind="stable").tolist()]
+        found = wrong(query, ranked, micro_store, 0, len(ranked))
+        assert {f.frame for f in found} == set(np.flatnonzero(apart >= 1).tolist())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [None, LateConfig(width=24)])
 def test_a_run_mines_what_ranks_highest_and_goes_on_with_it(

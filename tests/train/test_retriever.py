@@ -11,11 +11,12 @@ from sentence_transformers import SentenceTransformer
 
 from conf.errors import UserError
 from conf.schema import LateConfig, LoraConfig
-from data.records import FPS, FrameRef, shown_frames
+from data.records import FPS, FRAMES, FrameRef, shown_frames
+from data.retrieval.database import Album
 from train import retriever
 from train.audit import audit_retriever
 from train.backbone import keep_differentiable
-from train.ranking import HeldOutRanking, LateHeldOutRanking
+from train.ranking import STEP, HeldOutRanking, LateHeldOutRanking, slice_database
 from train.retriever import frame_input, query_input
 from train.towers import count_towers
 
@@ -134,6 +135,22 @@ def test_adapters_are_trained_in_fp32_over_a_bf16_base(
     assert np.isfinite(model.encode(query, prompt_name="query")).all()
 
 
+def test_no_frame_of_a_slice_shows_what_another_shows(micro_store) -> None:
+    """But for targets, which are all in it."""
+    queries = micro_store.retrieval("train")
+    targets = {q.target for q in queries}
+    database = slice_database(queries, micro_store)
+    assert targets < set(database)
+    album = Album(micro_store.scene)
+    for target in targets:
+        album.add(target)
+    assert all(album.add(frame) for frame in database if frame not in targets)
+    shown = {(f.scene_id, f.frame) for f in database}
+    for scene_id in {f.scene_id for f in database}:
+        left_out = {f for f in range(0, FRAMES, STEP) if (scene_id, f) not in shown}
+        assert not any(album.add(FrameRef(scene_id, frame)) for frame in left_out)
+
+
 @pytest.mark.parametrize("late", [None, LateConfig(width=24)])
 def test_a_held_out_ranking_is_that_of_all_pixels_at_once(
     micro_store, frames, retriever_cfg, tmp_path, monkeypatch, late
@@ -143,7 +160,7 @@ def test_a_held_out_ranking_is_that_of_all_pixels_at_once(
     model = load(micro_store, cfg, tmp_path).eval()
     queries = micro_store.retrieval("train")[:7]
     kind = LateHeldOutRanking if late else HeldOutRanking
-    evaluator = kind(queries, frames, cfg, 2)
+    evaluator = kind(queries, slice_database(queries, micro_store), frames, cfg, 2)
     assert all(isinstance(one, FrameRef) for one in evaluator.corpus)
     asked = model.encode_query([query_input(q, frames, cfg) for q in queries])
     shown = model.encode_document([frame_input(f, frames) for f in evaluator.corpus])

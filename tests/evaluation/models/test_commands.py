@@ -27,7 +27,7 @@ from conf.schema import (
 from evaluation import report, retrieve, select
 from evaluation.answers import AnswerLog
 from train import backbone, retriever, samples
-from train.trained import settings_of
+from train.trained import measured, settings_of
 
 SMALL = ArchitectureConfig(
     hidden=64, layers=1, heads=2, kv_heads=2, feed_forward=64,
@@ -186,6 +186,14 @@ def test_a_run_that_cannot_be_measured_is_told(runs, tmp_path, damage, said) -> 
     damage(tmp_path / "run")
     with pytest.raises(UserError, match=said):
         settings_of(tmp_path / "run", SftCommand, "student")
+
+
+def test_a_model_is_not_tested_on_scenes_that_it_may_have_seen(runs, micro) -> None:
+    cfg = SelectCommand(model=str(runs / "sft" / "run"))
+    for benchmark in (micro, replace(micro, seed=1, test_share=0.9), replace(micro, scenes=99)):
+        assert measured(cfg, benchmark, SftCommand, "student")[0] == runs / "sft" / "run"
+    with pytest.raises(UserError, match=r"trained with benchmark\.test_share=0\.\d+, and may have"):
+        measured(cfg, replace(micro, test_share=0.9), SftCommand, "student")
 
 
 def test_a_torn_model_is_named(runs, tmp_path) -> None:
