@@ -82,6 +82,13 @@ _DENIAL = re.compile(
     re.IGNORECASE,
 )
 """Takes back a letter that was said before it."""
+_SECOND_THOUGHT = re.compile(
+    r"^[ \t*_#>`\-]*(?:(?:oh|no|hmm+|but|sorry)\b[,.! \t]*)*"
+    r"(?:(?P<denial>wait|scratch that|(?:that|this|it)(?:'s| is) (?:wrong|incorrect|not right))"
+    r"|actually|correction|on second thought)\b[^\n]*",
+    re.IGNORECASE | re.MULTILINE,
+)
+"""A line after the answer's that takes it back, where it is a denial or names another letter."""
 
 
 def parse_choice(raw: str) -> str | None:
@@ -125,12 +132,24 @@ def _told(prose: str, letters: str, cut: bool) -> Choice:
     if cut:
         # The last word goes on as one that says nothing.
         prose += "xx"
-    lines = [m["value"] for m in _ANSWER.finditer(prose)]
+    lines = [*_ANSWER.finditer(prose)]
     if not lines:
         return _lone(prose, letters)
-    choice = _agree([_read(value, letters) for value in lines])
-    if choice.reason is Reason.NO_ANSWER and not lines[-1].strip():
+    choice = _agree([_read(line["value"], letters) for line in lines])
+    if choice.reason is Reason.NO_ANSWER and not lines[-1]["value"].strip():
         return Choice(None, Reason.CUT_OFF)
+    if choice.letter:
+        return _kept(choice, prose[lines[-1].end() :], letters)
+    return choice
+
+
+def _kept(choice: Choice, after: str, letters: str) -> Choice:
+    """A choice, unless what is said after it takes it back."""
+    for thought in _SECOND_THOUGHT.finditer(after):
+        if _letters_named(_bare(thought[0])) & {*letters} - {choice.letter}:
+            return Choice(None, Reason.SEVERAL)
+        if thought["denial"]:
+            return Choice(None, Reason.REFUSAL)
     return choice
 
 
