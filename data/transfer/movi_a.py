@@ -150,4 +150,10 @@ def _frame_file(place: Path, frame: int) -> Path:
 
 
 def _video(place: Path) -> list[bytes]:
+    """
+    Raises:
+        BadRecord: neither a folder of frames nor a file of records is where it was.
+    """
+    if not place.parent.is_file():
+        raise BadRecord(f"{place} is missing")
     return list(tfrecord.example(place.parent, int(place.name), ("video",)).get("video", []))

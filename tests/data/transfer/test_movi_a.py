@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -187,6 +188,16 @@ def test_a_folder_that_is_nearly_right_is_refused(tmp_path: Path, trap: str) -> 
     with pytest.raises(BadRecord, match=said) as refusal:
         movi_a.read(path, tmp_path, "test")
     assert str(refusal.value).startswith(str(tmp_path / "00012"))
+
+
+def test_a_folder_that_went_away_is_named(tmp_path: Path) -> None:
+    path = write_movi_folder(tmp_path / "00012", movi_example([(9.5, 0, 1, 0.5, 0.0)]))
+    scene = movi_a.read(path, tmp_path, "test")
+    shutil.rmtree(tmp_path / "00012")
+    for look in (lambda: movi_a.check_footage(scene, tmp_path),
+                 lambda: movi_a.images(scene, tmp_path, [0])):  # fmt: skip
+        with pytest.raises(BadRecord, match="00012 is missing"):
+            look()
 
 
 RECORD_TRAPS: dict[str, tuple[Callable[[dict], object], str]] = {
