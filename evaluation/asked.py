@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+INPUTS = 1
+"""Rises with how an item is put to a model, so that no earlier answer is taken for one."""
+
 SampleOf = Callable[[str, Thing], Sample]
 """Shows and asks a thing in a mode."""
 
@@ -96,6 +99,7 @@ def model_here(
 
     revision = {
         "weights": compatible.weights_digest(compatible.named(student), weights),
+        "processor": compatible.processor_digest(weights or compatible.named(student)),
         "revision": student.revision,
         "quantization": student.quantization,
         "precision": precision,
@@ -133,6 +137,7 @@ def model_served(
         )
     weights = product_folder(folder, "student") if folder else None
     told["weights"] = compatible.weights_digest(told["root"], told["parent"], weights)
+    told["processor"] = compatible.processor_digest(told["parent"] or told["root"])
 
     def say(mode: str, sample_of: SampleOf) -> Say:
         def answer(things: list[Thing], keep: Keep) -> None:
@@ -184,6 +189,7 @@ def known_by(
         "benchmark": benchmark,
         "control": control,
         "prompt": told(mode, regime),
+        "inputs": INPUTS,
         "frames": student.frames,
         "image_size": student.image_size,
         "schema": schema() if mode == "constrained" else None,
