@@ -27,9 +27,11 @@ NUMBERED = 6
 """Rows at most whose bars have room for their numbers."""
 
 
-def selection_figure(rows: Sequence[SelectionRow], path: Path | str) -> None:
+def selection_figure(
+    rows: Sequence[SelectionRow], path: Path | str, reference: bool = True
+) -> None:
     """Bars of accuracy (%) by family with 95% Wilson whiskers, one colour a row of `rows`; the
-    chance line; and the paper's reasoning student as hollow diamonds."""
+    chance line; and, as a `reference`, the paper's reasoning student as hollow diamonds."""
     figure = empty_figure(8, 4.4)
     axes = figure.add_subplot()
     axes.spines[["top", "right"]].set_visible(False)
@@ -46,7 +48,7 @@ def selection_figure(rows: Sequence[SelectionRow], path: Path | str) -> None:
             axes.errorbar(x, middle, reach, fmt="none", ecolor=INK, capsize=3, elinewidth=1.2)
             if len(rows) <= NUMBERED:
                 _number(axes, x, 100 * found.high, value)
-    for at, family in enumerate(FAMILIES):
+    for at, family in enumerate(FAMILIES if reference else ()):
         x, value = at + len(rows) / 2 * width, getattr(paper.COT, family)
         label = f"paper: {paper.COT.name}, 8B" if at == 0 else None
         axes.scatter(

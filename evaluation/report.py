@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from conf.entry import Run, command
 from conf.runs import write_text
@@ -31,23 +32,27 @@ def main(cfg: ReportCommand, run: Run) -> None:
     check_same_build(m.run for m in (*choices, *ranks))
     check_same_rankings(ranks)
     browser = browser_of(choices, Path(cfg.store), cfg.items, cfg.seed)
-    figures, tables = run.folder / "figures", run.folder / "tables"
-    for earlier in (figures, tables):
-        shutil.rmtree(earlier, ignore_errors=True)
-    told = (browser.confusions, browser.apart)
-    sections = sections_of(once(choices), once(ranks), runs, *told, figures)
+    page = run.folder / "report.html"
+    # What there was stays until all of it is made anew.
+    with TemporaryDirectory(dir=run.folder) as made:
+        figures, tables = Path(made) / "figures", Path(made) / "tables"
+        for folder in (figures, tables):
+            folder.mkdir()
+        told = (browser.confusions, browser.apart)
+        sections = sections_of(once(choices), once(ranks), runs, *told, figures)
+        for section in sections:
+            for table in (*section.tables, *section.details):
+                write_text(tables / f"{table.name}.md", table.as_markdown())
+                write_text(tables / f"{table.name}.tex", table.as_latex())
+        write_page(page, sections, browser, [f"{r.kind}/{r.name}" for r in runs])
+        for folder in (figures, tables):
+            shutil.rmtree(run.folder / folder.name, ignore_errors=True)
+            folder.rename(run.folder / folder.name)
 
-    tables.mkdir()
-    for section in sections:
-        for table in (*section.tables, *section.details):
-            write_text(tables / f"{table.name}.md", table.as_markdown())
-            write_text(tables / f"{table.name}.tex", table.as_latex())
     text = "\n\n".join(f"{t.caption}\n\n{t}" for section in sections for t in section.tables)
     log.info("%s", text)
     write_text(run.folder / "report.txt", text + "\n")
-    page = run.folder / "report.html"
-    write_page(page, sections, browser, [f"{r.kind}/{r.name}" for r in runs])
-    log.info("\ntables: %s\npage: %s", tables, page)
+    log.info("\ntables: %s\npage: %s", run.folder / "tables", page)
 
 
 if __name__ == "__main__":

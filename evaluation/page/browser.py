@@ -56,6 +56,10 @@ def browser_of(choices: Sequence[Measured], stores: Path, bound: int, seed: int)
     browser = Browser()
     for name, store in opened.items():
         answered = [m for m in once(choices) if m.benchmark == name and _answers(m, said)]
+        builds = {m.run.report["build"] for m in answered}
+        if isinstance(store, Store) and builds - {store.identity}:
+            # By the same names it may have other items.
+            store = f"{store.folder} was built anew since they were answered"
         if answered and isinstance(store, str):
             browser.notes.append(f"The items of {name} cannot be shown: {store}.")
         elif answered:
@@ -94,12 +98,9 @@ def _add(
         f"{store.name}: {len(shown):,} of {len(known):,} answered items, a spread over subtypes "
         "and over right and wrong answers; items=N shows more or fewer."
     )
-    if lost := len(asked) - len(known):
-        browser.notes.append(
-            f"{lost:,} answered items are left out: {store.folder} has none of these names, so it "
-            "was built otherwise when they were answered."
-        )
-    browser.notes += [f"Frames are missing: {why}." for why in gone[:1]]
+    if gone:
+        more = f"; and of {len(gone) - 1:,} more scenes" if gone[1:] else ""
+        browser.notes.append(f"Frames are missing: {gone[0]}{more}.")
 
 
 def _answers(m: Measured, said: RunAnswers) -> Mapping[str, Said | Scored]:

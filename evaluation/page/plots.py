@@ -53,9 +53,11 @@ def _how_far(horizon: str) -> tuple[bool, int]:
     return horizon.endswith(" s"), int(horizon.split()[0])
 
 
-def horizon_figure(found: Mapping[str, Mapping[str, Interval]], path: Path) -> None:
-    """Accuracy (%) by horizon, one color a model, with 95% whiskers; the chance line; and the
-    paper's reasoning student 1 s and 2 s ahead as hollow diamonds."""
+def horizon_figure(
+    found: Mapping[str, Mapping[str, Interval]], path: Path, reference: bool = True
+) -> None:
+    """Accuracy (%) by horizon, one color a model, with 95% whiskers; the chance line; and, as a
+    `reference`, the paper's reasoning student 1 s and 2 s ahead as hollow diamonds."""
     horizons = sorted({horizon for of in found.values() for horizon in of}, key=_how_far)
     figure = empty_figure(7, 4.2)
     axes = figure.add_subplot()
@@ -70,7 +72,7 @@ def horizon_figure(found: Mapping[str, Mapping[str, Interval]], path: Path) -> N
         )  # fmt: skip
     paper_s = {f"{s} s": value for s, value in paper.TIME_BY_HORIZON[paper.COT.name].items()}
     places = [(i, paper_s[h]) for i, h in enumerate(horizons) if h in paper_s]
-    if places:
+    if places and reference:
         axes.scatter(
             *zip(*places, strict=True), 60, marker="D", color="#ffffff", edgecolors=INK,
             linewidths=1.5, label=f"paper: {paper.COT.name}, 8B",

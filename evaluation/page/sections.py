@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -81,7 +82,7 @@ def zero_shot(choices: Sequence[Measured], ranks: Sequence[Measured], folder: Pa
     for benchmark, rows in by_items(m for m in choices if not m.trained).items():
         if benchmark not in abroad:
             section.tables.append(shaped.selection_zero_shot(benchmark, rows))
-            section.figures.append(_families(folder, "zero-shot", benchmark, rows))
+            section.figures.append(_families(folder, "zero-shot", rows, True))
     for benchmark, rows in by_items(m for m in ranks if not m.trained).items():
         section.tables.append(shaped.retrieval_zero_shot(benchmark, widest(rows)))
     return section
@@ -98,7 +99,7 @@ def distillation(
     for benchmark, rows in by_items(choices).items():
         if benchmark not in abroad and any(m.trained for m in rows):
             section.tables.append(shaped.selection_distilled(benchmark, rows))
-            section.figures.append(_families(folder, "families", benchmark, rows))
+            section.figures.append(_families(folder, "families", rows, True))
             _add_apart(section, benchmark, apart)
     for benchmark, rows in by_items(ranks).items():
         if any(m.trained for m in rows):
@@ -148,7 +149,8 @@ def transfer(
     for benchmark, rows in by_items(choices).items():
         if benchmark in abroad:
             section.tables.append(shaped.selection_transfer(benchmark, rows))
-            section.figures.append(_families(folder, "families", benchmark, rows))
+            # The paper's figures by family are of CLEVRER.
+            section.figures.append(_families(folder, "families", rows, False))
             _add_apart(section, benchmark, apart)
     return section
 
@@ -223,11 +225,13 @@ def choices_in_detail(
         UserError: what a run reports is of another version.
     """
     section = Section("Selection in detail")
+    abroad = transfers(choices)
     for benchmark, rows in by_items(choices).items():
         cells = _told(rows, "subtypes", _intervals)
         horizons = {label: by for label, of in cells.items() if (by := plots.by_horizon(of))}
         if horizons:
-            drawn = _draw(folder, f"horizons-{benchmark}", plots.horizon_figure, horizons)
+            draw = partial(plots.horizon_figure, reference=rows[0].benchmark not in abroad)
+            drawn = _draw(folder, f"horizons-{benchmark}", draw, horizons)
             section.figures.append(Figure(drawn, f"Accuracy by horizon on {benchmark}."))
         if found := confusions.get(benchmark):
             drawn = _draw(folder, f"positions-{benchmark}", plots.confusion_figure, found)
@@ -308,9 +312,10 @@ def _renamed(table: Table, benchmark: str, name: str | None = None) -> Table:
     return replace(table, name=f"{name or table.name}-{benchmark}", caption=caption)
 
 
-def _families(folder: Path, name: str, benchmark: str, rows: Sequence[Measured]) -> Figure:
-    shown = [m.row for m in rows]
-    drawn = _draw(folder, f"{name}-{benchmark}", figures.selection_figure, shown)
+def _families(folder: Path, name: str, rows: Sequence[Measured], reference: bool) -> Figure:
+    benchmark, shown = rows[0].items, [m.row for m in rows]
+    draw = partial(figures.selection_figure, reference=reference)
+    drawn = _draw(folder, f"{name}-{benchmark}", draw, shown)
     return Figure(drawn, f"Accuracy by family on {benchmark}, with 95% intervals.")
 
 

@@ -9,7 +9,7 @@ from conf.sweep import AT_START
 from evaluation import paper
 from evaluation.formats import Best, Table
 from evaluation.metrics import Interval
-from evaluation.page.gathering import Finished
+from evaluation.page.gathering import Finished, unreadable
 from evaluation.page.rows import SUITES, Measured
 from evaluation.rows import SIMILARITY
 from evaluation.tables import (
@@ -151,6 +151,15 @@ def overall_table(
         else m.column
         for m in rows
     ]
+    # A line that has been measured on two benchmarks of a column has a column for each.
+    places = {(label, column): set() for label, column in zip(labels, columns, strict=True)}
+    for m, label, column in zip(rows, labels, columns, strict=True):
+        places[label, column].add(m.benchmark)
+    shared = {column for (_, column), of in places.items() if len(of) > 1}
+    columns = [
+        f"{column} ({m.benchmark})" if column in shared else column
+        for m, column in zip(rows, columns, strict=True)
+    ]
     suites = dict.fromkeys(["In domain", *SUITES.values(), *columns])
     found: dict[str, dict[str, Interval]] = {}
     for m, label, column in zip(rows, labels, columns, strict=True):
@@ -178,7 +187,10 @@ def training_table(runs: Sequence[Finished]) -> Table | None:
     """What each run measured on held-out training scenes, at its start and at its end."""
     parts = {}
     for run in runs:
-        metrics = json.loads((run.folder / "metrics.json").read_text())
+        try:
+            metrics = json.loads((run.folder / "metrics.json").read_text())
+        except ValueError as error:
+            raise unreadable(run.folder, "metrics.json") from error
         starts = {name: metrics.get(f"{name}{AT_START}") for name in metrics}
         parts[f"{run.kind}/{run.name}"] = [
             [name.replace("_", " "), f"{start:.3f}", f"{metrics[name]:.3f}"]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from conf.entry import Run
 from conf.errors import UserError
@@ -216,6 +217,45 @@ def test_a_model_on_a_benchmark_that_it_was_not_trained_on_is_transfer(runs, mic
     assert "python -m data.build benchmark=elsewhere" in page
 
 
+def test_two_benchmarks_of_a_simulator_have_columns_of_their_own(runs):
+    for name in ("one", "two"):
+        shutil.copytree(runs / "select" / "cot", runs / "select" / name)
+        path = runs / "select" / name / "report.json"
+        path.write_text(path.read_text().replace('"micro"', f'"{name}"', 1))
+        config = runs / "select" / name / "config.yaml"
+        settings = OmegaConf.load(config)
+        settings.benchmark.simulator, settings.benchmark.name = "movi_a", name
+        OmegaConf.save(settings, config)
+    folder = reported(runs, runs, items=1)
+    table = (folder / "tables" / "transfer.md").read_text()
+    head = "| Overall accuracy, % | In domain | MoVi-A | Physion | MoVi-A (one) | MoVi-A (two) |"
+    assert head in table
+    assert "| cot (reasoning) | 100.0 | - | - | 100.0 | 100.0 |" in table
+
+
+def test_answers_are_not_judged_by_another_build_of_their_benchmark(runs, micro_store):
+    """It has other items by the same names."""
+    for path in (runs / "select").glob("*/report.json"):
+        _add(path, build="before")
+    folder = reported(runs, micro_store.folder.parent, runs=["select/*"])
+    page = (folder / "report.html").read_text()
+    assert "The items of micro cannot be shown" in page
+    assert "was built anew since they were answered" in page
+    assert 'id="data"' not in page
+    assert not list((folder / "figures").glob("positions-*"))
+    assert not list((folder / "tables").glob("apart-*"))
+    assert (folder / "tables" / "selection-micro.md").exists()
+
+
+def test_a_report_that_ends_early_leaves_what_there_was(runs, micro_store):
+    folder = reported(runs, micro_store.folder.parent, items=1)
+    before = {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
+    (runs / "sft" / "cot" / "metrics.json").write_text("{")
+    with pytest.raises(UserError, match=r"metrics\.json"):
+        reported(runs, micro_store.folder.parent, items=1)
+    assert {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()} == before
+
+
 def test_without_the_benchmark_the_tables_still_stand(runs, tmp_path):
     folder = reported(runs, tmp_path / "nowhere")
     assert (folder / "tables" / "selection-micro.md").exists()
@@ -331,6 +371,7 @@ def test_what_was_built_anew_is_told_from_what_it_was_before(runs, micro_store, 
          ),
          {}, "clip/scores.jsonl is .* of another version"),
         (lambda runs: (runs / "select/cot/run.json").write_text("{}"), {}, "cot/run.json is miss"),
+        (lambda runs: (runs / "sft/cot/metrics.json").write_text("{"), {}, "cot/metrics.json is"),
         (lambda runs: None, {"runs": ["a**"]}, "a\\*\\* is no pattern of folders"),
         (lambda runs: (runs / "select/cot/metrics.json").unlink(), {"runs": ["select/cot"]},
          "no finished run"),
