@@ -238,12 +238,15 @@ def test_other_folders_are_no_checkpoints(tmp_path, caplog) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [None, LateConfig(width=24)], ids=["one vector", "many"])
 def test_a_retriever_goes_on_as_if_undisturbed(contrastive_settings, tmp_path, late) -> None:
-    train = replace(contrastive_settings.train, best="mrr")
+    """Within its second epoch."""
+    train = replace(contrastive_settings.train, best="mrr", max_steps=8, evaluations=4, keep=4)
     cfg = replace(contrastive_settings.retriever, late=late)
     settings = replace(contrastive_settings, retriever=cfg, train=train)
-    whole, killed = train_twice(contrastive.main, settings, tmp_path)
-    measured = {r["step"]: r["eval_mrr"] for r in read_journal(whole) if "eval_mrr" in r}
-    best = max((2, 4), key=measured.get)
+    whole, killed = train_twice(contrastive.main, settings, tmp_path, step=6)
+    journal = read_journal(whole)
+    assert 1 < next(r["epoch"] for r in journal if r["step"] == 6) < 2
+    measured = {r["step"]: r["eval_mrr"] for r in journal if "eval_mrr" in r}
+    best = max((2, 4, 6, 8), key=measured.get)
     kept = load_file(whole / f"checkpoint-{best}" / "model.safetensors")
     weights = load_file(whole / "retriever" / "model.safetensors")
     assert all(torch.equal(kept[name], weight) for name, weight in weights.items())
