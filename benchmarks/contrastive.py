@@ -23,6 +23,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from conf.compose import compose
 from conf.schema import ContrastiveCommand
 
@@ -76,13 +78,10 @@ def main() -> None:
 
 def measure_speed(args: argparse.Namespace) -> None:
     for rule in ("random", "scenes"):
-        rounds = [
-            {
-                name: in_process(args, batch=128, batches=rule, **switches)
-                for name, switches in VARIANTS.items()
-            }
-            for _ in range(args.rounds)
-        ]
+        rounds: list[dict[str, dict[str, Any]]] = [{} for _ in range(args.rounds)]
+        turns = [(found, name) for found in rounds for name in VARIANTS]
+        for found, name in tqdm(turns, desc=f"train.batches={rule}", unit="training"):
+            found[name] = in_process(args, batch=128, batches=rule, **VARIANTS[name])
         told = rounds[0][PLAIN]
         print(f"\nbatches of 128 queries, train.batches={rule}, {args.steps} steps", flush=True)
         print(
@@ -105,7 +104,7 @@ def measure_growth(args: argparse.Namespace) -> None:
         for batch in (32, 128, 512):
             found = [
                 in_process(args, batch=batch, batches="random", **VARIANTS[name])
-                for _ in range(args.rounds)
+                for _ in tqdm(range(args.rounds), desc=name, unit="training", leave=False)
             ]
             rate, peak = (statistics.median(f[key] for f in found) for key in ("rate", "peak"))
             print(f"{name:<34}{batch:>6}{rate:>11.2f}{peak:>7.2f}", flush=True)
