@@ -184,8 +184,9 @@ def _override_problems(
         if root in OVERLAYS and not (override.is_add() or override.is_force_add()):
             return [f"{override.input_line}: lay it over with a +, as +{override.input_line}"]
         fitting = ", ".join(_options_in(schema, loader, key))
+        told = f"the options are {fitting}" if fitting else f"{command} takes none"
         return [
-            f"{_typed_key(override)}={name}: no such {key}, the options are {fitting}"
+            f"{_typed_key(override)}={name}: no such {key}, {told}"
             for name in chosen
             if name not in options
         ]

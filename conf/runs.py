@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 ELSEWHERE = ("run", "store", "checkpoints", "workers", "train.workers", "host", "port", "public")
 """Keys that say where and how fast a run goes, not what comes out of it."""
 
-OPENED = {"config.yaml", "run.json", "run.log"}
+OPENED = {"config.yaml", "run.json", "run.log", "output.log", "job.json"}
 """Files of a run's folder before the command makes any."""
 
 TRAINERS = {"student": "sft", "retriever": "contrastive"}

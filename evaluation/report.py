@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import logging
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from conf.entry import Run, command
 from conf.runs import write_text
@@ -34,8 +35,8 @@ def main(cfg: ReportCommand, run: Run) -> None:
     browser = browser_of(choices, Path(cfg.store), cfg.items, cfg.seed)
     page = run.folder / "report.html"
     # What there was stays until all of it is made anew.
-    with TemporaryDirectory(dir=run.folder) as made:
-        figures, tables = Path(made) / "figures", Path(made) / "tables"
+    with emptied(run.folder / "partial") as made:
+        figures, tables = made / "figures", made / "tables"
         for folder in (figures, tables):
             folder.mkdir()
         told = (browser.confusions, browser.apart)
@@ -53,6 +54,17 @@ def main(cfg: ReportCommand, run: Run) -> None:
     log.info("%s", text)
     write_text(run.folder / "report.txt", text + "\n")
     log.info("\ntables: %s\npage: %s", run.folder / "tables", page)
+
+
+@contextmanager
+def emptied(folder: Path) -> Iterator[Path]:
+    """A folder without what a killed run left in it, which is gone afterwards."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
 
 
 if __name__ == "__main__":

@@ -83,12 +83,13 @@ _DENIAL = re.compile(
 )
 """Takes back a letter that was said before it."""
 _SECOND_THOUGHT = re.compile(
-    r"^[ \t*_#>`\-]*(?:(?:oh|no|hmm+|but|sorry)\b[,.! \t]*)*"
-    r"(?:(?P<denial>wait|scratch that|(?:that|this|it)(?:'s| is) (?:wrong|incorrect|not right))"
-    r"|actually|correction|on second thought)\b[^\n]*",
-    re.IGNORECASE | re.MULTILINE,
+    r"[ \t*_#>`\-]*(?P<taken_back>(?:(?:oh|no|nope|hmm+|but|sorry|wait|actually|correction|"
+    r"scratch that|on second thought)\b[\s,.!:;*_\-–—]*)*)"
+    r"(?P<denied>(?:that|this|it)(?:['’]s| is) (?:wrong|incorrect|not right)\W*$)?"
+    r"(?:(?:it|that)(?:['’]s| is)\b|i meant\b|make (?:it|that)\b|the answer is\b)?(?P<rest>.*)",
+    re.IGNORECASE,
 )
-"""A line after the answer's that takes it back, where it is a denial or names another letter."""
+"""The line after the answer's, which may take it back."""
 
 
 def parse_choice(raw: str) -> str | None:
@@ -102,7 +103,7 @@ def parse(raw: str, letters: str = LETTERS, cut: bool = False) -> Choice:
     Only what follows the last `</think>` counts. Where a chat template opens `<think>` itself, put
     it back in front, or a thought that was cut off is read as an answer. A record (JSON with
     `choice` or `forced_choice`) is the only source where there is one; records or answer lines
-    that disagree give no letter.
+    that disagree give no letter, nor does one that the next line takes back.
 
     Args:
         raw: the whole output.
@@ -144,13 +145,15 @@ def _told(prose: str, letters: str, cut: bool) -> Choice:
 
 
 def _kept(choice: Choice, after: str, letters: str) -> Choice:
-    """A choice, unless what is said after it takes it back."""
-    for thought in _SECOND_THOUGHT.finditer(after):
-        if _letters_named(_bare(thought[0])) & {*letters} - {choice.letter}:
-            return Choice(None, Reason.SEVERAL)
-        if thought["denial"]:
-            return Choice(None, Reason.REFUSAL)
-    return choice
+    """A choice, unless the next line takes it back, alone or for another letter. What is explained
+    below is no part of the answer."""
+    thought = _SECOND_THOUGHT.match(after.strip().partition("\n")[0])
+    if not (thought["taken_back"] or thought["denied"]):
+        return choice
+    if thought["denied"] or not thought["rest"].strip():
+        return Choice(None, Reason.REFUSAL)
+    instead = _read(thought["rest"], letters).letter
+    return Choice(None, Reason.SEVERAL) if instead not in (None, choice.letter) else choice
 
 
 def _records(text: str) -> tuple[list[str], str, Reason | None, list[str]]:

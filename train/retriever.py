@@ -69,7 +69,8 @@ def load_retriever(
 
     Raises:
         UserError: the model is not on this machine and cannot be fetched; it has no vision tower,
-            or a processor of another model; it was saved by another pooling.
+            or a processor of another model; it was saved by another pooling, or with trained
+            modules after its backbone.
     """
     source = cfg.model
     if cfg.architecture is not None:

@@ -109,18 +109,27 @@ def measured(
 
 
 def check_unseen(model: str, trained: BenchmarkConfig, asked: BenchmarkConfig) -> None:
-    """Hold a benchmark to the one that `model`, as it is called, was trained on. By one seed both
-    simulate the same scenes, and split them alike as long as they test the same share.
+    """Hold a benchmark to the one that `model`, as it is called, was trained on. What both simulate
+    by one seed are the same scenes, as are what they read of one release; a split by one seed tests
+    the same of them, and more where it tests a greater share.
 
     Raises:
         UserError: scenes of training may be among those that are tested.
     """
-    same = all(getattr(trained, k) == getattr(asked, k) for k in ("simulator", "standin", "seed"))
-    if same and trained.simulator == "bullet" and trained.test_share != asked.test_share:
+    scenes = (
+        "simulator",
+        "standin",
+        "folder",
+        *(("seed",) if trained.simulator == "bullet" else ()),
+    )
+    if any(getattr(trained, key) != getattr(asked, key) for key in scenes):
+        return
+    if trained.seed != asked.seed or asked.test_share > trained.test_share:
         raise UserError(
-            f"{model} was trained with benchmark.test_share={trained.test_share}, and may have "
-            f"seen scenes that benchmark.test_share={asked.test_share} of the same seed tests: "
-            "give the same share, or another benchmark.seed"
+            f"{model} was trained with benchmark.seed={trained.seed} and "
+            f"benchmark.test_share={trained.test_share}, and may have seen scenes that a split by "
+            f"benchmark.seed={asked.seed} and benchmark.test_share={asked.test_share} tests: give "
+            "those of the training"
         )
 
 

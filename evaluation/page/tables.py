@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 
+from conf.errors import UserError
 from conf.sweep import AT_START
 from evaluation import paper
 from evaluation.formats import Best, Table
 from evaluation.metrics import Interval
-from evaluation.page.gathering import Finished, unreadable
+from evaluation.page.gathering import Finished
 from evaluation.page.rows import SUITES, Measured
 from evaluation.rows import SIMILARITY
 from evaluation.tables import (
@@ -151,11 +152,12 @@ def overall_table(
         else m.column
         for m in rows
     ]
-    # A line that has been measured on two benchmarks of a column has a column for each.
-    places = {(label, column): set() for label, column in zip(labels, columns, strict=True)}
+    # Two benchmarks of a suite have a column each; of its own, a line may have two.
+    places: dict[tuple[str, str], set[str]] = {}
     for m, label, column in zip(rows, labels, columns, strict=True):
-        places[label, column].add(m.benchmark)
-    shared = {column for (_, column), of in places.items() if len(of) > 1}
+        line = label if column == "In domain" else ""
+        places.setdefault((column, line), set()).add(m.benchmark)
+    shared = {column for (column, _), of in places.items() if len(of) > 1}
     columns = [
         f"{column} ({m.benchmark})" if column in shared else column
         for m, column in zip(rows, columns, strict=True)
@@ -190,7 +192,10 @@ def training_table(runs: Sequence[Finished]) -> Table | None:
         try:
             metrics = json.loads((run.folder / "metrics.json").read_text())
         except ValueError as error:
-            raise unreadable(run.folder, "metrics.json") from error
+            raise UserError(
+                f"{run.folder / 'metrics.json'} is damaged: delete it, and run its training "
+                "command again, which ends where it was"
+            ) from error
         starts = {name: metrics.get(f"{name}{AT_START}") for name in metrics}
         parts[f"{run.kind}/{run.name}"] = [
             [name.replace("_", " "), f"{start:.3f}", f"{metrics[name]:.3f}"]

@@ -27,7 +27,7 @@ from conf.schema import (
 from evaluation import report, retrieve, select
 from evaluation.answers import AnswerLog
 from train import backbone, retriever, samples
-from train.trained import measured, settings_of
+from train.trained import check_unseen, measured, settings_of
 
 SMALL = ArchitectureConfig(
     hidden=64, layers=1, heads=2, kv_heads=2, feed_forward=64,
@@ -190,10 +190,17 @@ def test_a_run_that_cannot_be_measured_is_told(runs, tmp_path, damage, said) -> 
 
 def test_a_model_is_not_tested_on_scenes_that_it_may_have_seen(runs, micro) -> None:
     cfg = SelectCommand(model=str(runs / "sft" / "run"))
-    for benchmark in (micro, replace(micro, seed=1, test_share=0.9), replace(micro, scenes=99)):
+    unseen = {"seed": 1, "test_share": 0.9}
+    for same in ({}, unseen, {"scenes": 99}, {"test_share": 0.01}):
+        benchmark = replace(micro, **same)
         assert measured(cfg, benchmark, SftCommand, "student")[0] == runs / "sft" / "run"
-    with pytest.raises(UserError, match=r"trained with benchmark\.test_share=0\.\d+, and may have"):
+    with pytest.raises(UserError, match=r"may have seen scenes that .*test_share=0\.9 tests"):
         measured(cfg, replace(micro, test_share=0.9), SftCommand, "student")
+    # Another seed splits the same release anew.
+    release = replace(micro, simulator="clevrer", folder="/release")
+    check_unseen("model", release, replace(release, folder="/other", seed=1))
+    with pytest.raises(UserError, match=r"may have seen scenes that .*seed=1 "):
+        check_unseen("model", release, replace(release, seed=1))
 
 
 def test_a_torn_model_is_named(runs, tmp_path) -> None:
