@@ -25,7 +25,7 @@ from train.finite import check_finite
 from train.retriever import Retriever, frame_input, query_input
 
 STEP = 6
-"""Every so many frames of a held-out scene one is in the slice's database."""
+"""Every so many frames of a held-out scene one is in the slice's database, but for twins."""
 RECALLS = (1, 10, 50)
 
 
