@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+SUITE = "dynapix"
+"""The suite of whose items the selection tables by family are."""
+
 
 @dataclass(frozen=True)
 class SelectionReference:

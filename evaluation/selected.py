@@ -13,7 +13,7 @@ from conf.runs import write_text
 from conf.schema import SelectCommand
 from data.controls import MATCHED
 from data.records import SelectionItem
-from evaluation import figures, tables
+from evaluation import figures, paper, tables
 from evaluation.answers import Answer
 from evaluation.confidence import Calibration, calibration, positions
 from evaluation.measures import by_subtype, selection_row
@@ -60,8 +60,9 @@ def write_report(
     confidences = {w: found for w, said in told.items() if (found := reported(said))}
     apart = differences(given, items, cfg)
 
+    suite = items[0].suite
     named = [replace(row, mode=w) for row, w in zip(rows, told, strict=True)]
-    parts = [tables.selection_table(named), *([tables.paired_table(apart)] if apart else [])]
+    parts = [tables.selection_table(named, suite), *([tables.paired_table(apart)] if apart else [])]
     log.info("%s", "\n\n".join(map(str, parts)))
     parts += [tables.subtype_table(subtypes), tables.reading_table(reasons)]
     parts += [tables.position_table(letters)]
@@ -77,7 +78,7 @@ def write_report(
         "calibration": {w: asdict(found) for w, found in confidences.items()},
     }
     write_text(folder / "report.json", json.dumps(report, indent=1))
-    figures.selection_figure(named, folder / "selection.png")
+    figures.selection_figure(named, folder / "selection.png", suite == paper.SUITE)
     return metrics
 
 

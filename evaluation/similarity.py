@@ -29,7 +29,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from data.controls import MATCHED
     from data.frames import Frames
     from data.records import FrameRef
-    from evaluation import embedding, figures, nearest, tables
+    from evaluation import embedding, figures, nearest, paper, tables
     from evaluation.confidence import positions
     from evaluation.measures import by_subtype, selection_row
     from evaluation.paired import anchors
@@ -59,7 +59,8 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
             apart.append((name, anchors(items, credits, cfg.seed)))
 
     write_text(run.folder / "scores.jsonl", "".join(f"{line}\n" for line in told))
-    parts = [tables.selection_table(rows), *([tables.paired_table(apart)] if apart else [])]
+    suite = items[0].suite
+    parts = [tables.selection_table(rows, suite), *([tables.paired_table(apart)] if apart else [])]
     log.info("%s", "\n\n".join(map(str, parts)))
     parts += [tables.subtype_table(subtypes), tables.position_table(letters)]
     write_text(run.folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")
@@ -71,7 +72,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         "positions": {n: asdict(found) for n, found in letters.items()},
     }
     write_text(run.folder / "report.json", json.dumps(report, indent=1))
-    figures.selection_figure(rows, run.folder / "selection.png")
+    figures.selection_figure(rows, run.folder / "selection.png", suite == paper.SUITE)
     first = rows[0]
     metrics = {family: found.value for family, found in first.families.items()}
     return metrics | {"macro": first.macro, "micro": first.micro.value}

@@ -19,15 +19,17 @@ RETRIEVAL_HEAD = ("Width", *_HEADS, "Queries", "Frames")
 PAPER = "paper (full benchmark)"
 
 
-def selection_table(rows: Sequence[SelectionRow]) -> Table:
-    """The rows, and below them the paper's, in percent."""
+def selection_table(rows: Sequence[SelectionRow], suite: str = paper.SUITE) -> Table:
+    """The rows, and below them, where the items are of the suite that the paper has by family, the
+    paper's; in percent."""
     similar = paper.SELECTION_SIMILARITY if any(r.mode == SIMILARITY for r in rows) else ()
     reference = (paper.CHANCE, *similar, *paper.SELECTION_DISTILLED, paper.HUMAN_MAJORITY)
+    own = {"": selection_cells(rows)}
     return Table(
         "selection",
         "Selection accuracy (%)",
         ["Selection accuracy, %", *SELECTION_HEAD],
-        {"": selection_cells(rows), PAPER: selection_references(reference)},
+        own | {PAPER: selection_references(reference)} if suite == paper.SUITE else own,
         (SELECTION_NOTE,),
     )
 

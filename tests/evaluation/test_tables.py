@@ -164,6 +164,13 @@ def test_selection_table(selection_rows):
     assert UNTRAINED in own
 
 
+def test_the_papers_rows_stand_below_items_of_its_own_suite_alone(selection_rows):
+    abroad = str(selection_table(selection_rows, "standin_physion"))
+    assert paper.COT.name not in abroad
+    assert "paper" not in abroad
+    assert str(selection_table(selection_rows)).splitlines()[2:8] == abroad.splitlines()[2:8]
+
+
 def test_columns_are_aligned(selection_rows, retrieval_rows):
     selection = str(selection_table(selection_rows)).splitlines()
     edge = selection[0].index("Macro") + len("Macro")
