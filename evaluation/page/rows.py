@@ -88,8 +88,17 @@ class Measured:
     @property
     def column(self) -> str:
         """What a column of this benchmark is called."""
-        simulator = self.run.config.get("benchmark", {}).get("simulator")
-        return SUITES.get(simulator, self.benchmark)
+        return SUITES.get(self._benchmark.get("simulator"), self.benchmark)
+
+    @property
+    def is_of_suite(self) -> bool:
+        """Whether its items are of a transfer suite, or of scenes that stand in for one."""
+        told = self._benchmark
+        return told.get("simulator") in SUITES or told.get("standin") in SUITES
+
+    @property
+    def _benchmark(self) -> dict[str, Any]:
+        return self.run.config.get("benchmark", {})
 
 
 def read_rows(runs: Sequence[Finished], root: Path) -> tuple[list[Measured], list[Measured]]:
@@ -149,10 +158,10 @@ def by_items(rows: Iterable[Measured]) -> dict[str, list[Measured]]:
 
 
 def transfers(rows: Sequence[Measured]) -> set[str]:
-    """The benchmarks on which models are measured that were trained elsewhere, and none that was
-    trained there."""
+    """The benchmarks where no model was trained, which are or stand in for the paper's transfer
+    suites, or on which models are measured that were trained elsewhere."""
     homes = {m.home for m in rows if m.home}
-    return {m.benchmark for m in rows if m.home not in (None, m.benchmark)} - homes
+    return {m.benchmark for m in rows if m.is_of_suite or m.home not in (None, m.benchmark)} - homes
 
 
 def widest(rows: Sequence[Measured]) -> list[Measured]:

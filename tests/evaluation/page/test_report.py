@@ -217,6 +217,18 @@ def test_a_model_on_a_benchmark_that_it_was_not_trained_on_is_transfer(runs, mic
     assert "python -m data.build benchmark=elsewhere" in page
 
 
+@pytest.mark.parametrize("of", ["simulator", "standin"])
+def test_a_base_alone_on_a_transfer_suite_is_no_zero_shot_row_of_the_papers_benchmark(runs, of):
+    config = runs / "select" / "base" / "config.yaml"
+    settings = OmegaConf.load(config)
+    settings.benchmark[of] = "physion"
+    OmegaConf.save(settings, config)
+    folder = reported(runs, runs, items=1, runs=["select/base"])
+    names = {path.stem for path in (folder / "tables").glob("*.md")}
+    assert {"transfer", "transfer-micro"} <= names
+    assert "selection-micro" not in names
+
+
 def test_two_benchmarks_of_a_simulator_have_columns_of_their_own(runs):
     for name in ("one", "two"):
         shutil.copytree(runs / "select" / "cot", runs / "select" / name)
