@@ -173,8 +173,10 @@ def _override_problems(
     # `student={...}` sets values below student, `student=tiny` chooses a preset.
     chosen = [] if isinstance(override._value, dict) else _chosen(override)
     options = loader.get_group_options(key)
+    fitting = ", ".join(_options_in(schema, loader, key)) if options else ""
+    told = f"the options are {fitting}" if fitting else f"{command} takes none"
     if options and override._value is None and not override.is_delete():
-        return [f"{override.input_line}: choose one of {', '.join(options)}"]
+        return [f"{override.input_line} chooses nothing: {told}"]
     if options and chosen and not override.is_delete():
         root = (override.package or key).partition(".")[0]
         if root not in OVERLAYS and not has_key(schema, root):
@@ -183,8 +185,6 @@ def _override_problems(
             return [f"{override.input_line}: a {root} is chosen already, leave out the +"]
         if root in OVERLAYS and not (override.is_add() or override.is_force_add()):
             return [f"{override.input_line}: lay it over with a +, as +{override.input_line}"]
-        fitting = ", ".join(_options_in(schema, loader, key))
-        told = f"the options are {fitting}" if fitting else f"{command} takes none"
         return [
             f"{_typed_key(override)}={name}: no such {key}, {told}"
             for name in chosen
