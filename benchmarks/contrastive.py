@@ -6,8 +6,12 @@
 `speed` trains some steps in every variant, each in a process of its own, in turns: medians over the
 rounds of queries a second and of the process's peak memory, and of each round's ratio to the plain
 library. That gets rows that name what they show, as ours do, so that pixels are read a batch at a
-time, its own collator, and the best of what its loss offers; the batches are ours. How many of a
-batch's frames and prefixes are repeated is told.
+time, its own collator, the best of what its loss offers, and once our attention and our hold on
+memory as a gift; the batches are ours. How many of a batch's frames and prefixes are repeated is
+told.
+
+The small benchmark's queries hardly share a clip. Where each scene's are all asked after the clip
+of its first ("a clip a scene"), the objective is another, and what sharing saves is seen.
 
 `growth` trains on batches of 32, 128 and 512 queries: peak memory, and time a query.
 """
@@ -20,6 +24,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,21 +47,29 @@ OVERRIDES = [
 ]
 PLAIN = "plain sentence-transformers"
 ALONE = {"distinct_frames": False, "shared_prefixes": False}
+BY_TOKENS = {"mini_batch_tokens": 3072}
 VARIANTS: dict[str, dict[str, Any]] = {
     PLAIN: {"plain": True},
-    "plain, by tokens": {"plain": True, "mini_batch_tokens": 4096},
+    "plain, by tokens": {"plain": True, **BY_TOKENS},
+    "plain, helped": {"plain": True, "helped": True},
     "ours, nothing shared": ALONE,
     "  each frame once": {**ALONE, "distinct_frames": True},
     "  each shared prefix once": {**ALONE, "shared_prefixes": True},
     "  the tower's features reused": {**ALONE, "reuse_features": True},
-    "  by tokens": {**ALONE, "mini_batch_tokens": 4096},
+    "  by tokens": {**ALONE, **BY_TOKENS},
     "  a thread that makes inputs": {**ALONE, "workers": 2},
-    "ours, all but prefixes": {
-        "shared_prefixes": False, "reuse_features": True, "mini_batch_tokens": 4096,
-    },
-    "ours, but no features kept": {"mini_batch_tokens": 4096},
-    "ours, prefixes too": {"reuse_features": True, "mini_batch_tokens": 4096},
-}  # fmt: skip
+    "ours, but no features kept": BY_TOKENS,
+    "ours, whole": {"reuse_features": True, **BY_TOKENS},
+}
+SHARING = (
+    PLAIN, "ours, nothing shared", "  each frame once", "  each shared prefix once", "ours, whole",
+)  # fmt: skip
+BATCHES: dict[str, tuple[dict[str, Any], Sequence[str]]] = {
+    "train.batches=random": ({"batches": "random"}, tuple(VARIANTS)),
+    "train.batches=scenes": ({"batches": "scenes"}, SHARING),
+    "train.batches=scenes, a clip a scene": ({"batches": "scenes", "one_clip": True}, SHARING),
+}
+"""How batches are composed, and the variants to which it matters."""
 
 
 def main() -> None:
@@ -77,19 +90,19 @@ def main() -> None:
 
 
 def measure_speed(args: argparse.Namespace) -> None:
-    for rule in ("random", "scenes"):
+    for rule, (composed, names) in BATCHES.items():
         rounds: list[dict[str, dict[str, Any]]] = [{} for _ in range(args.rounds)]
-        turns = [(found, name) for found in rounds for name in VARIANTS]
-        for found, name in tqdm(turns, desc=f"train.batches={rule}", unit="training"):
-            found[name] = in_process(args, batch=128, batches=rule, **VARIANTS[name])
+        turns = [(found, name) for found in rounds for name in names]
+        for found, name in tqdm(turns, desc=rule, unit="training"):
+            found[name] = in_process(args, batch=128, **composed, **VARIANTS[name])
         told = rounds[0][PLAIN]
-        print(f"\nbatches of 128 queries, train.batches={rule}, {args.steps} steps", flush=True)
+        print(f"\nbatches of 128 queries, {rule}, {args.steps} steps", flush=True)
         print(
             f"{told['frames']:.0%} of the frames and {told['prefixes']:.0%} of the prefixes that a "
             "batch names are repeated in it"
         )
         print(f"{'':<34}{'queries/s':>10}{'of plain':>10}{'GiB':>7}{'of plain':>10}{'loss':>10}")
-        for name in VARIANTS:
+        for name in names:
             line = f"{name:<34}"
             for key, width in (("rate", 10), ("peak", 7)):
                 line += f"{statistics.median(r[name][key] for r in rounds):>{width}.2f}"
@@ -100,7 +113,7 @@ def measure_speed(args: argparse.Namespace) -> None:
 
 def measure_growth(args: argparse.Namespace) -> None:
     print(f"{'':<34}{'batch':>6}{'queries/s':>11}{'GiB':>7}")
-    for name in (PLAIN, "ours, nothing shared", "ours, but no features kept", "ours, prefixes too"):
+    for name in (PLAIN, "ours, nothing shared", "ours, but no features kept", "ours, whole"):
         for batch in (32, 128, 512):
             found = [
                 in_process(args, batch=batch, batches="random", **VARIANTS[name])
@@ -126,10 +139,17 @@ def print_one(args: argparse.Namespace) -> None:
 
 
 def train_one(
-    steps: int, benchmark: str, store: str, plain: bool = False, **switches: Any
+    steps: int,
+    benchmark: str,
+    store: str,
+    plain: bool = False,
+    helped: bool = False,
+    one_clip: bool = False,
+    **switches: Any,
 ) -> dict[str, Any]:
     """Train a variant here: queries a second, the process's peak memory, the last loss, and the
-    shares of a batch's frames and prefixes that are repeated."""
+    shares of a batch's frames and prefixes that are repeated. `helped`: the plain library's trainer
+    has our attention and our hold on memory; `one_clip`: a scene's queries are asked after one."""
     from benchmarks.contrastive_runs import repeated, train
 
     overrides = [f"train.{name}={value}" for name, value in switches.items()]
@@ -139,7 +159,7 @@ def train_one(
         [*OVERRIDES, f"benchmark={benchmark}", f"store={store}", *overrides],
     )
     with tempfile.TemporaryDirectory() as folder:
-        figures = train(cfg, steps + 1, plain, Path(folder))
+        figures = train(cfg, steps + 1, plain, helped or not plain, one_clip, Path(folder))
     return {
         "rate": cfg.train.batch * len(figures.seconds) / sum(figures.seconds),
         "peak": figures.peak,

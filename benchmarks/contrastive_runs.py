@@ -29,6 +29,7 @@ from data.store import Store
 from train import retriever, room
 from train.batches import Batch, Composed, batch_of
 from train.contrast import ByName, RetrieverTrainer, arguments, loss_of, named
+from train.fused import fuse, unfuse
 from train.inputs import Inputs
 from train.mining import HardNegatives
 from train.precision import settled
@@ -46,18 +47,38 @@ class Figures:
     batches: list[Batch]
 
 
-def train(cfg: ContrastiveCommand, steps: int, plain: bool, folder: Path) -> Figures:
-    """Train `steps` steps of the settings' own benchmark and retriever in `folder`."""
-    room.keep_big_blocks()
+def train(
+    cfg: ContrastiveCommand, steps: int, plain: bool, helped: bool, one_clip: bool, folder: Path
+) -> Figures:
+    """Train `steps` steps of the settings' own benchmark and retriever in `folder`. Without
+    `helped` it attends as transformers has it, and big blocks of memory are given back each time;
+    with `one_clip` all queries of a scene are asked after the clip of its first."""
+    if helped:
+        room.keep_big_blocks()
     set_seed(SEED)
     cfg.train.precision = settled(cfg.train.precision)
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     queries = store.retrieval("train")
+    if one_clip:
+        queries = after_one_clip(queries)
     model = retriever.load_retriever(
         cfg.retriever, cfg.train.precision, retriever.corpus(queries, cfg.retriever), folder
     )
+    if not helped:
+        model[0].model.set_attn_implementation("sdpa")
     frames = Frames(store, cfg.retriever.image_size)
     return trained(cfg, model, queries, frames, store, steps, plain, folder)
+
+
+def after_one_clip(queries: Sequence[RetrievalQuery]) -> list[RetrievalQuery]:
+    first: dict[str, RetrievalQuery] = {}
+    for query in queries:
+        first.setdefault(query.scene_id, query)
+    clips = [first[query.scene_id] for query in queries]
+    return [
+        replace(query, prefix_start=clip.prefix_start, prefix_stop=clip.prefix_stop)
+        for query, clip in zip(queries, clips, strict=True)
+    ]
 
 
 def trained(
@@ -99,6 +120,7 @@ NEVER = {"eval_strategy": "no", "eval_on_start": False, "save_strategy": "no"}
 
 def ours(cfg, model, queries, frames, store, folder, order) -> Trainer:
     """The trainer as `train.contrastive` makes it, without evaluations and checkpoints."""
+    fuse(model)
     inputs = Inputs(model, frames, cfg.retriever, cfg.train.precision)
     negatives = HardNegatives(queries, cfg.train, model, inputs, RankingLoss, store, folder)
     return RetrieverTrainer(
@@ -114,6 +136,7 @@ def ours(cfg, model, queries, frames, store, folder, order) -> Trainer:
 
 def plains(cfg, model, queries, frames, store, folder, order) -> Trainer:
     """The library's trainer, collator and losses; its user reads pixels as a batch is made."""
+    unfuse(model)
     columns = ["query", "target", *(f"negative_{k}" for k in range(cfg.train.hard_negatives))]
     prompts = dict.fromkeys(columns, cfg.retriever.frame_instruction)
     collator = LateFrames(

@@ -36,6 +36,7 @@ from train import loop
 from train.collate import Collator, encode, letter_ids, pad
 from train.conversation import Sample
 from train.features import Features, Keyed
+from train.fused import fuse, unfuse
 from train.packing import PackingCollator, rope_of
 from train.room import peak, start_peak
 from train.sft_trainer import LetterChoice, StudentTrainer, token_mean
@@ -113,6 +114,7 @@ def ours(
 ) -> Trainer:
     """The trainer as `train.sft` makes it, without evaluations and checkpoints."""
     train = work.train
+    fuse(work.model)
     if variant.attention is not None:
         work.model.get_base_model().set_attn_implementation(variant.attention)
     kind = EveryRow if variant.collator == "every row" else Collator
@@ -151,6 +153,7 @@ def trls(variant: Variant, work: Work, clock: Clock, folder: Path) -> Trainer:
     from trl import SFTConfig, SFTTrainer
 
     train, own = work.train, variant.collator == "own"
+    unfuse(work.model)
     work.model.get_base_model().set_attn_implementation(variant.attention or "sdpa")
     rows = datasets.Dataset.from_dict({"row": range(len(work.samples))})
     collator = EveryRow(work.processor, work.max_length)

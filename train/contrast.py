@@ -33,6 +33,7 @@ from data.store import Store
 from train import checkpoints, compatible, journal, loop, mini_batches, ranks, retriever, room
 from train.audit import audit_retriever
 from train.batches import Batch, Composed, batch_of
+from train.fused import fuse
 from train.inputs import Inputs
 from train.late_loss import LateRankingLoss
 from train.mining import HardNegatives
@@ -70,6 +71,7 @@ def train_retriever(
             corpus=retriever.corpus(store.retrieval("train"), cfg.retriever),
             folder=run.folder / "untrained",
         )
+    fuse(model)
     longest = retriever.longest_query(training, model.tokenizer)
     log.info(audit_retriever(model, cfg.retriever, longest, frames))
 

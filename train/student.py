@@ -35,6 +35,7 @@ from train import (
 from train.audit import audit
 from train.collate import Collator, letter_ids
 from train.features import Features, Keyed
+from train.fused import fuse
 from train.generate import HeldOutAnswers
 from train.packing import PackingCollator, rope_of
 from train.planned import ByLength, Samples
@@ -66,6 +67,7 @@ def train_student(
         if not ranks.sharded():
             # Else the trainer would only find later that it does not fit.
             model.to(PartialState(cpu=not torch.cuda.is_available()).device)
+    fuse(model)
     training, validation = split(cfg, store, rationales)
     ways = ways_of(cfg, model, processor)
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)

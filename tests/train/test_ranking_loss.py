@@ -19,6 +19,7 @@ from conf.schema import LoraConfig, RetrieverConfig
 from data.geometry import displacements
 from data.records import FrameRef
 from train.batches import batch_of
+from train.fused import fuse, unfuse
 from train.inputs import Inputs
 from train.negatives import Weighing
 from train.ranking_loss import RankingLoss, early
@@ -78,7 +79,11 @@ def ours(trained, queries, frames, store, distinct=True, shared=True, **settings
     settings = {"mini_batch": 5, "weighing": Weighing(store), "scale": SCALE, **settings}
     inputs = Inputs(model, frames, cfg, "fp32")
     loss = MatryoshkaLoss(model, RankingLoss(model, inputs, **settings), cfg.widths, WEIGHTS)
-    return gradients(model, loss, [batch_of(queries, NEGATIVES, distinct, shared)])
+    fuse(model)
+    try:
+        return gradients(model, loss, [batch_of(queries, NEGATIVES, distinct, shared)])
+    finally:
+        unfuse(model)
 
 
 def assert_same(one, two) -> None:
