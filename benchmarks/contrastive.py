@@ -113,7 +113,7 @@ def measure_speed(args: argparse.Namespace) -> None:
 
 def measure_growth(args: argparse.Namespace) -> None:
     print(f"{'':<34}{'batch':>6}{'queries/s':>11}{'GiB':>7}")
-    for name in (PLAIN, "ours, nothing shared", "ours, but no features kept", "ours, whole"):
+    for name in (PLAIN, "ours, but no features kept", "ours, whole"):
         for batch in (32, 128, 512):
             found = [
                 in_process(args, batch=batch, batches="random", **VARIANTS[name])
