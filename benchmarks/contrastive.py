@@ -81,6 +81,7 @@ def main() -> None:
         command.add_argument("--rounds", type=int, default=3)
         command.add_argument("--benchmark", default="small")
         command.add_argument("--store", default="store", help="where the benchmark is or is built")
+        command.add_argument("--precision", default="fp32", help="also bf16, of all variants")
         command.set_defaults(measure=measure)
     single = commands.add_parser("one", help="one variant, for the others")
     single.add_argument("variant", type=json.loads)
@@ -125,7 +126,13 @@ def measure_growth(args: argparse.Namespace) -> None:
 
 def in_process(args: argparse.Namespace, **variant: Any) -> dict[str, Any]:
     """What `train_one` gives in a process of its own."""
-    told = {"steps": args.steps, "benchmark": args.benchmark, "store": args.store, **variant}
+    told = {
+        "steps": args.steps,
+        "benchmark": args.benchmark,
+        "store": args.store,
+        "precision": args.precision,
+        **variant,
+    }
     command = [sys.executable, "-m", "benchmarks.contrastive", "one", json.dumps(told)]
     done = subprocess.run(command, text=True, capture_output=True)
     if done.returncode:

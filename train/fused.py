@@ -1,9 +1,10 @@
 """The same passes in fewer and faster operations, for a model that is trained.
 
 Patches do not overlap: the convolution over them is one matrix product, which is several times as
-fast, the more so backwards. And what an adapter gives is scaled while it is as narrow as its rank,
-and added to what it is laid over within the product that widens it; peft scales and adds in passes
-over the whole width, and keeps what lies between.
+fast, the more so backwards. What an adapter gives is scaled while it is as narrow as its rank, and
+added to what it is laid over within the product that widens it; peft scales and adds in passes over
+the whole width, and keeps what lies between. And what a layer in 4 bits gives is not copied first:
+peft does that for adapters that would write into it, and these do not.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from typing import Any
 
 import torch
 from peft.tuners.lora import LoraLayer
-from peft.tuners.lora.layer import LoraVariant
+from peft.tuners.lora.bnb import Linear4bit
+from peft.tuners.lora.layer import Linear, LoraVariant
 from torch import nn
 from torch.nn.functional import linear
 
@@ -28,6 +30,8 @@ def fuse(model: nn.Module) -> None:
         if isinstance(module, LoraLayer) and not isinstance(module.get_base_layer(), nn.Embedding):
             for name in set(module.lora_A) - set(module.lora_variant):
                 module.lora_variant[name] = AddedInProduct()
+            if type(module) is Linear4bit:
+                module.__class__ = UncopiedLinear4bit
 
 
 def unfuse(model: nn.Module) -> None:
@@ -39,6 +43,8 @@ def unfuse(model: nn.Module) -> None:
             for name, variant in list(module.lora_variant.items()):
                 if isinstance(variant, AddedInProduct):
                     del module.lora_variant[name]
+        if isinstance(module, UncopiedLinear4bit):
+            module.__class__ = Linear4bit
 
 
 class PatchProduct(nn.Conv3d):
@@ -63,3 +69,14 @@ class AddedInProduct(LoraVariant):
         base, widening = result.to(narrow.dtype), module.lora_B[active_adapter].weight.T
         added = torch.addmm(base.flatten(0, -2), narrow.flatten(0, -2), widening.to(narrow.dtype))
         return added.view(result.shape)
+
+
+class UncopiedLinear4bit(Linear4bit):
+    """Adapters over a layer in 4 bits, which pass forward as those over any other layer."""
+
+    forward = Linear.forward
+
+    def _cast_input_dtype(self, x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+        # Autocast would only cast it back.
+        enabled = torch.is_autocast_enabled(x.device.type)
+        return x if enabled else super()._cast_input_dtype(x, dtype)
