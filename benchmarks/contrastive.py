@@ -83,6 +83,8 @@ def main() -> None:
         command.add_argument("--store", default="store", help="where the benchmark is or is built")
         command.add_argument("--precision", default="fp32", help="also bf16, of all variants")
         command.set_defaults(measure=measure)
+        if name == "speed":
+            command.add_argument("--only", nargs="*", help="these variants, beside the plain one")
     single = commands.add_parser("one", help="one variant, for the others")
     single.add_argument("variant", type=json.loads)
     single.set_defaults(measure=print_one)
@@ -92,6 +94,8 @@ def main() -> None:
 
 def measure_speed(args: argparse.Namespace) -> None:
     for rule, (composed, names) in BATCHES.items():
+        if args.only is not None:
+            names = [PLAIN, *args.only]
         rounds: list[dict[str, dict[str, Any]]] = [{} for _ in range(args.rounds)]
         turns = [(found, name) for found in rounds for name in names]
         for found, name in tqdm(turns, desc=rule, unit="training"):

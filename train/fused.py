@@ -1,10 +1,10 @@
 """The same passes in fewer and faster operations, for a model that is trained.
 
 Patches do not overlap: the convolution over them is one matrix product, which is several times as
-fast, the more so backwards. What an adapter gives is scaled while it is as narrow as its rank, and
-added to what it is laid over within the product that widens it; peft scales and adds in passes over
-the whole width, and keeps what lies between. And what a layer in 4 bits gives is not copied first:
-peft does that for adapters that would write into it, and these do not.
+fast, the more so backwards. And what an adapter gives is scaled while it is as narrow as its rank,
+and added in place to what it is laid over, within the product that widens it. peft scales and adds
+in passes over the whole width and keeps what lies between; what a layer in 4 bits gives it copies
+first, for adapters that change a view of it.
 """
 
 from __future__ import annotations
@@ -27,11 +27,10 @@ def fuse(model: nn.Module) -> None:
         embeds = getattr(module, "patch_embed", None)
         if isinstance(getattr(embeds, "proj", None), nn.Conv3d):
             embeds.proj.__class__ = PatchProduct
-        if isinstance(module, LoraLayer) and not isinstance(module.get_base_layer(), nn.Embedding):
+        if type(module) in ROWS:
+            module.__class__ = ROWS[type(module)]
             for name in set(module.lora_A) - set(module.lora_variant):
-                module.lora_variant[name] = AddedInProduct()
-            if type(module) is Linear4bit:
-                module.__class__ = UncopiedLinear4bit
+                module.lora_variant[name] = AddedInPlace()
 
 
 def unfuse(model: nn.Module) -> None:
@@ -39,12 +38,11 @@ def unfuse(model: nn.Module) -> None:
     for module in list(model.modules()):
         if isinstance(module, PatchProduct):
             module.__class__ = nn.Conv3d
-        if isinstance(module, LoraLayer):
+        if type(module) in ROWS.values():
             for name, variant in list(module.lora_variant.items()):
-                if isinstance(variant, AddedInProduct):
+                if isinstance(variant, AddedInPlace):
                     del module.lora_variant[name]
-        if isinstance(module, UncopiedLinear4bit):
-            module.__class__ = Linear4bit
+            module.__class__ = type(module).__base__
 
 
 class PatchProduct(nn.Conv3d):
@@ -56,8 +54,9 @@ class PatchProduct(nn.Conv3d):
         return found[..., None, None, None]
 
 
-class AddedInProduct(LoraVariant):
-    """Plain LoRA, for `peft`'s forward alone: merging is left to models that are loaded for it."""
+class AddedInPlace(LoraVariant):
+    """Plain LoRA over rows, for `peft`'s forward alone: merging is left to models that are loaded
+    for it."""
 
     @staticmethod
     def forward(
@@ -65,18 +64,31 @@ class AddedInProduct(LoraVariant):
     ) -> torch.Tensor:
         dropped = module.lora_dropout[active_adapter](x)
         narrow = module.lora_A[active_adapter](dropped) * module.scaling[active_adapter]
+        widening = module.lora_B[active_adapter].weight.T
         # Without autocast the base may be in bf16 beside adapters in fp32.
-        base, widening = result.to(narrow.dtype), module.lora_B[active_adapter].weight.T
-        added = torch.addmm(base.flatten(0, -2), narrow.flatten(0, -2), widening.to(narrow.dtype))
-        return added.view(result.shape)
+        return result.to(narrow.dtype).addmm_(narrow, widening.to(narrow.dtype))
 
 
-class UncopiedLinear4bit(Linear4bit):
-    """Adapters over a layer in 4 bits, which pass forward as those over any other layer."""
+class RowsLinear(Linear):
+    """Adapters over a layer that is given rows: what it gives is then no view, and autograd lets it
+    be changed in place at no cost."""
 
-    forward = Linear.forward
+    def forward(self, x: torch.Tensor, *args: Any, **settings: Any) -> torch.Tensor:
+        rows = super().forward(x.flatten(0, -2), *args, **settings)
+        return rows.unflatten(0, x.shape[:-1])
+
+
+class RowsLinear4bit(Linear4bit):
+    """The same over a layer in 4 bits, by the forward of any other layer, which copies nothing."""
+
+    def forward(self, x: torch.Tensor, *args: Any, **settings: Any) -> torch.Tensor:
+        rows = Linear.forward(self, x.flatten(0, -2), *args, **settings)
+        return rows.unflatten(0, x.shape[:-1])
 
     def _cast_input_dtype(self, x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
         # Autocast would only cast it back.
         enabled = torch.is_autocast_enabled(x.device.type)
         return x if enabled else super()._cast_input_dtype(x, dtype)
+
+
+ROWS = {Linear: RowsLinear, Linear4bit: RowsLinear4bit}

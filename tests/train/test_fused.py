@@ -13,7 +13,7 @@ from conf.schema import LoraConfig
 from train import backbone
 from train.collate import Collator
 from train.conversation import selection_sample
-from train.fused import AddedInProduct, PatchProduct, fuse, unfuse
+from train.fused import AddedInPlace, PatchProduct, fuse, unfuse
 from train.sft_trainer import token_mean
 
 KINDS = {
@@ -57,7 +57,7 @@ def test_loss_and_every_gradient_are_the_same(student) -> None:
     assert any(isinstance(module, PatchProduct) for module in model.modules())
     variants = [v for m in model.modules() for v in getattr(m, "lora_variant", {}).values()]
     assert bool(variants) is adapted
-    assert all(isinstance(v, AddedInProduct) for v in variants)
+    assert all(isinstance(v, AddedInPlace) for v in variants)
     torch.testing.assert_close(fused, plain, rtol=1e-5, atol=0)
     assert found.keys() == gradients.keys()
     for name, gradient in gradients.items():
