@@ -62,6 +62,16 @@ def check_tower(group: str, model: str, config: PreTrainedConfig) -> None:
         )
 
 
+def check_family(model: str, config: PreTrainedConfig) -> None:
+    """Raises UserError where a base of a retriever is no Qwen3-VL, whose masks, positions and
+    features the sharing of prefixes goes by."""
+    if config.model_type != "qwen3_vl":
+        raise UserError(
+            f"retriever.model={model} is a {config.model_type}; retriever.encoder=qwen3_vl reads "
+            "and trains Qwen3-VL models alone, such as Qwen3-VL-Embedding: give one of these"
+        )
+
+
 def check_processor(
     group: str,
     model: str,

@@ -112,8 +112,7 @@ def train_retriever(
         trainer,
         run,
         checkpoint,
-        "lower train.mini_batch, which changes no gradient, or set "
-        "train.gradient_checkpointing=true, in a run of its own (run=NAME)",
+        mini_batches.lower(train),
     )
     if rank() == 0:
         model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)
@@ -229,6 +228,10 @@ class NamedBatches:
             retriever.take_adapters(self.model, folder)
         else:
             super()._load_from_checkpoint(checkpoint_path)
+
+    def _load_best_model(self) -> None:
+        """The library would log that it could not, and keep the last weights."""
+        self._load_from_checkpoint(self.state.best_model_checkpoint)
 
     def collect_features(self, inputs: dict[str, list[int]]) -> tuple[list[Batch], None]:
         return [self._batch_of(inputs["places"])], None

@@ -23,7 +23,7 @@ from accelerate.utils import gather_object
 from torch import nn
 
 from conf.runs import write_json
-from conf.schema import SftTrainConfig
+from conf.schema import ContrastiveTrainConfig, SftTrainConfig
 from train.collate import Collator
 from train.loop import is_out_of_memory
 from train.planned import ByLength, Samples
@@ -295,6 +295,11 @@ def lower(train: SftTrainConfig) -> str:
     named = "student.image_size or student.frames"
     if train.micro_batch != 1:
         named = f"train.micro_batch, which is {train.micro_batch}"
+    return lowered(named, train)
+
+
+def lowered(named: str, train: SftTrainConfig | ContrastiveTrainConfig) -> str:
+    """That what is `named` is to be lowered, and which switches are left to turn."""
     switched = {"gradient_checkpointing": True, "reuse_features": False}
     left = [
         f"set train.{key}={str(spares).lower()}"

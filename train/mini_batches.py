@@ -55,6 +55,13 @@ def settle(
     )
 
 
+def lower(train: ContrastiveTrainConfig) -> str:
+    """By which keys a run that was out of memory takes less of it."""
+    sized = "mini_batch" if train.mini_batch_tokens is None else "mini_batch_tokens"
+    found = f"{sized}, which is {getattr(train, sized)} and changes no gradient"
+    return memory.lowered(f"train.{found}", train)
+
+
 class MiniBatches:
     """Trials by the two passes that a step makes of its mini-batches."""
 

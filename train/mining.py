@@ -44,9 +44,9 @@ SPARE = 64
 
 class HardNegatives(TrainerCallback):
     """Which hard negatives the training queries have: the benchmark's, and every `train.mine_every`
-    steps those frames of the pool, all that training queries name, that the retriever ranks
-    highest, without the target and what its scene's oracle displaces by less than
-    `train.mine_margin` px (at 336 x 336) from it.
+    steps those frames of the pool that the retriever ranks highest, without the target and what its
+    scene's oracle displaces by less than `train.mine_margin` px (at 336 x 336) from it. The pool is
+    what the benchmark's batches show: targets, and `train.hard_negatives` of each query.
 
     They are in the run's folder, a file a mining, so that a run that goes on has those it had.
     """
@@ -64,7 +64,8 @@ class HardNegatives(TrainerCallback):
         """`ranking` says how the model embeds and how embeddings are held against each other."""
         self._queries = queries
         self._every, self._margin = train.mine_every, train.mine_margin
-        self._count, self._mini_batch = train.hard_negatives, train.mini_batch
+        self._count = train.hard_negatives
+        self._mini_batch, self._tokens = train.mini_batch, train.mini_batch_tokens
         self._model, self._inputs, self._ranking = model, inputs, ranking
         self._store, self._folder = store, folder
         self._mined: Mined = {}
@@ -109,10 +110,15 @@ class HardNegatives(TrainerCallback):
         query = task == "query"
         make = self._inputs.of_prefixes if query else self._inputs.of_frames
         names = batch.query_names if query else batch.frame_names
+        size = self._mini_batch
+        if self._tokens is not None:
+            # A prefix has the questions of the whole pool here, not of a batch.
+            lengths = self._inputs.prefix_lengths if query else self._inputs.frame_lengths
+            size = max(1, self._tokens // max(lengths(batch)))
         made: list[torch.Tensor] = []
-        starts = range(0, rows, self._mini_batch)
+        starts = range(0, rows, size)
         for start in tqdm(starts, desc=f"mining: {KINDS[task]}", unit="batch", leave=False):
-            some = start, min(start + self._mini_batch, rows)
+            some = start, min(start + size, rows)
             given = self._inputs.on_device(make(batch, *some))
             embedded = self._ranking.embed(self._model, given, task).float().cpu()
             check_finite(embedded, partial(names, *some))

@@ -36,6 +36,7 @@ from train.backbone import (
 )
 from train.compatible import (
     PEFT,
+    check_family,
     check_modules,
     check_pooling,
     check_processor,
@@ -84,6 +85,7 @@ def load_retriever(
     try:
         config = AutoConfig.from_pretrained(source, **origin)
         check_tower("retriever", source, config)
+        check_family(source, config)
         backbone = Transformer(
             source,
             model_kwargs={**weight_options(cfg, precision), **origin},

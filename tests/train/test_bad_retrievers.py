@@ -14,6 +14,7 @@ import pytest
 from safetensors.torch import load_file, save_file
 from sentence_transformers import SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Dense, Pooling, Transformer
+from transformers import Qwen2VLConfig
 
 from conf.entry import Run
 from conf.errors import UserError
@@ -176,6 +177,14 @@ def test_a_base_of_the_hubs_cache_with_another_pooling(
     (cached / "refs" / "main").write_text(commit)
     cfg = over(contrastive_settings, "lab/embedder")
     refused(cfg, tmp_path / "run", r"lab/embedder was saved with mean pooling.* last token")
+
+
+def test_a_base_of_another_family(contrastive_settings, saved_base, tmp_path) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(saved_base, other)
+    Qwen2VLConfig().save_pretrained(other)
+    said = r"other is a qwen2_vl; retriever\.encoder=qwen3_vl reads and trains Qwen3-VL"
+    refused(over(contrastive_settings, other), tmp_path / "run", said)
 
 
 def test_weights_that_are_no_numbers(contrastive_settings, saved_base, tmp_path) -> None:

@@ -12,8 +12,8 @@ from torch import nn
 
 from conf.entry import Run
 from conf.schema import SftCommand
-from conf.schema.training import SftTrainConfig
-from train import journal, memory, room, sft
+from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
+from train import journal, memory, mini_batches, room, sft
 from train.backbone import load_student
 from train.collate import Collator
 from train.memory import Choice, choose, settle, sizes
@@ -255,4 +255,13 @@ def test_what_is_advised_is_what_is_left_to_do() -> None:
     spare = replace(train, micro_batch=1, gradient_checkpointing=True, reuse_features=False)
     assert memory.lower(spare) == (
         "lower student.image_size or student.frames, in a run of its own (run=NAME)"
+    )
+    retriever = ContrastiveTrainConfig(mini_batch=8, gradient_checkpointing=True)
+    assert mini_batches.lower(retriever) == (
+        "lower train.mini_batch, which is 8 and changes no gradient, in a run of its own (run=NAME)"
+    )
+    by_tokens = replace(retriever, mini_batch_tokens=2048, reuse_features=True)
+    assert mini_batches.lower(by_tokens) == (
+        "lower train.mini_batch_tokens, which is 2048 and changes no gradient, or set "
+        "train.reuse_features=false, in a run of its own (run=NAME)"
     )

@@ -49,13 +49,12 @@ def test_no_margin_takes_a_frame_that_shows_what_the_target_shows(micro_store) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("late", [None, LateConfig(width=24)])
+@pytest.mark.parametrize(("late", "tokens"), [(None, None), (LateConfig(width=24), 256)])
 def test_a_run_mines_what_ranks_highest_and_goes_on_with_it(
-    contrastive_settings, micro_store, frames, tmp_path, late
+    contrastive_settings, micro_store, frames, tmp_path, late, tokens
 ) -> None:
-    train = replace(
-        contrastive_settings.train, mine_every=1, mine_margin=MARGIN, evaluations=4, keep=4
-    )
+    often = {"mine_every": 1, "mine_margin": MARGIN, "evaluations": 4, "keep": 4}
+    train = replace(contrastive_settings.train, mini_batch_tokens=tokens, **often)
     cfg = replace(contrastive_settings.retriever, late=late)
     settings = replace(contrastive_settings, retriever=cfg, train=train)
     whole, killed = tmp_path / "whole", tmp_path / "killed"

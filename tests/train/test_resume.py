@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from sentence_transformers import SentenceTransformerTrainer
 from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.entry import Run
@@ -288,3 +289,19 @@ def test_a_best_checkpoint_that_was_lost_is_told(contrastive_settings, tmp_path)
         UserError, match=r"checkpoint-2, the best .* was lost or cut off \(its file"
     ):
         contrastive.main.__wrapped__(settings, Run("killed", killed))
+
+
+@pytest.mark.slow
+def test_a_best_checkpoint_that_cannot_be_read_is_no_silent_last_one(
+    contrastive_settings, tmp_path, monkeypatch
+) -> None:
+    def torn(*_: object) -> None:
+        raise RuntimeError("torn")
+
+    monkeypatch.setattr(SentenceTransformerTrainer, "_load_from_checkpoint", torn)
+    train = replace(contrastive_settings.train, best="mrr")
+    with pytest.raises(RuntimeError, match="torn"):
+        contrastive.main.__wrapped__(
+            replace(contrastive_settings, train=train), Run("run", tmp_path)
+        )
+    assert not (tmp_path / "retriever").exists()
