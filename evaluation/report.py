@@ -15,6 +15,8 @@ from conf.schema import ReportCommand
 
 log = logging.getLogger(__name__)
 
+PAGE = "report.html"
+
 
 @command("evaluation.report", ReportCommand)
 def main(cfg: ReportCommand, run: Run) -> None:
@@ -33,7 +35,6 @@ def main(cfg: ReportCommand, run: Run) -> None:
     check_same_build(m.run for m in (*choices, *ranks))
     check_same_rankings(ranks)
     browser = browser_of(choices, Path(cfg.store), cfg.items, cfg.seed)
-    page = run.folder / "report.html"
     # What there was stays until all of it is made anew.
     with emptied(run.folder / "partial") as made:
         figures, tables = made / "figures", made / "tables"
@@ -45,15 +46,17 @@ def main(cfg: ReportCommand, run: Run) -> None:
             for table in (*section.tables, *section.details):
                 write_text(tables / f"{table.name}.md", table.as_markdown())
                 write_text(tables / f"{table.name}.tex", table.as_latex())
-        write_page(page, sections, browser, [f"{r.kind}/{r.name}" for r in runs])
+        text = "\n\n".join(f"{t.caption}\n\n{t}" for section in sections for t in section.tables)
+        write_text(made / "report.txt", text + "\n")
+        write_page(made / PAGE, sections, browser, [f"{r.kind}/{r.name}" for r in runs])
         for folder in (figures, tables):
             shutil.rmtree(run.folder / folder.name, ignore_errors=True)
             folder.rename(run.folder / folder.name)
+        for name in ("report.txt", PAGE):
+            (made / name).replace(run.folder / name)
 
-    text = "\n\n".join(f"{t.caption}\n\n{t}" for section in sections for t in section.tables)
     log.info("%s", text)
-    write_text(run.folder / "report.txt", text + "\n")
-    log.info("\ntables: %s\npage: %s", run.folder / "tables", page)
+    log.info("\ntables: %s\npage: %s", run.folder / "tables", run.folder / PAGE)
 
 
 @contextmanager

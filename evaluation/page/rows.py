@@ -71,6 +71,11 @@ class Measured:
         return settings.get("student", {}).get("name")
 
     @property
+    def model(self) -> str:
+        """What the run's report calls the model."""
+        return self.reported or self.row.name
+
+    @property
     def label(self) -> str:
         return f"{self.row.name} ({self.row.mode})"
 
@@ -78,8 +83,7 @@ class Measured:
     def known_by(self) -> str:
         """What the run of a selection row knows it by: the mode in which its one model was asked,
         or which of its embedders chose."""
-        name = self.reported or self.row.name
-        return name if self.run.kind == "similarity" else self.row.mode
+        return self.model if self.run.kind == "similarity" else self.row.mode
 
     def told(self, kind: str) -> Any:
         """What else the run reports of a selection row's model, such as its subtypes."""
@@ -147,6 +151,18 @@ def _place(m: Measured) -> tuple:
 def _with_run(m: Measured) -> Measured:
     row = replace(m.row, name=f"{m.row.name}, {m.run.name}")
     return replace(m, row=row, reported=m.row.name)
+
+
+def model_names(rows: Sequence[Measured]) -> list[str]:
+    """Of each row what its line is called where a line is a model on several benchmarks: the model;
+    what was measured again on the same items has its run's name."""
+    taken: set[tuple[str, str, str]] = set()
+    names = []
+    for m in rows:
+        cell = (m.model, m.row.mode, m.items)
+        names.append(m.row.name if cell in taken else m.model)
+        taken.add(cell)
+    return names
 
 
 def by_items(rows: Iterable[Measured]) -> dict[str, list[Measured]]:

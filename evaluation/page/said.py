@@ -138,8 +138,17 @@ def check_same_items(rows: Sequence[Measured], ids: Sequence[Mapping[str, object
             elif rows[j].row.n != m.row.n:
                 told = f"{names[0]} and {names[1]} answered {rows[j].row.n:,} and {m.row.n:,} items"
                 raise UserError(f"{told}: compare runs of the same items")
+            elif (drawn := _drawn(rows[j].run)) != _drawn(m.run):
+                told = f"{names[0]} and {names[1]} answered items of limit and seed {drawn} and "
+                raise UserError(f"{told}{_drawn(m.run)}: compare runs of the same items")
         except UserError as error:
             raise UserError(f"{error}, which runs=[...] chooses") from error
+
+
+def _drawn(run: Finished) -> tuple[int, int] | None:
+    """The limit and the seed by which a run's items were drawn; None where they are all of them."""
+    limit = run.config.get("limit")
+    return None if limit is None else (limit, run.config.get("seed", 0))
 
 
 def check_same_rankings(rows: Sequence[Measured]) -> None:

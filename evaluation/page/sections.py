@@ -19,7 +19,7 @@ from evaluation.metrics import Interval
 from evaluation.page import plots
 from evaluation.page import tables as shaped
 from evaluation.page.gathering import STUDIES, TRAININGS, Finished, json_lines, unreadable
-from evaluation.page.rows import Measured, by_items, transfers, widest
+from evaluation.page.rows import Measured, by_items, model_names, transfers, widest
 from evaluation.page.tables import ABLATED, REGIMES
 from evaluation.paired import Paired
 from train.plots import curves_figure
@@ -127,7 +127,8 @@ def ablation(choices: Sequence[Measured]) -> Section:
     if not any(m.regime in ABLATED for m in told):
         return Section("Ablation")
     told.sort(key=lambda m: list(REGIMES).index(m.regime))
-    labels = [f"{REGIMES[m.regime]} ({m.row.name})" for m in told]
+    names = zip(told, model_names(told), strict=True)
+    labels = [f"{REGIMES[m.regime]} ({name})" for m, name in names]
     caption = "Ablation: accuracy over all items (%) in reasoning mode"
     reference = {"paper, Table 12": paper.ABLATION}
     return Section("Ablation", [shaped.overall_table("ablation", caption, told, labels, reference)])
@@ -140,9 +141,10 @@ def transfer(
     section = Section("Transfer")
     if not (abroad := transfers(choices)):
         return section
-    travelled = {m.label for m in choices if m.benchmark in abroad}
-    told = [m for m in choices if m.label in travelled]
-    labels = [m.label for m in told]
+    travelled = {(m.model, m.row.mode) for m in choices if m.benchmark in abroad}
+    told = [m for m in choices if (m.model, m.row.mode) in travelled]
+    names = zip(told, model_names(told), strict=True)
+    labels = [f"{name} ({m.row.mode})" for m, name in names]
     caption = "Transfer: accuracy over all items (%)"
     reference = {"paper, Section 5.3 (answer mode)": paper.TRANSFER}
     section.tables.append(shaped.overall_table("transfer", caption, told, labels, reference))
@@ -284,10 +286,10 @@ def rankings_in_detail(ranks: Sequence[Measured], folder: Path) -> Section:
             drawn = _draw(folder, f"widths-{benchmark}", figures.retrieval_figure, of_all)
             section.figures.append(Figure(drawn, f"Recall by width on {benchmark}."))
         curves = {
-            (curve["name"], m.run.folder): curve
+            (m.row.name, m.run.folder): {**curve, "name": m.row.name}
             for m in rows
             for curve in m.run.report.get("curves", [])
-            if curve["builder"] is None
+            if curve["builder"] is None and curve["name"] == m.model
         }
         if curves:
             drawn = _draw(folder, f"recall-{benchmark}", plots.recall_figure, [*curves.values()])

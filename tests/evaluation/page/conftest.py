@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -33,3 +34,10 @@ def measured(tmp_path_factory, micro, micro_store) -> Path:
     retrieve_run(root, micro_store, micro, "emb")
     retrieve_run(root, micro_store, micro, "emb", kind="two_stage")
     return root
+
+
+@pytest.fixture
+def runs(measured, tmp_path) -> Path:
+    """A copy to damage."""
+    shutil.copytree(measured, tmp_path / "checkpoints")
+    return tmp_path / "checkpoints"

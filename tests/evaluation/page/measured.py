@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 from omegaconf import OmegaConf
 
+from conf.entry import Run
 from conf.schema import (
     ContrastiveCommand,
+    ReportCommand,
     RetrieveCommand,
     RetrieverConfig,
     SelectCommand,
@@ -24,7 +26,7 @@ from conf.schema import (
 from conf.schema.training import SftTrainConfig
 from data.records import SelectionItem
 from data.store import Store
-from evaluation import nearest
+from evaluation import nearest, report
 from evaluation.confidence import positions
 from evaluation.measures import ranks_apart, recall_curves, retrieval_rows
 from evaluation.metrics import accuracy_by, accuracy_table
@@ -175,3 +177,12 @@ def retrieve_run(
     )  # fmt: skip
     finish(root / kind / name, settings, report)
     return root / kind / name
+
+
+def reported(root: Path, store: Path, **settings) -> Path:
+    """The folder of a report over what is below `root`."""
+    folder = root / "report" / "default"
+    folder.mkdir(parents=True, exist_ok=True)
+    cfg = ReportCommand(checkpoints=str(root), store=str(store), **settings)
+    report.main.__wrapped__(cfg, Run("default", folder))
+    return folder

@@ -11,29 +11,18 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import ReportCommand
 from data.controls import MATCHED
 from data.records import LETTERS
-from evaluation import report
 from evaluation.page.said import Scored
-from tests.evaluation.page.measured import retrieve_run, right, select_run, similarity_run
-
-
-@pytest.fixture
-def runs(measured, tmp_path) -> Path:
-    """A copy to damage."""
-    shutil.copytree(measured, tmp_path / "checkpoints")
-    return tmp_path / "checkpoints"
-
-
-def reported(root: Path, store: Path, **settings) -> Path:
-    folder = root / "report" / "default"
-    folder.mkdir(parents=True, exist_ok=True)
-    cfg = ReportCommand(checkpoints=str(root), store=str(store), **settings)
-    report.main.__wrapped__(cfg, Run("default", folder))
-    return folder
+from tests.evaluation.page.measured import (
+    reported,
+    retrieve_run,
+    right,
+    select_run,
+    similarity_run,
+)
 
 
 def page_data(folder: Path) -> dict:
