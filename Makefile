@@ -74,7 +74,7 @@ paper: RETRIEVED := $(RETRIEVER)
 paper: SUITES := movi_a physion
 paper: FOLDER = benchmark.folder=$(RELEASES)/$$s
 # The record is the headline; the modes of students are what these are held against.
-paper: ZERO_SHOT := modes=[record,reasoning,answer]
+paper: ZERO_SHOT := modes=[record,constrained,reasoning,answer]
 paper: MATCHER := matcher=$(RETRIEVER)
 paper: ROUTES :=
 paper: releases hours experiments ## The same at the paper's scale, with STUDENT, RETRIEVER and TEACHER, on releases in RELEASES

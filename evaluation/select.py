@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from train.trained import check_modes, measured
 
-    folder, trained = measured(cfg, cfg.benchmark, SftCommand, "student")
+    folder, trained = measured(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
     student, regime = trained.student, trained.train.regime
     modes = cfg.modes or default_modes(cfg, regime)
     if folder is not None:
@@ -65,12 +65,12 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 
 
 def default_modes(cfg: SelectCommand, regime: str) -> list[str]:
-    """The modes that a student was trained in; of a base, the record."""
+    """The modes that a student was trained in; of a base, the record, free and held to its form."""
     from train.trained import modes_of
 
     if cfg.model is not None:
         return modes_of(regime) or ["answer"]
-    return ["record"] if cfg.server.url is None else ["record", "constrained"]
+    return ["record", "constrained"]
 
 
 def draw_item(item, chosen, frames, path: Path) -> None:

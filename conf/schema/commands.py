@@ -258,12 +258,12 @@ class SelectCommand(CommandConfig):
     takes the student's base."""
     modes: list[str] | None = None
     """reasoning (rationale, then answer), answer (at once), record (the structured record) and
-    constrained (the record, held to its JSON schema by a server), each measured by itself; null
-    takes those that the student was trained in, and the record of a base."""
+    constrained (the record, held to its JSON schema), each measured by itself; null takes those
+    that the student was trained in, and both kinds of record of a base."""
     batch: int = 16
     """Items that pass the model at once."""
     limit: int | None = None
-    """Test items at most, spread over the cells; null takes all."""
+    """Test items at most, spread over the families; null takes all."""
     seed: int = 0
     """Of the items that `limit` leaves, of answers that are drawn, and of the scenes that are drawn
     for intervals."""
@@ -285,11 +285,6 @@ class SelectCommand(CommandConfig):
         if not given or len(set(given)) < len(given) or set(given) - set(ASKED):
             problems.append(
                 f"modes={self.modes}: give one or more of {', '.join(ASKED)}, each once"
-            )
-        if "constrained" in given and self.server.url is None:
-            problems.append(
-                "modes: constrained needs a server, which holds a model to the record's JSON "
-                "schema; give server.url=http://HOST:PORT/v1"
             )
         return problems
 
