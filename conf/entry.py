@@ -103,7 +103,8 @@ def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None
     settings = strict(cfg, schema)
     task = HydraConfig.get()
     overrides = list(task.overrides.task)
-    run = Run(run_name(settings.run, overrides), Path(os.path.relpath(task.runtime.output_dir)))
+    folder = Path(os.path.relpath(task.runtime.output_dir))
+    run = Run(run_name(settings.run, overrides), folder, tuple(overrides))
     if rank() > 0:
         logging.disable(logging.WARNING)
         # The main rank holds the folder for all.

@@ -53,6 +53,8 @@ class Run:
     name: str
     """Of the folder below checkpoints/<command>/, such as exp-cot."""
     folder: Path
+    overrides: tuple[str, ...] = ()
+    """What was typed, such as train.lr=1e-4."""
 
 
 def rank() -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +13,6 @@ from typing import Any
 
 from tqdm import tqdm
 
-from conf.runs import write_text
 from data.records import FrameRef, RetrievalQuery, SelectionItem
 from evaluation.protocol import Record, parse, read_record
 from train.generate import Written
@@ -104,28 +104,29 @@ class AnswerLog:
         self.judged = judged
         self._thing_of = {thing.name: thing for thing in things}
         read = self._read(path)
-        self.answers = {(a.item_id, a.mode): a for a, _, _ in read if a}
-        told = {row.get("key") for _, row, _ in read if "asked" in row}
-        whole = [line for _, _, line in read]
-        whole += [
+        self.answers = {(a.item_id, a.mode): a for a, _ in read if a}
+        told = {row.get("key") for _, row in read if "asked" in row}
+        heads = [
             json.dumps({"key": key, "mode": mode, "asked": asked[mode]})
             for mode, key in self.keys.items()
             if key not in told
         ]
-        write_text(path, "".join(f"{line}\n" for line in whole))
+        # What a kill tore in the midst of a line ends there.
+        torn = path.exists() and path.read_bytes()[-1:] not in (b"", b"\n")
+        self._write([*([""] if torn else []), *heads])
 
     def take_over(self, others: Iterable[Path]) -> int:
         """Keep also what other files hold of answers to the same, which are not asked again; how
         many these are."""
         before = len(self.answers)
         for path in others:
-            found = [answer for answer, _, _ in self._read(path) if answer]
+            found = [answer for answer, _ in self._read(path) if answer]
             self.append([a for a in found if (a.item_id, a.mode) not in self.answers])
         return len(self.answers) - before
 
-    def _read(self, path: Path) -> list[tuple[Kept | None, dict[str, Any], str]]:
-        """The lines of a file, each with its object and, where it is one to what is asked, the
-        answer. What a kill tore is left out: that is asked again."""
+    def _read(self, path: Path) -> list[tuple[Kept | None, dict[str, Any]]]:
+        """The objects in a file's lines, each with the answer where it is one to what is asked.
+        What a kill tore is left out: that is asked again."""
         found = []
         for line in path.read_bytes().splitlines() if path.exists() else []:
             try:
@@ -133,7 +134,7 @@ class AnswerLog:
                 thing = None if "asked" in row else self._thing_of.get(row["item_id"])
                 if thing and self._bears_key(row):
                     answer = self.judged(thing, row["mode"], Written(row["text"], row["cut"]))
-                found.append((answer, row, line.decode()))
+                found.append((answer, row))
             except (ValueError, TypeError, KeyError, AttributeError):
                 continue
         return found
@@ -142,11 +143,15 @@ class AnswerLog:
         return row["mode"] in self.keys and row["key"] == self.keys[row["mode"]]
 
     def append(self, answers: list[Kept]) -> None:
-        with open(self._path, "a") as file:
-            file.writelines(
-                json.dumps({**asdict(a), "key": self.keys[a.mode]}) + "\n" for a in answers
-            )
+        self._write([json.dumps({**asdict(a), "key": self.keys[a.mode]}) for a in answers])
         self.answers |= {(a.item_id, a.mode): a for a in answers}
+
+    def _write(self, lines: list[str]) -> None:
+        """Add lines, which no failure of the machine takes away again."""
+        with open(self._path, "a", encoding="utf-8") as file:
+            file.writelines(f"{line}\n" for line in lines)
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def _key(mode: str, asked: dict[str, Any]) -> str:

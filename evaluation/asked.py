@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,6 +104,8 @@ def model_here(
         "quantization": student.quantization,
         "precision": precision,
     }
+    if student.architecture is not None and folder is None:
+        revision["architecture"] = asdict(student.architecture)
     return Asked(_title(folder, student), revision, say)
 
 

@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     from train.trained import measured
 
-    folder, trained = measured(cfg, cfg.benchmark, ContrastiveCommand, "retriever")
+    folder, trained = measured(cfg, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides)
     preset = trained.retriever
     if cfg.index == "faiss":
         from evaluation.index import import_faiss

@@ -150,13 +150,14 @@ def written(reply: Reply, opened: bool) -> Written:
 
 
 def revision(server: ServerConfig) -> dict[str, Any]:
-    """What the first server that answers tells of `server.model`: the `root` that it was loaded
-    from, and that of the `parent` that it is an adapter of.
+    """What the servers that answer tell of `server.model`: the `root` that it was loaded from, and
+    that of the `parent` that it is an adapter of.
 
     Raises:
-        UserError: none answers, or that one does not serve the model or accept the key.
+        UserError: none answers, or one does not serve the model or accept the key, or two have
+            another one by that name.
     """
-    problems = []
+    problems, told = [], {}
     for url in server.urls:
         try:
             with openai.OpenAI(
@@ -174,8 +175,22 @@ def revision(server: ServerConfig) -> dict[str, Any]:
             )
         own = models[server.model]
         parent = models.get(own.get("parent"), {}).get("root")
-        return {"root": own.get("root"), "parent": parent}
-    raise UserError(
-        f"no server of server.url can be asked ({'; '.join(problems)}): start one, such as with "
-        "python -m teacher.serve frames=true, and run this again"
-    )
+        told[url] = {"root": own.get("root"), "parent": parent}
+    if not told:
+        raise UserError(
+            f"no server of server.url can be asked ({'; '.join(problems)}): start one, such as "
+            "with python -m teacher.serve frames=true, and run this again"
+        )
+    first, *others = told
+    for url in others:
+        if told[url] != told[first]:
+            raise UserError(
+                f"server.url: by the name {server.model} {first} has {_loaded(told[first])} and "
+                f"{url} {_loaded(told[url])}: give servers of one model"
+            )
+    return told[first]
+
+
+def _loaded(told: dict[str, Any]) -> str:
+    over = f" over {told['parent']}" if told["parent"] else ""
+    return f"{told['root']}{over}"

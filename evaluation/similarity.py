@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from train.trained import measured
 
-    folder, trained = measured(cfg, cfg.benchmark, ContrastiveCommand, "retriever")
+    folder, trained = measured(cfg, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides)
     preset = trained.retriever
 
     from data.build import ensure_benchmark

@@ -21,9 +21,9 @@ log = logging.getLogger(__name__)
 def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from train.trained import measured, modes_of
 
-    folder, trained = measured(cfg, cfg.benchmark, SftCommand, "student")
+    folder, trained = measured(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
     matched_by, frozen = measured(
-        cfg.matcher, cfg.benchmark, ContrastiveCommand, "retriever", "matcher.model"
+        cfg.matcher, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides, "matcher.model"
     )
     if frozen.retriever.late is not None:
         raise UserError(

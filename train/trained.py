@@ -18,6 +18,14 @@ from train.compatible import based
 EXPORT = "export.json"
 """Stands in a folder that `train.export` wrote, and there only."""
 
+MEASURED_BY = {
+    "student": ("temperature", "top_p", "top_k", "max_new_tokens", "max_length"),
+    "retriever": ("widths", "max_length"),
+    "train": ("precision",),
+}
+"""The settings of a run that a measurement may give otherwise, by their group: they change neither
+what was trained nor what it is shown."""
+
 Command = TypeVar("Command")
 
 
@@ -92,20 +100,41 @@ def measured(
     benchmark: BenchmarkConfig,
     schema: type[Command],
     product: str,
+    overrides: Sequence[str] = (),
     key: str = "model",
 ) -> tuple[Path | None, Any]:
     """The folder that `cfg.model` names and the settings of what was trained there, to be measured
-    on a benchmark; None and `cfg` itself, which has a preset's, where it names none.
+    on a benchmark; None and `cfg` itself, which has a preset's, where it names none. Of what the
+    user typed as `overrides`, the settings in `MEASURED_BY` hold instead of the run's.
 
     Raises:
-        UserError: what `settings_of` and `check_unseen` raise.
+        UserError: what `settings_of` and `check_unseen` raise; other settings of the model are
+            given beside the run, whose own they are.
     """
     if cfg.model is None:
         return None, cfg
     folder = Path(cfg.model)
     settings = settings_of(folder, schema, product, key)
     check_unseen(f"{key}={folder}", settings.benchmark, benchmark)
+    _lay_over(settings, cfg, product, overrides, key)
     return folder, settings
+
+
+def _lay_over(settings: Any, cfg: Any, product: str, overrides: Sequence[str], key: str) -> None:
+    above = key.removesuffix("model")
+    for override in overrides:
+        typed = override.lstrip("+~").partition("=")[0]
+        group, _, setting = typed.removeprefix(above).partition(".")
+        preset = typed == above.removesuffix(".")
+        if not preset and (not typed.startswith(above) or group not in (product, "train")):
+            continue
+        if preset or setting not in MEASURED_BY[group]:
+            free = [f"{above}{g}.{name}" for g in (product, "train") for name in MEASURED_BY[g]]
+            raise UserError(
+                f"{typed} does nothing beside {key}={cfg.model}, which is measured as it was "
+                f"trained: leave it out; what may be given is {', '.join(free)}"
+            )
+        setattr(getattr(settings, group), setting, getattr(getattr(cfg, group), setting))
 
 
 def check_unseen(model: str, trained: BenchmarkConfig, asked: BenchmarkConfig) -> None:

@@ -64,7 +64,7 @@ class StudentConfig:
     thinking: bool = False
     """Whether the model thinks before it answers. What it thinks is no answer."""
     temperature: float = 0.0
-    """At which evaluation.select draws tokens; 0 takes the likeliest one each time."""
+    """At which tokens of an answer are drawn; 0 takes the likeliest one each time."""
     top_p: float = 1.0
     """Share of the likeliest tokens that are drawn from."""
     top_k: int = 0

@@ -8,6 +8,7 @@ from fractions import Fraction
 
 import numpy as np
 
+from conf.errors import UserError
 from data.frames import Frames
 from data.records import SelectionItem
 
@@ -36,6 +37,11 @@ def media_of(item: SelectionItem, frames: Frames) -> list[Medium]:
     prefix = frames.stack(item.scene_id, shown)
     video = encode_video(prefix, frames.scene(item.scene_id).fps)
     images = [frames.array(c.scene_id, c.frame) for c in item.candidates]
+    if len({prefix[0].shape, *(image.shape for image in images)}) > 1:
+        raise UserError(
+            f"item {item.item_id} has candidates of another frame size than its prefix, which "
+            "would tell some of them apart: choose the items of the study by items=FILE, without it"
+        )
     files = padded([encode_image(pixels) for pixels in images])
     return [
         _medium(PREFIX, VIDEO, prefix[0], video),

@@ -21,6 +21,7 @@ class TalkingServer(LocalServer):
     def __init__(self, says: Callable[[dict[str, Any]], Said], port: int = 0) -> None:
         self.says = says
         self.key: str | None = None
+        self.root = "weights"
         self.asked: list[dict[str, Any]] = []
         super().__init__(Handler, port)
 
@@ -31,7 +32,7 @@ class Handler(JsonHandler):
     def get(self) -> None:
         if self.locked():
             return
-        model = {"id": "served", "object": "model", "root": "weights", "parent": None}
+        model = {"id": "served", "object": "model", "root": self.server.root, "parent": None}
         adapter = {"id": "adapter", "object": "model", "root": "lora", "parent": "served"}
         self.say(200, {"object": "list", "data": [model, adapter]})
 

@@ -16,6 +16,7 @@ from conf.schema import (
     ArchitectureConfig,
     ContrastiveCommand,
     LoraConfig,
+    MatcherConfig,
     ReportCommand,
     RetrieveCommand,
     RetrieverConfig,
@@ -100,13 +101,16 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
     # Killed in the middle of a line, it asks again only what was lost, and says the same.
     log = run.folder / "answers.jsonl"
     whole = log.read_text()
-    log.write_text(whole[: len(whole) * 2 // 3])
+    torn = whole[: len(whole) * 2 // 3]
+    log.write_text(torn)
     heads = [json.loads(line) for line in whole.splitlines()[:2]]
     known = {head["mode"]: head["asked"] for head in heads}
     assert 0 < len(AnswerLog(log, known, micro_store.selection("test")).answers) < 16
     select.main.__wrapped__(asked, run)
     assert (run.folder / "report.json").read_text() == told
-    assert sorted(log.read_text().splitlines()) == sorted(whole.splitlines())
+    assert log.read_text().startswith(f"{torn}\n")
+    lines = [*whole.splitlines(), torn.rpartition("\n")[2]]
+    assert sorted(log.read_text().splitlines()) == sorted(lines)
 
     # What is right is judged anew, and a damaged line is asked again.
     items = micro_store.selection("test")
@@ -201,6 +205,27 @@ def test_a_model_is_not_tested_on_scenes_that_it_may_have_seen(runs, micro) -> N
     check_unseen("model", release, replace(release, folder="/other", seed=1))
     with pytest.raises(UserError, match=r"may have seen scenes that .*seed=1 "):
         check_unseen("model", release, replace(release, seed=1))
+
+
+def test_what_a_run_is_asked_otherwise_is_taken_or_refused(runs, micro) -> None:
+    model = runs / "sft" / "run"
+    cfg = SelectCommand(
+        model=str(model), student=StudentConfig(name="x", temperature=0.7, frames=2)
+    )
+    typed = ("modes=[answer]", "student.temperature=0.7")
+    _, settings = measured(cfg, micro, SftCommand, "student", typed)
+    assert settings.student.temperature == 0.7
+    # What was not typed is the preset's, and not the run's.
+    assert settings.student.frames == settings_of(model, SftCommand, "student").student.frames != 2
+    for refused in ("student=qwen3_vl_8b", "student.lora.rank=8", "++train.regime=cot"):
+        with pytest.raises(UserError, match=r"does nothing beside model=.*student\.temperature"):
+            measured(cfg, micro, SftCommand, "student", (*typed, refused))
+    matcher = MatcherConfig(model=str(runs / "contrastive" / "run"))
+    given = (matcher, micro, ContrastiveCommand, "retriever")
+    measured(*given, ("student.frames=2", "matcher.model=RUN"), "matcher.model")
+    for refused in ("matcher=clip", "matcher.retriever.image_size=64"):
+        with pytest.raises(UserError, match=r"does nothing beside matcher\.model=.*matcher\.train"):
+            measured(*given, (refused,), "matcher.model")
 
 
 def test_a_torn_model_is_named(runs, tmp_path) -> None:

@@ -257,10 +257,19 @@ def test_answers_to_other_questions_stay_and_do_not_count(items, tmp_path) -> No
     assert AnswerLog(path, {"record": {"seed": 0}}, items).answers == first.answers
     assert not AnswerLog(path, {"record": {"seed": 1}}, items).answers
     assert not AnswerLog(path, {"answer": {"seed": 0}}, items).answers
-    # A line that was torn is gone, the others stay.
+    # A line that was torn ends there, the others stay.
     path.write_text(path.read_text() + '{"item_id": "')
     assert AnswerLog(path, {"record": {"seed": 0}}, items).answers == first.answers
-    assert [json.loads(line) for line in path.read_text().splitlines()]
+    assert path.read_text().endswith('{"item_id": "\n')
+
+
+def test_servers_of_two_models_by_one_name_are_told(talking) -> None:
+    one, same, other = (talking(lambda _: FULL) for _ in range(3))
+    given = replace(at(one), url=[one.url, same.url])
+    assert revision(given) == revision(at(one))
+    other.root = "others"
+    with pytest.raises(UserError, match=r"has weights and http\S+ others: give servers of one"):
+        revision(replace(given, url=[one.url, same.url, other.url]))
 
 
 def test_what_an_answer_depends_on_is_its_key() -> None:
