@@ -296,8 +296,8 @@ class RetrieveCommand(CommandConfig):
     train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
     """The preset's recipe; a measurement takes its precision alone."""
     model: str | None = None
-    """A run folder of train.contrastive, with its own retriever and recipe; null takes the
-    retriever's base."""
+    """A run folder of train.contrastive or what train.export wrote, with its own retriever and
+    recipe; null takes the retriever's base."""
     batch: int = 64
     """Queries or frames that pass the model at once."""
     index: str = "exact"
@@ -324,8 +324,8 @@ class SimilarityCommand(CommandConfig):
     train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
     """The preset's recipe; a measurement takes its precision alone."""
     model: str | None = None
-    """A run folder of train.contrastive, with its own retriever and recipe; null takes the
-    preset's model as it was released."""
+    """A run folder of train.contrastive or what train.export wrote, with its own retriever and
+    recipe; null takes the preset's model as it was released."""
     batch: int = 64
     """Prefixes or frames that pass the model at once."""
     limit: int | None = None

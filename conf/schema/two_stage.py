@@ -24,8 +24,8 @@ class MatcherConfig:
     train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
     """The preset's recipe; a measurement takes its precision alone."""
     model: str | None = None
-    """A run folder of train.contrastive, with its own retriever and recipe; null takes the preset's
-    model as it was released."""
+    """A run folder of train.contrastive or what train.export wrote, with its own retriever and
+    recipe; null takes the preset's model as it was released."""
     batch: int = 64
     """Texts or frames that pass the model at once."""
 
