@@ -40,7 +40,9 @@ def train_twice(main, settings, folder: Path, step: int = 2) -> tuple[Path, Path
     main.__wrapped__(settings, Run("whole", whole))
     killed.mkdir()
     kept = killed / f"checkpoint-{step}"
-    shutil.copytree(whole / kept.name, kept)
+    for folder in whole.glob("checkpoint-*"):
+        if int(folder.name.removeprefix("checkpoint-")) <= step:
+            shutil.copytree(folder, killed / folder.name)
     # What a kill leaves: a checkpoint without its state, and a journal past the whole one.
     torn = killed / f"checkpoint-{step + 1}"
     torn.mkdir()
