@@ -55,10 +55,14 @@ def load_late(folder: Path, **options: Any) -> MultiVectorEncoder:
     return MultiVectorEncoder._load_with_module_classes(str(folder), SAVED_AS, **options)
 
 
-def keep_projection_exact(model: MultiVectorEncoder) -> None:
-    """Keep the projection in fp32 over a base in lower precision, as adapters are: it is trained,
-    and updates of its size vanish in bf16's steps."""
+def keep_late_exact(model: MultiVectorEncoder) -> None:
+    """Keep what follows a base of lower precision in fp32: the projection, as adapters are, since
+    updates of its size vanish in bf16's steps; and the distances by which tokens are pooled, which
+    the library cannot read where autocast on a CPU makes them bf16."""
     model[1].float().register_forward_pre_hook(widen)
+    for module in model:
+        if isinstance(module, HierarchicalTokenPooling):
+            module.pool_one = torch.autocast("cpu", enabled=False)(module.pool_one)
 
 
 def widen(_: nn.Module, given: tuple[dict[str, Any]]) -> None:

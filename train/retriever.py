@@ -44,7 +44,7 @@ from train.compatible import (
     is_retriever,
 )
 from train.conversation import clip_of
-from train.late import keep_projection_exact, late_modules, load_late
+from train.late import keep_late_exact, late_modules, load_late
 from train.ranks import from_main
 from train.tiny import build_model, build_processor
 from train.trained import EXPORT
@@ -103,7 +103,7 @@ def load_retriever(
     }
     if cfg.late is not None:
         model = MultiVectorEncoder(modules=late_modules(backbone, cfg.late), **whole)
-        keep_projection_exact(model)
+        keep_late_exact(model)
     else:
         pooling = Pooling(backbone.get_embedding_dimension(), pooling_mode="lasttoken")
         model = SentenceTransformer(modules=[backbone, pooling, Normalize()], **whole)
@@ -186,7 +186,7 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
     try:
         if cfg.late is not None:
             model = load_late(folder, **options)
-            keep_projection_exact(model)
+            keep_late_exact(model)
         else:
             model = SentenceTransformer(str(folder), **options)
     except UNREADABLE as error:

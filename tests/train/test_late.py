@@ -269,6 +269,20 @@ def test_the_projection_is_trained_in_fp32_over_a_bf16_base(
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(FRAME))
 
 
+@pytest.mark.parametrize("pool", [1, 2, 4])
+def test_tokens_are_pooled_in_bf16_as_in_fp32(
+    micro_store, late_cfg, queries, frames, tmp_path, pool
+) -> None:
+    cfg = replace(late_cfg, late=LateConfig(width=24, pool=pool))
+    model = load(cfg, micro_store, tmp_path)
+    shown = [frame_input(queries[0].target, frames)]
+    (exact,) = model.encode_document(shown)
+    with torch.autocast("cpu", torch.bfloat16):
+        (vectors,) = model.encode_document(shown)
+    assert vectors.shape == exact.shape == (FRAME // pool, 24)
+    assert vectors.isfinite().all()
+
+
 def test_the_audit_shows_what_is_scored(model, late_cfg, queries, frames) -> None:
     told = audit_retriever(model, late_cfg, queries[0], frames)
     length = len(model.tokenizer(queries[0].question, add_special_tokens=False).input_ids)
