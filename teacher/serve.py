@@ -173,7 +173,10 @@ def vllm_arguments(
         arguments += ["--lora-modules", f"adapter={Path(cfg.adapter).absolute()}"]
     if not machine.cards:
         cache = round(cfg.cache_gb * 2**30)
-        return [*arguments, "--enforce-eager", "--kv-cache-memory-bytes", str(cache)]
+        arguments += ["--enforce-eager", "--kv-cache-memory-bytes", str(cache)]
+        # Of a part of a prompt a token is drawn and taken back, which ends a server without a GPU
+        # where a request has a seed of its own (vLLM 0.32): no prompt is read in parts.
+        return [*arguments, "--no-enable-chunked-prefill"]
     if (cfg.cards or 1) > machine.cards:
         raise UserError(f"cards={cfg.cards}: vLLM finds {machine.cards} on this machine")
     # A model's heads divide by powers of two.

@@ -126,6 +126,30 @@ def test_a_served_model_is_measured_by_records(server, cfg, micro, micro_store, 
         assert names == sorted(names, key=row["text"].index)
 
 
+def test_answers_are_drawn_many_at_a_time_each_by_its_own_seed(
+    server, cfg, micro, micro_store, tmp_path
+) -> None:
+    drawn = replace(cfg, temperature=0.7, max_new_tokens=16)
+    asked = SelectCommand(
+        benchmark=micro, student=drawn, store=str(micro_store.folder.parent), modes=["answer"],
+        server=ServerConfig(url=server.url, model="tiny", patience=5),
+    )  # fmt: skip
+
+    def answers(name: str, **settings: object) -> dict[str, str]:
+        folder = tmp_path / name
+        folder.mkdir()
+        select.main.__wrapped__(replace(asked, **settings), Run(name, folder))
+        rows = [json.loads(line) for line in (folder / "answers.jsonl").read_text().splitlines()]
+        return {row["item_id"]: row["text"] for row in rows if "item_id" in row}
+
+    texts = answers("first")
+    # As many as it is asked at once, whose prompts are longer together than one step reads.
+    assert len(texts) >= asked.server.concurrency
+    assert len(set(texts.values())) > len(texts) // 2
+    assert answers("again") == texts
+    assert answers("other", seed=1) != texts
+
+
 def test_a_server_answers_as_the_student_whose_adapters_it_has(
     server, cfg, base, merged, micro_store
 ) -> None:
