@@ -76,7 +76,7 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
     check_reachable("retriever", preset.image_model, "image_model")
     video_config = _config(preset.model, preset.revision, "model")
     times = getattr(video_config.vision_config, "num_frames", None)
-    if not getattr(video_config.vision_config, "add_time_attn", False):
+    if not _is_of_videos(video_config):
         raise UserError(
             f"retriever.model={preset.model} has no attention over time: give a LanguageBind model "
             "of videos that was tuned whole, such as LanguageBind/LanguageBind_Video_FT"
@@ -87,6 +87,11 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
             f"give retriever.frames={times}"
         )
     image_config = _config(preset.image_model, preset.image_revision, "image_model")
+    if _is_of_videos(image_config):
+        raise UserError(
+            f"retriever.image_model={preset.image_model} attends over time: give a LanguageBind "
+            "model of images, such as LanguageBind/LanguageBind_Image"
+        )
     check_size(preset, video_config)
     check_size(preset, image_config)
     try:
@@ -125,6 +130,10 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
 def spread(there: int, wanted: int) -> list[int]:
     """`wanted` of the numbers below `there`, evenly; some of them again where there are fewer."""
     return [int(k) for k in np.linspace(0, there - 1, wanted).round()]
+
+
+def _is_of_videos(config: CLIPConfig) -> bool:
+    return getattr(config.vision_config, "add_time_attn", False)
 
 
 def _config(source: str, revision: str | None, key: str) -> CLIPConfig:

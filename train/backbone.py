@@ -120,6 +120,8 @@ def load_failure(group: str, model: str, error: Exception, key: str = "model") -
     first = next(iter(str(error).strip().splitlines()), type(error).__name__)
     if Path(model).is_dir():
         return UserError(f"{group}.{key}={model} cannot be loaded from that folder: {first}")
+    if Path(model).is_absolute() or model.startswith("."):
+        return UserError(f"{group}.{key}={model}: there is no such folder; give the one it is in")
     return UserError(
         f"{group}.{key}={model} is not on this machine and cannot be fetched: there is no "
         f"folder of that name, and the hub's cache does not hold it. Point at a local copy with "

@@ -293,6 +293,8 @@ def test_a_model_that_lacks_a_part_is_told(damage, said, presets, tmp_path) -> N
         ("languagebind", {"frames": 12}, "give retriever.frames=4"),
         ("languagebind", {"image_model": "no/such"}, r"retriever\.image_model=no/such is not on"),
         ("languagebind", {"image_model": "siglip2"}, "retriever.image_model="),
+        ("languagebind", {"image_model": "languagebind"}, "attends over time: give .* of images"),
+        ("clip", {"model": "./no/such"}, "retriever.model=./no/such: there is no such folder"),
     ],
 )  # fmt: skip
 def test_a_model_of_another_kind_is_told(kind, changes, said, presets) -> None:
