@@ -73,6 +73,13 @@ def _named(root: Path, pattern: str, finished: Sequence[Path]) -> list[Path]:
     if chosen:
         return sorted(chosen)
     if folders:
+        kind, *name = folders[0].relative_to(root).parts
+        if kind == "study" and name:
+            raise UserError(
+                f"runs: {folders[0]} holds votes that are not counted yet: run python -m "
+                f"evaluation.study.export run={'/'.join(name)}, and name its run below "
+                f"{root / 'export_study'}"
+            )
         raise UserError(
             f"runs: {folders[0]} is no finished run of an evaluation or of training: run its "
             "command again to go on with it, or name another one"
