@@ -20,6 +20,7 @@ from evaluation.answers import AnswerLog, Told, as_told, ask_all
 from evaluation.asked import Asked, SampleOf, known_by
 from evaluation.drawn import short_hash
 from teacher.sections import SECTIONS, parts
+from train.choice import without_thought
 
 TEXTS = "texts"
 """Folder of them in a store."""
@@ -108,8 +109,7 @@ def foreseen(text: str) -> str:
 
 
 def _said(text: str) -> str:
-    said = text.rpartition("</think>")[2]
-    return "" if "<think>" in said else said.strip()
+    return (without_thought(text) or "").strip()
 
 
 def _sections(said: str) -> list[str]:

@@ -65,9 +65,13 @@ _BETWEEN = frozenset(
 )
 
 _UNSEEN = re.compile("[\u200b-\u200f\u2060\ufeff]")
+_THOUGHT_OPENS = re.compile(r"[<◁]think(?:ing)?[>▷]", re.IGNORECASE)
+_THOUGHT_ENDS = re.compile(r"[<◁]/think(?:ing)?[>▷]", re.IGNORECASE)
 _LATEX = re.compile(r"\\(?:boxed|text(?:bf|rm|tt)?|math(?:bf|rm|tt)|displaystyle)(?![a-z])")
-_EMPTY = frozenset(("", "null"))
-_DECLINES = frozenset(("none", "n/a", "na", "nil", "no", "neither", "unknown", "unsure", "abstain"))
+_DECLINES = frozenset(
+    ("none", "null", "n/a", "na", "nil", "no", "neither", "unknown", "unsure", "abstain", "refuse",
+     "refused", "decline", "declined", "pass")
+)  # fmt: skip
 _REFUSAL = re.compile(
     r"(?:can\s?not|can'?t|unable to|impossible to|hard to|not able to)\s+(?:be\s+)?"
     r"(?:reliably\s+)?(?:determine|tell|answer|decide|choose|select|pick|identify|say|know|see|view|"
@@ -78,7 +82,14 @@ _REFUSAL = re.compile(
 )
 _DENIAL = re.compile(
     r"none of|\bor none\b|no (?:correct|valid|suitable) (?:answer|option|choice|candidate|image)|"
-    r"\bwait\b|can\s?not be determined|\b(?:that|this|it)(?:'s| is) (?:wrong|incorrect|not right)",
+    r"\bwait\b|can\s?not be determined|\b(?:that|this|it)(?:'s| is) (?:wrong|incorrect|not right)|"
+    r"i'?m sorry|i am sorry|refuse to|\b(?:i|we) (?:can\s?not|can'?t|do not|don'?t|could not) "
+    r"(?:reliably )?(?:determine|tell|say|decide|know|answer|choose|select|pick|identify|help)\b|"
+    r"(?:impossible|unable|not able) to (?:determine|tell|say|decide|know|answer|choose|select|"
+    r"pick|identify)\b|(?:not enough|insufficient) (?:information|evidence|data)|"
+    r"^\W*(?:(?:which|that|this|it)\s+)?(?:(?:is|was|seems|looks|would be)\s+)?"
+    r"(?:no|nope|not|wrong|incorrect|false|impossible|rejected|excluded|eliminated|ruled out|"
+    r"not (?:it|right|correct|possible|valid|the answer))\s*(?:$|[.,;:!?])",
     re.IGNORECASE,
 )
 """Takes back a letter that was said before it."""
@@ -111,9 +122,8 @@ def parse(raw: str, letters: str = LETTERS, cut: bool = False) -> Choice:
         cut: whether the model was stopped before its output's end, so that the last word may be a
             part of one.
     """
-    text = _UNSEEN.sub("", unicodedata.normalize("NFKC", raw))
-    text = text.rpartition("</think>")[2]
-    if "<think>" in text:
+    text = without_thought(_UNSEEN.sub("", unicodedata.normalize("NFKC", raw)))
+    if text is None:
         return Choice(None, Reason.CUT_OFF)
     found, prose, flag, whole = _records(text)
     if found:
@@ -126,6 +136,12 @@ def parse(raw: str, letters: str = LETTERS, cut: bool = False) -> Choice:
     if choice.reason is Reason.NO_ANSWER and cut:
         return Choice(None, Reason.CUT_OFF)
     return choice
+
+
+def without_thought(text: str) -> str | None:
+    """What follows an output's last thought; None where one is not closed."""
+    said = _THOUGHT_ENDS.split(text)[-1]
+    return None if _THOUGHT_OPENS.search(said) else said
 
 
 def _told(prose: str, letters: str, cut: bool) -> Choice:
@@ -260,7 +276,7 @@ def _bare(value: str) -> str:
 def _read(value: str, letters: str) -> Choice:
     """The letter that a short statement chooses."""
     value = _bare(value)
-    if value.lower() in _EMPTY:
+    if not value:
         return Choice(None, Reason.NO_ANSWER)
     if value.lower() in _DECLINES:
         return Choice(None, Reason.REFUSAL)
@@ -292,6 +308,6 @@ def _lone(text: str, letters: str) -> Choice:
         refused = _REFUSAL.search(value)
         return Choice(None, Reason.REFUSAL if refused else Reason.NO_ANSWER)
     choice, one = _read(value, letters), _ONE.fullmatch(value)
-    if choice.letter and one["rest"].strip(" .,:;!?。"):
+    if choice.letter and one["rest"].strip(" .,;!?。"):
         return Choice(None, Reason.NO_ANSWER)
     return choice
