@@ -10,7 +10,7 @@ import numpy as np
 from conf.schema import RetrieverConfig
 from data.records import LETTERS, SelectionItem
 from evaluation.cache import Embeddings
-from evaluation.metrics import expected_hits, ranks_of
+from evaluation.metrics import expected_hits, gold_scores, ranks_of
 from evaluation.ranking import Cut, pair_scores
 
 
@@ -38,9 +38,10 @@ def candidate_scores(
 
 def credits(scores: np.ndarray, answers: Sequence[int]) -> np.ndarray:
     """(items,) 1 where the right candidate scores highest, 1/m where it is one of m that do, else
-    0."""
-    greater, tied = ranks_of(scores, np.asarray(answers))
-    return expected_hits(greater, tied, np.ones(len(scores), bool), 1)
+    0, as where its score is NaN."""
+    answers = np.asarray(answers)
+    greater, tied = ranks_of(scores, answers)
+    return expected_hits(greater, tied, ~np.isnan(gold_scores(scores, answers)), 1)
 
 
 def told(name: str, items: Sequence[SelectionItem], scores: np.ndarray) -> list[str]:

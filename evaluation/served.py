@@ -124,8 +124,9 @@ def request_of(cfg: StudentConfig, mode: str, clip: Clip | None) -> Request:
     }
     if clip:
         extra["media_io_kwargs"] = {"video": {"num_frames": -1, **clip.metadata}}
-    if cfg.top_k:
-        extra["top_k"] = cfg.top_k
+    if cfg.temperature:
+        # Left out, a server takes the bound of the model's own generation_config.json.
+        extra["top_k"] = cfg.top_k or -1
     request = {
         "temperature": cfg.temperature,
         "top_p": cfg.top_p,

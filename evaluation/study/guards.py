@@ -70,7 +70,7 @@ class Guard:
         origin = headers.get("origin")
         if origin is None:
             return headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none")
-        asked = f"{urlsplit(origin).scheme}://{headers.get('host', '')}"
+        asked = f"{origin.partition(':')[0]}://{headers.get('host', '')}"
         return _site(origin) not in {_site(asked), self._public} - {None}
 
 

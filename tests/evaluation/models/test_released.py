@@ -249,8 +249,8 @@ def test_a_tie_is_no_choice() -> None:
     chosen = nearest.letters(scores)
     assert chosen[:6] == ["A"] * 5 + [None]
     # What is chosen is right where the credit is whole.
-    credits = nearest.credits(scores, answers)[6:]
-    right = [c == LETTERS[a] for c, a in zip(chosen[6:], answers[6:], strict=True)]
+    credits = nearest.credits(scores, answers)
+    right = [c == LETTERS[a] for c, a in zip(chosen, answers, strict=True)]
     assert right == (credits == 1).tolist()
 
 

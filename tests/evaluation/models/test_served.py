@@ -102,6 +102,13 @@ def test_a_model_is_held_to_the_schema_and_draws_by_seeds(items, frames, talking
     assert len(set(seeds[0])) == 2
 
 
+def test_no_bound_is_asked_for_as_such(items, frames, talking) -> None:
+    server = talking(lambda _: "B")
+    unbound = replace(STUDENT, temperature=0.7, top_p=1.0, top_k=0)
+    asker(at(server), frames, unbound)(items[:1], lambda _: None)
+    assert (server.asked[0]["top_p"], server.asked[0]["top_k"]) == (1.0, -1)
+
+
 def test_a_control_hides_the_clip(items, frames, talking) -> None:
     server = talking(lambda _: "B")
     asker(at(server), frames, control="candidate_only")(items[:1], lambda _: None)

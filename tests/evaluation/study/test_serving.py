@@ -303,6 +303,7 @@ def test_another_sites_forms_are_refused(visitor) -> None:
     for headers in (
         {"Origin": "http://evil.example"},
         {"Origin": "null"},
+        {"Origin": "http://["},
         {"Origin": f"https://127.0.0.1:{visitor.port + 1}"},
         {"Sec-Fetch-Site": "cross-site"},
         {"Sec-Fetch-Site": "same-site"},
@@ -318,7 +319,8 @@ def test_another_sites_forms_are_refused(visitor) -> None:
     [("https://study.example.org", 200), ("https://study.example.org:443", 200),
      ("http://study.example.org", 403), ("https://study.example.org:8443", 403),
      ("https://study.example.org.evil.example", 403), ("https://:443", 403),
-     ("https://study.example.org:x", 403), ("http://INSIDE:8000", 200)],
+     ("https://study.example.org:x", 403), ("http://INSIDE:8000", 200), ("http://[", 403),
+     ("", 403), (":", 403)],
 )  # fmt: skip
 def test_forms_come_back_to_the_public_address_however_it_is_written(origin, status) -> None:
     told = []
