@@ -302,19 +302,28 @@ def index_table(indexes: Sequence[dict[str, Any]]) -> Table:
     )
 
 
+def majority_cells(name: str, found: dict[str, Any]) -> list[list[str]]:
+    """The majority vote of what `evaluation.study.agreement.summary` found, under
+    `SELECTION_HEAD`; nothing where there is none."""
+    if not found["majority"]:
+        return []
+    rows = _human_cells(name, found["majority"])
+    return [[*row[:-1], parsed, row[-1]] for row, parsed in zip(rows, ("-", ""), strict=True)]
+
+
+def _human_cells(name: str, of: dict[str, Any]) -> list[list[str]]:
+    each = [Interval(**told) if (told := of["families"].get(f)) else None for f in FAMILIES]
+    micro = Interval(**of["micro"])
+    shares = [*(i and i.value for i in each), of["macro"], micro.value]
+    spans = [*map(interval_cell, each), "", interval_cell(micro)]
+    return [[name, *map(_percent, shares), str(micro.n)], ["  95% interval", *spans, ""]]
+
+
 def human_table(found: dict[str, Any]) -> Table:
     """What `evaluation.study.agreement.summary` found, beside the paper's study."""
-
-    def rows(name: str, of: dict[str, Any]) -> list[list[str]]:
-        each = [Interval(**told) if (told := of["families"].get(f)) else None for f in FAMILIES]
-        micro = Interval(**of["micro"])
-        shares = [*(i and i.value for i in each), of["macro"], micro.value]
-        spans = [*map(interval_cell, each), "", interval_cell(micro)]
-        return [[name, *map(_percent, shares), str(micro.n)], ["  95% interval", *spans, ""]]
-
-    own = [row for name, of in found["accuracy"].items() for row in rows(name, of)]
+    own = [row for name, of in found["accuracy"].items() for row in _human_cells(name, of)]
     if found["majority"]:
-        own += rows("Majority vote", found["majority"])
+        own += _human_cells("Majority vote", found["majority"])
     for clock in ("server", "client"):
         times = [found["seconds"].get(f, {}).get(clock) for f in FAMILIES]
         shown = ["-" if t is None else f"{t:.1f}" for t in times]

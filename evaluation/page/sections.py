@@ -63,7 +63,7 @@ def sections_of(
     plain = [m for m in choices if not m.ways]
     every = [m for m in ranks if m.row.builder is None]
     found = [
-        zero_shot(plain, every, folder),
+        zero_shot(plain, every, [run for run in runs if run.kind in STUDIES], folder),
         distillation(plain, every, apart, folder),
         ablation(plain),
         transfer(plain, apart, folder),
@@ -76,12 +76,18 @@ def sections_of(
     return [s for s in found if s.tables or s.figures or s.details]
 
 
-def zero_shot(choices: Sequence[Measured], ranks: Sequence[Measured], folder: Path) -> Section:
+def zero_shot(
+    choices: Sequence[Measured],
+    ranks: Sequence[Measured],
+    studies: Sequence[Finished],
+    folder: Path,
+) -> Section:
     section = Section("Zero-shot")
     abroad = transfers(choices)
     for benchmark, rows in by_items(m for m in choices if not m.trained).items():
         if benchmark not in abroad:
-            section.tables.append(shaped.selection_zero_shot(benchmark, rows))
+            asked = [run for run in studies if run.report.get("benchmark") == benchmark]
+            section.tables.append(shaped.selection_zero_shot(benchmark, rows, asked))
             section.figures.append(_families(folder, "zero-shot", rows, True))
     for benchmark, rows in by_items(m for m in ranks if not m.trained).items():
         section.tables.append(shaped.retrieval_zero_shot(benchmark, widest(rows)))

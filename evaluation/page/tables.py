@@ -10,7 +10,7 @@ from conf.sweep import AT_START
 from evaluation import paper
 from evaluation.formats import Best, Table
 from evaluation.metrics import Interval
-from evaluation.page.gathering import Finished
+from evaluation.page.gathering import Finished, unreadable
 from evaluation.page.rows import SUITES, Measured
 from evaluation.rows import SIMILARITY
 from evaluation.tables import (
@@ -19,6 +19,7 @@ from evaluation.tables import (
     SELECTION_HEAD,
     SELECTION_NOTE,
     interval_cell,
+    majority_cells,
     retrieval_cells,
     retrieval_references,
     selection_cells,
@@ -44,8 +45,17 @@ BOLD = "Bold: the best of a column, of what was measured here and of the paper's
 NO_MODELS = (paper.CHANCE.name, paper.HUMAN_MAJORITY.name)
 
 
-def selection_zero_shot(benchmark: str, rows: Sequence[Measured]) -> Table:
-    """The paper's Table 2."""
+PEOPLE = "people, on the items of their study"
+
+
+def selection_zero_shot(
+    benchmark: str, rows: Sequence[Measured], studies: Sequence[Finished]
+) -> Table:
+    """The paper's Table 2, with the majority votes of studies of the benchmark.
+
+    Raises:
+        UserError: what a study exported is of another version.
+    """
     reference = {
         "": (paper.CHANCE, paper.HUMAN_MAJORITY),
         ": similarity scorers": paper.SELECTION_SIMILARITY,
@@ -54,12 +64,20 @@ def selection_zero_shot(benchmark: str, rows: Sequence[Measured]) -> Table:
     parts = {
         "similarity scorers": selection_cells([m.row for m in rows if m.row.mode == SIMILARITY]),
         "generative models": selection_cells([m.row for m in rows if m.row.mode != SIMILARITY]),
+        PEOPLE: [row for study in studies for row in _majority(study)],
         **{f"paper, Table 2{k}": selection_references(told) for k, told in reference.items()},
     }
     head = [f"Zero-shot, {benchmark}", *SELECTION_HEAD]
     told = _with_best(head, _told(parts), SELECTION_BEST)
     caption = f"Zero-shot selection accuracy (%) on {benchmark}"
     return Table(f"selection-{benchmark}", caption, head, told, (SELECTION_NOTE, BOLD))
+
+
+def _majority(study: Finished) -> Rows:
+    try:
+        return majority_cells(f"Majority vote, {study.name}", study.report)
+    except (KeyError, TypeError) as error:
+        raise unreadable(study.folder) from error
 
 
 def selection_distilled(benchmark: str, rows: Sequence[Measured]) -> Table:
@@ -218,9 +236,8 @@ def _with_best(
     what was measured, and among the paper's."""
     parts = {label: [list(row) for row in rows] for label, rows in parts.items()}
     for printed in (False, True):
-        of = [
-            r for label, rows in parts.items() if label.startswith("paper") is printed for r in rows
-        ]
+        chosen = [r for k, r in parts.items() if k.startswith("paper") is printed and k != PEOPLE]
+        of = [row for rows in chosen for row in rows]
         models = [row for row in of if not row[0].startswith("  ") and row[0] not in NO_MODELS]
         for place, name in enumerate(head):
             if name in best:
