@@ -138,6 +138,15 @@ def model_served(
             folder,
         )
     weights = product_folder(folder, "student") if folder else None
+    seen = told["parent"] or told["root"]
+    if seen is None or not Path(seen).is_dir():
+        log.info(
+            "of %s the server tells its name alone (%s): once that stands for other weights, give "
+            "their commit as student.revision=COMMIT, or the answers so far are taken for theirs",
+            server.model,
+            seen,
+        )
+    told["revision"] = student.revision
     told["weights"] = compatible.weights_digest(told["root"], told["parent"], weights)
     told["processor"] = compatible.processor_digest(told["parent"] or told["root"])
 

@@ -221,6 +221,16 @@ def test_what_is_served_is_told_apart(talking) -> None:
         revision(at(server))
 
 
+def test_what_a_server_cannot_tell_of_its_weights_the_user_can(talking, caplog) -> None:
+    caplog.set_level("INFO")
+    cfg = SelectCommand(student=STUDENT, server=at(talking(lambda _: FULL)))
+    plain, committed = (
+        model_served(cfg, None, replace(STUDENT, revision=rev)).revision for rev in (None, "c0ffee")
+    )
+    assert plain != committed
+    assert "of served the server tells its name alone (weights)" in caplog.text
+
+
 def test_a_server_is_given_its_key(items, frames, talking, tmp_path, monkeypatch) -> None:
     server = talking(lambda _: FULL)
     server.key = "secret"
