@@ -153,7 +153,7 @@ def builders_figure(
     handles, labels = left.get_legend_handles_labels()
     figure.legend(
         handles[::-1], labels[::-1], loc="outside right center", fontsize=9, frameon=False,
-        title=textwrap.fill(name, 18), title_fontsize=9,
+        title=literal(textwrap.fill(name, 18)), title_fontsize=9,
     )  # fmt: skip
     figure.savefig(path)
 
@@ -234,6 +234,11 @@ def _number(axes: Axes, x: float, y: float, value: float) -> None:
     axes.text(x, y + 1.5, f"{value:.0f}", ha="center", va="bottom", fontsize=9, color=INK)
 
 
+def literal(name: str) -> str:
+    """A name as text to draw, in which a dollar sign begins no formula."""
+    return name.replace("$", r"\$")
+
+
 def legend_above(figure: Figure, axes: Axes) -> None:
     """A legend above the plot, where it covers nothing."""
     handles, labels = axes.get_legend_handles_labels()
@@ -241,7 +246,7 @@ def legend_above(figure: Figure, axes: Axes) -> None:
     order = sorted(range(len(labels)), key=lambda i: labels[i].startswith("paper"))
     figure.legend(
         [handles[i] for i in order],
-        [labels[i] for i in order],
+        [literal(labels[i]) for i in order],
         loc="outside upper left",
         ncols=2,
         fontsize=9,

@@ -152,7 +152,7 @@ def _shown(row: Iterable[str], written: Callable[[str], str], bold: str) -> list
 
 def _plain(text: str) -> str:
     """Text that Markdown shows as it is."""
-    return re.sub(r"([\\`*_\[\]<>|~#&])", r"\\\1", text.strip())
+    return re.sub(r"([\\`*_\[\]<>|~#&$])", r"\\\1", text.strip())
 
 
 def _ampersands(row: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from data.records import LETTERS
 from evaluation import paper
-from evaluation.figures import FAINT, INK, color_of, legend_above
+from evaluation.figures import FAINT, INK, color_of, legend_above, literal
 from evaluation.metrics import Interval, wilson
 from evaluation.rows import UNTRAINED
 from train.plots import COLORS, empty_figure
@@ -153,7 +153,7 @@ def confusion_figure(found: Mapping[str, np.ndarray], path: Path) -> None:
         axes.set_ylim(len(LETTERS) - 0.5, -0.5)
         axes.tick_params(length=0)
         axes.spines[:].set_visible(False)
-        axes.set_title(name if len(name) < 34 else f"{name[:32]}…", fontsize=9)
+        axes.set_title(literal(name if len(name) < 34 else f"{name[:32]}…"), fontsize=9)
         axes.set_xlabel("chosen", fontsize=9)
         axes.set_ylabel("right", fontsize=9)
     figure.savefig(path)

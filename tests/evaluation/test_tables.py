@@ -2,6 +2,7 @@ import json
 from dataclasses import replace
 from types import SimpleNamespace
 
+import matplotlib
 import numpy as np
 import pytest
 from PIL import Image
@@ -22,6 +23,7 @@ from evaluation.metrics import (
     query_measures,
     wilson,
 )
+from evaluation.page.plots import confusion_figure, recall_figure
 from evaluation.ranking import Ranks
 from evaluation.rows import RECALLS, UNTRAINED, RetrievalRow, SelectionRow
 from evaluation.tables import (
@@ -249,6 +251,17 @@ def test_figures_are_written(selection_rows, retrieval_rows, ranks, queries, tmp
         with Image.open(path) as image:
             assert image.width > 800
     assert len(list(tmp_path.iterdir())) == 8
+
+
+def test_a_dollar_in_a_name_begins_no_formula(tmp_path):
+    name = r"run $\frac$"
+    with matplotlib.rc_context({"svg.fonttype": "none"}):
+        recall_figure(
+            [{"name": name, "ks": [1, 10], "recalls": [0.1, 0.5]}], tmp_path / "recall.svg"
+        )
+        confusion_figure({name: np.eye(4, 5)}, tmp_path / "confusion.svg")
+    for path in tmp_path.iterdir():
+        assert f">{name}<" in path.read_text()
 
 
 def test_the_frame_says_what_was_right(tmp_path):
