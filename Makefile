@@ -57,7 +57,6 @@ SUITES := standin_movi_a standin_physion
 ZERO_SHOT := modes=[reasoning,answer]
 # An encoder of about a million weights matches nothing before it is trained.
 MATCHER := matcher.model=checkpoints/contrastive/$(RETRIEVED)
-ROUTES := routes=[cot_text,predict_image]
 
 paper-tiny: experiments ## Every experiment of the paper at tiny scale, transfer to stand-in suites, and the report
 
@@ -76,7 +75,6 @@ paper: FOLDER = benchmark.folder=$(RELEASES)/$$s
 # The record is the headline; the modes of students are what these are held against.
 paper: ZERO_SHOT := modes=[record,constrained,reasoning,answer]
 paper: MATCHER := matcher=$(RETRIEVER)
-paper: ROUTES :=
 paper: releases hours experiments ## The same at the paper's scale, with STUDENT, RETRIEVER and TEACHER, on releases in RELEASES
 
 experiments: setup
@@ -92,7 +90,7 @@ experiments: setup
 	$(PY) train.contrastive $(BENCHMARK) $(EMBEDDER) run=$(RETRIEVED)
 	$(PY) evaluation.retrieve $(BENCHMARK) model=checkpoints/contrastive/$(RETRIEVED)
 	$(PY) evaluation.similarity $(BENCHMARK) model=checkpoints/contrastive/$(RETRIEVED)
-	$(PY) evaluation.two_stage $(BENCHMARK) $(BASE) $(MATCHER) $(ROUTES)
+	$(PY) evaluation.two_stage $(BENCHMARK) $(BASE) $(MATCHER)
 	$(PY) evaluation.two_stage $(BENCHMARK) model=checkpoints/sft/$(RUNS)cot $(MATCHER)
 	$(PY) evaluation.report
 
