@@ -183,7 +183,8 @@ def embed_texts(embedder: Embedder, texts: Iterable[str], store: Store, batch: i
     """The embeddings of texts that stand for a query by themselves, by the text. Errors are those
     of `embed_queries`."""
     about = {"instruction": embedder.preset.query_instruction}
-    things = {text: text for text in sorted(set(texts))}
+    # Those of one length together, so that few are padded; where memory runs out, it is at once.
+    things = {text: text for text in sorted(set(texts), key=lambda text: (-len(text), text))}
     return _embedded(embedder, "text", about, things, lambda e, some: e.texts(some), store, batch)
 
 

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from train.retriever import Retriever
 
 Query = RetrievalQuery | SelectionItem
+PAIRS = 64 * 512**2
+"""Pairs of tokens at most in the attention mask of texts that pass a model at once: 64 texts of 512
+tokens, which is as long as a model writes by default. What a tokenizer has never seen it splits
+into many more, and the mask of 64 such texts takes many GB."""
 
 
 class Encoder(Protocol):
@@ -56,7 +60,11 @@ class JointEncoder:
         return self._pictures([Image.fromarray(pixels) for pixels in shown])
 
     def texts(self, texts: list[str]) -> np.ndarray:
-        return self._embedded(texts, self._preset.query_instruction, "query")
+        longest = max(map(len, self._model.tokenizer(texts)["input_ids"]))
+        some = max(1, PAIRS // max(1, longest) ** 2)
+        instruction = self._preset.query_instruction
+        parts = [texts[k : k + some] for k in range(0, len(texts), some)]
+        return np.concatenate([self._embedded(part, instruction, "query") for part in parts])
 
     def _pictures(self, shown: list[Image.Image]) -> np.ndarray:
         return self._embedded(shown, self._preset.frame_instruction, "frame")

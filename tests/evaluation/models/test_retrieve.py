@@ -28,7 +28,7 @@ from conf.schema import (
 )
 from data.frames import Frames
 from data.store import open_store
-from evaluation import retrieve
+from evaluation import encoders, retrieve
 from evaluation.embedding import EMBEDDINGS, embed_frames, embed_queries, embedders
 from evaluation.metrics import metrics_from_counts, rank_metrics
 from train import retriever
@@ -290,3 +290,19 @@ def test_one_with_an_edited_processor_is_another(
         path.write_text(path.read_text() + "\n")
     changed = [now != then for now, then in zip(keys(), before, strict=True)]
     assert changed == [another, another]
+
+
+@pytest.mark.slow
+def test_long_texts_pass_a_few_at_a_time_and_come_to_the_same(saved, micro_store, monkeypatch):
+    texts = ["The red cube rests.", *(f"{'It moves on. ' * k}" for k in (40, 3, 1, 20, 2))]
+    (trained, _) = embedders(saved, CFG, "fp32", micro_store, saved)
+    encoder = trained.load()
+    whole, passed = encoder.texts(texts), []
+    plain = encoder._embedded
+    monkeypatch.setattr(encoder, "_embedded", lambda *a: passed.append(a[0]) or plain(*a))
+    longest = max(map(len, encoder._model.tokenizer(texts)["input_ids"]))
+    for pairs, parts in ((3 * longest**2, [3, 3]), (1, [1] * 6), (6 * longest**2, [6])):
+        monkeypatch.setattr(encoders, "PAIRS", pairs)
+        passed.clear()
+        np.testing.assert_allclose(encoder.texts(texts), whole, atol=1e-5)
+        assert [len(some) for some in passed] == parts
