@@ -152,7 +152,7 @@ CASES = [
     ("Answer: not B", None, NO),
     ("Answer: <letter>", None, NO),
     ("Second choice: C", None, NO),
-    ('{"choice": null}', None, NO),
+    ('{"choice": null}', None, REF),
     ('{"choice": ""}', None, NO),
     ('{"choice": "<letter>"}', None, NO),
     ('{"choice": "framed"}', None, NO),
