@@ -148,7 +148,7 @@ def model_served(
         )
     told["revision"] = student.revision
     told["weights"] = compatible.weights_digest(told["root"], told["parent"], weights)
-    told["processor"] = compatible.processor_digest(told["parent"] or told["root"])
+    told["processor"] = compatible.processor_digest(seen)
 
     def say(mode: str, sample_of: SampleOf) -> Say:
         def answer(things: list[Thing], keep: Keep) -> None:

@@ -80,13 +80,13 @@ _REFUSAL = re.compile(
     r"(?:answer|option|choice|candidate|image)",
     re.IGNORECASE,
 )
+_SETTLE = r"(?:determine|tell|say|decide|know|answer|choose|select|pick|identify)\b"
 _DENIAL = re.compile(
     r"none of|\bor none\b|no (?:correct|valid|suitable) (?:answer|option|choice|candidate|image)|"
     r"\bwait\b|can\s?not be determined|\b(?:that|this|it)(?:'s| is) (?:wrong|incorrect|not right)|"
     r"i'?m sorry|i am sorry|refuse to|\b(?:i|we) (?:can\s?not|can'?t|do not|don'?t|could not) "
-    r"(?:reliably )?(?:determine|tell|say|decide|know|answer|choose|select|pick|identify|help)\b|"
-    r"(?:impossible|unable|not able) to (?:determine|tell|say|decide|know|answer|choose|select|"
-    r"pick|identify)\b|(?:not enough|insufficient) (?:information|evidence|data)|"
+    rf"(?:reliably )?{_SETTLE}|(?:impossible|unable|not able) to {_SETTLE}|"
+    r"(?:not enough|insufficient) (?:information|evidence|data)|"
     r"^\W*(?:(?:which|that|this|it)\s+)?(?:(?:is|was|seems|looks|would be)\s+)?"
     r"(?:no|nope|not|wrong|incorrect|false|impossible|rejected|excluded|eliminated|ruled out|"
     r"not (?:it|right|correct|possible|valid|the answer))\s*(?:$|[.,;:!?])",

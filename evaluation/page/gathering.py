@@ -76,9 +76,9 @@ def _named(root: Path, pattern: str, finished: Sequence[Path]) -> list[Path]:
         kind, *name = folders[0].relative_to(root).parts
         if kind == "study" and name:
             raise UserError(
-                f"runs: {folders[0]} holds votes that are not counted yet: run python -m "
-                f"evaluation.study.export run={'/'.join(name)}, and name its run below "
-                f"{root / 'export_study'}"
+                f"runs: {folders[0]} is a study, whose votes are reported once they are counted: "
+                f"run python -m evaluation.study.export run={'/'.join(name)}, and name its run "
+                f"below {root / 'export_study'}"
             )
         raise UserError(
             f"runs: {folders[0]} is no finished run of an evaluation or of training: run its "

@@ -86,7 +86,8 @@ def zero_shot(
     abroad = transfers(choices)
     for benchmark, rows in by_items(m for m in choices if not m.trained).items():
         if benchmark not in abroad:
-            asked = [run for run in studies if run.report.get("benchmark") == benchmark]
+            of = (benchmark, rows[0].run.report.get("build"))
+            asked = [s for s in studies if (s.report.get("benchmark"), s.report.get("build")) == of]
             section.tables.append(shaped.selection_zero_shot(benchmark, rows, asked))
             section.figures.append(_families(folder, "zero-shot", rows, True))
     for benchmark, rows in by_items(m for m in ranks if not m.trained).items():

@@ -43,9 +43,8 @@ RETRIEVAL_BEST = {**dict.fromkeys(("R@1", "R@10", "R@50", "MRR"), max), "Median"
 """Which number of a column is its best."""
 BOLD = "Bold: the best of a column, of what was measured here and of the paper's rows."
 NO_MODELS = (paper.CHANCE.name, paper.HUMAN_MAJORITY.name)
-
-
 PEOPLE = "people, on the items of their study"
+"""The part of a table in which they stand, who are no models."""
 
 
 def selection_zero_shot(

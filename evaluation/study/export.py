@@ -34,7 +34,8 @@ def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
         annotators = storage.annotators(db)
     if not votes:
         raise UserError(f"{path} holds no votes yet")
-    found = {"benchmark": about["benchmark"], **summary(votes, items, annotators)}
+    of = {"benchmark": about["benchmark"], "build": about["identity"]}
+    found = of | summary(votes, items, annotators)
     write_text(run.folder / VOTES, "".join(json.dumps(v.to_row()) + "\n" for v in votes))
     write_text(run.folder / "report.json", json.dumps(found, indent=1))
     table = human_table(found)

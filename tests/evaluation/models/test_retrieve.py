@@ -294,7 +294,7 @@ def test_one_with_an_edited_processor_is_another(
 
 @pytest.mark.slow
 def test_long_texts_pass_a_few_at_a_time_and_come_to_the_same(saved, micro_store, monkeypatch):
-    texts = ["The red cube rests.", *(f"{'It moves on. ' * k}" for k in (40, 3, 1, 20, 2))]
+    texts = ["The red cube rests.", *("It moves on. " * k for k in (40, 3, 1, 20, 2))]
     (trained, _) = embedders(saved, CFG, "fp32", micro_store, saved)
     encoder = trained.load()
     whole, passed = encoder.texts(texts), []

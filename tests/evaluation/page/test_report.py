@@ -12,20 +12,17 @@ import pytest
 from omegaconf import OmegaConf
 
 from conf.errors import UserError
-from conf.schema import ExportStudyCommand, ReportCommand
+from conf.schema import ReportCommand
 from data.controls import MATCHED
-from data.records import FAMILIES, LETTERS
+from data.records import LETTERS
 from evaluation.page.said import Scored
-from evaluation.study.agreement import summary
 from tests.evaluation.page.measured import (
-    finish,
     reported,
     retrieve_run,
     right,
     select_run,
     similarity_run,
 )
-from tests.evaluation.study.test_agreement import vote
 
 
 def page_data(folder: Path) -> dict:
@@ -63,22 +60,6 @@ def test_everything_is_written_in_the_papers_shape(runs, micro_store):
     data = page_data(folder)
     assert len(data["items"]) == 12
     assert all(len(item["said"]) == 5 for item in data["items"])
-
-
-def test_what_people_chose_stands_beside_models(runs, micro_store):
-    votes = [vote(name, k, 0, FAMILIES[k % 3]) for k in range(6) for name in ("A1", "A2")]
-    found = {"benchmark": micro_store.name, **summary(votes, 6, ["A1", "A2"])}
-    finish(runs / "export_study" / "pilot", ExportStudyCommand(run="pilot"), found)
-    folder = reported(runs, micro_store.folder.parent, items=0)
-    table = (folder / "tables" / "selection-micro.md").read_text()
-    # All that they said is right, and they are no model that would be a column's best.
-    whole = " | ".join(["100.0"] * 5)
-    assert f"| Majority vote, pilot | {whole} | - | 6 |" in table
-    assert "Majority vote, pilot" not in (folder / "tables" / "ablation.md").read_text()
-    elsewhere = {**found, "benchmark": "elsewhere"}
-    (runs / "export_study" / "pilot" / "report.json").write_text(json.dumps(elsewhere))
-    folder = reported(runs, micro_store.folder.parent, items=0)
-    assert "Majority vote, pilot" not in (folder / "tables" / "selection-micro.md").read_text()
 
 
 def test_students_are_held_against_what_they_should_surpass(runs, micro, micro_store):
@@ -396,7 +377,7 @@ def test_what_was_built_anew_is_told_from_what_it_was_before(runs, micro_store, 
         (lambda runs: (runs / "select/cot/metrics.json").unlink(), {"runs": ["select/cot"]},
          "no finished run"),
         (lambda runs: (runs / "study/friends").mkdir(parents=True), {"runs": ["study/friends"]},
-         "not counted yet: run python -m evaluation.study.export run=friends"),
+         "once they are counted: run python -m evaluation.study.export run=friends"),
         (lambda runs: None, {"runs": ["select/cto"]}, "names no run .*; there are .*select/cot"),
         (lambda runs: None, {"runs": ["sft/*"]}, "nothing is measured"),
         (lambda runs: shutil.rmtree(runs / "select"), {"runs": ["select/*"]}, "names no run"),

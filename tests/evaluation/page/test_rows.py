@@ -10,7 +10,11 @@ import pytest
 from omegaconf import OmegaConf
 
 from conf.errors import UserError
-from tests.evaluation.page.measured import reported, retrieve_run, similarity_run
+from conf.schema import ExportStudyCommand
+from data.records import FAMILIES
+from evaluation.study.agreement import summary
+from tests.evaluation.page.measured import finish, reported, retrieve_run, similarity_run
+from tests.evaluation.study.test_agreement import vote
 
 
 def changed(report: Path, **row: object) -> None:
@@ -57,3 +61,21 @@ def test_a_base_has_one_curve_and_two_runs_have_names(runs, micro, micro_store):
     drawn = (folder / "figures" / "recall-micro.svg").read_text()
     assert drawn.count(">untrained small<") == 1
     assert drawn.count(">emb<") == drawn.count(">other<") == 1
+
+
+def test_what_people_chose_stands_beside_models(runs, micro_store):
+    votes = [vote(name, k, 0, FAMILIES[k % 3]) for k in range(6) for name in ("A1", "A2")]
+    found = {"benchmark": "micro", "build": micro_store.identity, **summary(votes, 6, ["A1", "A2"])}
+    finish(runs / "export_study" / "pilot", ExportStudyCommand(run="pilot"), found)
+    folder = reported(runs, micro_store.folder.parent, items=0)
+    table = (folder / "tables" / "selection-micro.md").read_text()
+    # All that they said is right, and they are no model that would be a column's best.
+    whole = " | ".join(["100.0"] * 5)
+    assert f"| Majority vote, pilot | {whole} | - | 6 |" in table
+    for other in ({"benchmark": "elsewhere"}, {"build": "before"}):
+        (runs / "export_study" / "pilot" / "report.json").write_text(json.dumps({**found, **other}))
+        folder = reported(runs, micro_store.folder.parent, items=0)
+        assert (
+            "Majority vote"
+            not in (folder / "tables" / "selection-micro.md").read_text().split("paper, Table 2")[0]
+        )
