@@ -99,7 +99,7 @@ releases:
 	transfer on $(RELEASES)/movi_a and $(RELEASES)/physion, which are not both there: give RELEASES=FOLDER"; exit 1; }
 
 hours: setup ## GPU hours of make paper's training, from the rates that cards measured
-	@$(PY) benchmarks.hours --student $(STUDENT) --retriever $(RETRIEVER)
+	@$(PY) benchmarks.speed.hours --student $(STUDENT) --retriever $(RETRIEVER)
 
 # Servers and ranks that tests start have threads of their own.
 test: setup vllm-env ## Run every test
@@ -109,7 +109,7 @@ test: setup vllm-env ## Run every test
 # What the tests of trainers and of models that are asked import takes longer than all quick tests.
 check: setup lint ## Lint, then run the quick tests
 	$(BIN)/python -m pytest -m "not slow" -n logical --maxprocesses 4 --dist loadfile \
-		--ignore tests/train --ignore tests/evaluation/models
+		--ignore tests/train --ignore tests/models --ignore tests/evaluation/models
 
 lint: setup ## Check format and style
 	$(BIN)/ruff format --check .

@@ -25,7 +25,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-import conf.plugins  # noqa: F401  registers the launcher that run_folder.yaml names
+import conf.multirun.plugins  # noqa: F401  registers the launcher that run_folder.yaml names
 from conf.errors import SettingsError
 from conf.keys import dict_above, has_key, keys, keys_like, nearest
 

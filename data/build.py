@@ -13,14 +13,9 @@ from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
 from conf.keys import nearest
 from conf.schema import BenchmarkConfig, BuildCommand
-from data.cells import family_quotas, make_items_and_queries, recipes, suite
-from data.growing import flat, growing_folder
 from data.parallel import Workers
-from data.rendering import RECORD, render_ahead
-from data.report import count, shortfalls, summary
-from data.retrieval import future
-from data.retrieval.database import make_databases
-from data.scenes import make_scenes
+from data.partial_build import flat, growing_folder
+from data.render.prerender import RECORD, render_ahead
 from data.store import (
     FRAMES,
     MANIFEST,
@@ -36,6 +31,11 @@ from data.store import (
     versions,
     write_atomically,
 )
+from data.tracks.build_items import family_quotas, make_items_and_queries, recipes, suite
+from data.tracks.retrieval import future
+from data.tracks.retrieval.database import make_databases
+from data.tracks.shortfalls import count, shortfalls, summary
+from data.world.scenes import make_scenes
 
 log = logging.getLogger(__name__)
 

@@ -1,5 +1,5 @@
 """Write a benchmark as others read it: as a Hugging Face dataset, which loads without this code, or
-its scenes as CLEVRER's release has them (see `data.transfer.export`).
+its scenes as CLEVRER's release has them (see `data.publish.clevrer_format`).
 
     exports/<name>/huggingface/
         README.md        the dataset card, by which `datasets.load_dataset` finds what is where
@@ -28,11 +28,11 @@ from conf.entry import Run, command
 from conf.errors import UserError
 from conf.runs import held, write_text
 from conf.schema import ExportCommand
-from data.columns import Rows, features
-from data.controls import MATCHED
 from data.parallel import Workers
+from data.publish.columns import Rows, features
 from data.records import POOLS, SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from data.store import DATABASES, Store, digest, sealed, write_atomically
+from data.tracks.controls import MATCHED
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -78,7 +78,7 @@ def main(cfg: ExportCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     if cfg.format == "clevrer":
-        from data.transfer.export import export_clevrer
+        from data.publish.clevrer_format import export_clevrer
 
         scenes = export_clevrer(store, Path(cfg.folder), Workers(cfg.workers))
         log.info("%s holds %d scenes as CLEVRER's release has them", cfg.folder, scenes)
@@ -123,7 +123,7 @@ def ensure_export(
 
 def export(store: Store, folder: Path, plan: dict[str, Any]) -> None:
     """Write the dataset that `plan` describes, going on with what a killed export left."""
-    from data import card, croissant
+    from data.publish import croissant, dataset_card
 
     growing = folder.with_name(f".{folder.name}.partial")
     growing.mkdir(parents=True, exist_ok=True)
@@ -140,7 +140,7 @@ def export(store: Store, folder: Path, plan: dict[str, Any]) -> None:
                 schema = columns[part.configuration].arrow_schema
                 shards += _write_part(growing, part, rows, schema, plan["images"], bar)
         described = {
-            "README.md": card.text(store, columns, shards, plan),
+            "README.md": dataset_card.text(store, columns, shards, plan),
             "croissant.json": croissant.text(store, columns, shards, plan),
         }
         for name, text in described.items():

@@ -16,9 +16,7 @@ from tqdm import tqdm
 from conf.entry import Run, command
 from conf.runs import write_text
 from conf.schema import GalleryCommand
-from data.controls import MATCHED
-from data.frames import Frames
-from data.geometry import displacement_across
+from data.publish.contact_sheets import Cell, Row, paths, sheet
 from data.records import (
     FAMILIES,
     LETTERS,
@@ -28,10 +26,12 @@ from data.records import (
     SelectionItem,
     shown_frames,
 )
-from data.retrieval.counterfactual import consequence
-from data.selection.drafts import cell_rng
-from data.sheets import Cell, Row, paths, sheet
+from data.render.frame_cache import Frames
 from data.store import Store, write_atomically
+from data.tracks.controls import MATCHED
+from data.tracks.retrieval.counterfactual import consequence
+from data.tracks.selection.distractors import cell_rng
+from data.world.geometry import displacement_across
 
 log = logging.getLogger(__name__)
 

@@ -18,10 +18,10 @@ from conf.entry import Run, command
 from conf.errors import UserError
 from conf.runs import write_text
 from conf.schema import StatisticsCommand
-from data.geometry import DIAGONAL, MODEL_SIZE, displacement_across
 from data.records import LETTERS, SPLITS, Candidate, SelectionItem
-from data.standins import view_of
 from data.store import Store
+from data.world.geometry import DIAGONAL, MODEL_SIZE, displacement_across
+from data.world.standins import view_of
 
 log = logging.getLogger(__name__)
 PAPER = {

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from conf.errors import UserError
-from data import renderers
+from data import render
 from data.records import (
     Collision,
     FrameRef,
@@ -39,8 +39,8 @@ from data.records import (
     SceneObject,
     SelectionItem,
 )
-from data.selection.drafts import BUILDERS_VERSION
-from data.standins import generator_version
+from data.tracks.selection.distractors import BUILDERS_VERSION
+from data.world.standins import generator_version
 
 MANIFEST = "manifest.json"
 SEAL = "sha256"
@@ -53,7 +53,7 @@ def versions(simulator: str, renderer: str, standin: str | None) -> dict[str, st
     rendered = simulator == "bullet"
     return {
         "generator": generator_version(standin),
-        "renderer": renderers.version(renderer) if rendered else f"{simulator}'s own frames",
+        "renderer": render.version(renderer) if rendered else f"{simulator}'s own frames",
         "builders": BUILDERS_VERSION,
     }
 

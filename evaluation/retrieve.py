@@ -14,12 +14,12 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.retrieve", RetrieveCommand)
 def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
-    from train.trained import measured
+    from models.trained_runs import measured
 
     folder, trained = measured(cfg, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides)
     preset = trained.retriever
     if cfg.index == "faiss":
-        from evaluation.index import import_faiss
+        from evaluation.retrieval.faiss_index import import_faiss
 
         if preset.late is not None:
             raise UserError(
@@ -32,41 +32,44 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
-    from data.frames import Frames
-    from evaluation import embedding, index, measures, ranked, tables
-    from train.precision import settled
+    from data.render.frame_cache import Frames
+    from evaluation.embedders import embed
+    from evaluation.metrics.accuracy import breakdown
+    from evaluation.reporting import tables
+    from evaluation.retrieval import faiss_index, standard_test
+    from models.precision import settled
 
-    queries, database = ranked.standard_test(store)
+    queries, database = standard_test.standard_test(store)
     frames = Frames(store, preset.image_size)
     ids = [q.query_id for q in queries]
     names = [f.name for f in database]
     targets = [q.target.name for q in queries]
     rows, curves, indexes, found = [], [], [], {}
     precision = settled(trained.train.precision)
-    for embedder in embedding.embedders(folder, preset, precision, store, run.folder):
-        asked = embedding.embed_queries(embedder, queries, store, frames, cfg.batch).rows(ids)
-        shown = embedding.embed_frames(embedder, database, store, frames, cfg.batch)
+    for embedder in embed.embedders(folder, preset, precision, store, run.folder):
+        asked = embed.embed_queries(embedder, queries, store, frames, cfg.batch).rows(ids)
+        shown = embed.embed_frames(embedder, database, store, frames, cfg.batch)
         name = embedder.name
         log.info("ranking %s frames with %s", f"{len(names):,}", name)
         if cfg.index == "exact":
-            parts = ranked.in_parts(shown, names)
-            ranks = ranked.ranks_of(preset, asked, shown.rows(targets), parts)
+            parts = standard_test.in_parts(shown, names)
+            ranks = standard_test.ranks_of(preset, asked, shown.rows(targets), parts)
         else:
             name = f"{name} ({cfg.index})"
-            ranks, told = index.approximate_ranks(
+            ranks, told = faiss_index.approximate_ranks(
                 asked, targets, shown, names, preset.widths, cfg.probes, cfg.seed
             )
             indexes += [{"name": name, **of_width} for of_width in told]
         found[name] = ranks
-        rows += measures.retrieval_rows(store.name, name, ranks, queries, cfg.seed)
-        curves += measures.recall_curves(name, ranks, queries)
+        rows += breakdown.retrieval_rows(store.name, name, ranks, queries, cfg.seed)
+        curves += breakdown.recall_curves(name, ranks, queries)
 
-    apart = measures.ranks_apart(found, queries, cfg.seed)
+    apart = breakdown.ranks_apart(found, queries, cfg.seed)
     told = [tables.ranks_apart_table(apart)] if apart else []
     told += [tables.index_table(indexes)] if indexes else []
-    ranked.write_ranks(run.folder, found, queries)
+    standard_test.write_ranks(run.folder, found, queries)
     also = {"build": store.identity, "indexes": indexes, "apart": apart}
-    ranked.write_report(run.folder, rows, curves, told, **also)
+    standard_test.write_report(run.folder, rows, curves, told, **also)
     return {name: found.value for name, found in rows[0].measures.items() if name != "tie_rate"}
 
 

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.select", SelectCommand)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
-    from train.trained import check_modes, measured
+    from models.trained_runs import check_modes, measured
 
     folder, trained = measured(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
     student, regime = trained.student, trained.train.regime
@@ -33,32 +33,37 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
-    from data.frames import Frames
-    from evaluation import answers, asked, selected
+    from data.render.frame_cache import Frames
+    from evaluation.generators import model_source, response_log
+    from evaluation.reporting import selection_results
 
     items = chosen_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = Frames(store, student.image_size)
-    model = asked.asked_model(cfg, folder, trained)
+    model = model_source.asked_model(cfg, folder, trained)
     given, keys, runs = {}, {}, Path(cfg.checkpoints, "select")
     # What a control changes shows only beside the same items as they are.
     for control in dict.fromkeys([None, cfg.control]):
         known = {
-            mode: asked.known_by(
+            mode: model_source.known_by(
                 mode, regime, student, cfg.seed, model.revision, store.identity, control
             )
             for mode in modes
         }
-        journal = answers.AnswerLog(run.folder / "answers.jsonl", known, items)
+        journal = response_log.AnswerLog(run.folder / "answers.jsonl", known, items)
         if cfg.control and (taken := journal.take_over(sorted(runs.glob("**/answers.jsonl")))):
             log.info("%d answers are there already, from other runs of this model", taken)
-        sample_of = partial(asked.shown, regime, frames, student, control)
+        sample_of = partial(model_source.shown, regime, frames, student, control)
         for mode in modes:
             log.info("asking %s in %s mode%s", model.name, mode, f", {control}" if control else "")
-            given[mode, control] = answers.ask_all(items, mode, model.say(mode, sample_of), journal)
+            given[mode, control] = response_log.ask_all(
+                items, mode, model.say(mode, sample_of), journal
+            )
             keys[mode, control] = journal.keys[mode]
 
     about = {"build": store.identity, "asked": [[*how, key] for how, key in keys.items()]}
-    metrics = selected.write_report(given, items, model.name, store.name, cfg, run.folder, about)
+    metrics = selection_results.write_report(
+        given, items, model.name, store.name, cfg, run.folder, about
+    )
     letter = given[modes[0], cfg.control][0].letter
     draw_item(items[0], letter, Frames(store), run.folder / "item.png")
     return metrics
@@ -66,7 +71,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 
 def default_modes(cfg: SelectCommand, regime: str) -> list[str]:
     """The modes that a student was trained in; of a base, the record, free and held to its form."""
-    from train.trained import modes_of
+    from models.trained_runs import modes_of
 
     if cfg.model is not None:
         return modes_of(regime) or ["answer"]
@@ -76,7 +81,7 @@ def default_modes(cfg: SelectCommand, regime: str) -> list[str]:
 def draw_item(item, chosen, frames, path: Path) -> None:
     """An item's prefix and candidates at full size, with what was chosen."""
     from data.records import LETTERS, shown_frames
-    from evaluation.figures import item_figure
+    from evaluation.reporting.figures import item_figure
 
     shown = shown_frames(item.prefix_start, item.prefix_stop, 6)
     item_figure(
@@ -98,7 +103,7 @@ def chosen_items(
     Raises:
         UserError: the benchmark has none.
     """
-    from data.controls import MATCHED
+    from data.tracks.controls import MATCHED
 
     items = store.selection("test", suite)
     if not items:
@@ -117,7 +122,7 @@ def spread(items: list[SelectionItem], limit: int | None, seed: int) -> list[Sel
     matched-anchor pairs it takes both items or neither."""
     import numpy as np
 
-    from data.controls import MATCHED, pairs
+    from data.tracks.controls import MATCHED, pairs
 
     if limit is None:
         return items

@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.similarity", SimilarityCommand)
 def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
-    from train.trained import measured
+    from models.trained_runs import measured
 
     folder, trained = measured(cfg, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides)
     preset = trained.retriever
@@ -26,34 +26,38 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
-    from data.controls import MATCHED
-    from data.frames import Frames
     from data.records import FrameRef
-    from evaluation import embedding, figures, nearest, paper, tables
-    from evaluation.confidence import positions
-    from evaluation.measures import by_subtype, selection_row
-    from evaluation.paired import anchors
-    from evaluation.rows import SIMILARITY
+    from data.render.frame_cache import Frames
+    from data.tracks.controls import MATCHED
+    from evaluation.embedders import embed
+    from evaluation.metrics.breakdown import by_subtype, selection_row
+    from evaluation.metrics.calibration import positions
+    from evaluation.metrics.significance import anchors
+    from evaluation.reporting import figures, paper, tables
+    from evaluation.reporting.rows import SIMILARITY
+    from evaluation.retrieval import nearest_candidate
     from evaluation.select import chosen_items
-    from train.precision import settled
+    from models.precision import settled
 
     items = chosen_items(store, cfg.suite, cfg.limit, cfg.seed)
     candidates = {FrameRef(c.scene_id, c.frame) for item in items for c in item.candidates}
     frames = Frames(store, preset.image_size)
     precision = settled(trained.train.precision)
     rows, told, subtypes, letters, apart = [], [], {}, {}, []
-    for embedder in embedding.embedders(folder, preset, precision, store, run.folder):
-        asked = embedding.embed_queries(embedder, items, store, frames, cfg.batch)
-        shown = embedding.embed_frames(embedder, candidates, store, frames, cfg.batch)
+    for embedder in embed.embedders(folder, preset, precision, store, run.folder):
+        asked = embed.embed_queries(embedder, items, store, frames, cfg.batch)
+        shown = embed.embed_frames(embedder, candidates, store, frames, cfg.batch)
         log.info("choosing for %s items with %s", f"{len(items):,}", embedder.name)
-        scores = nearest.candidate_scores(items, asked, shown, preset)
-        right = nearest.credits(scores, [item.answer for item in items])
+        scores = nearest_candidate.candidate_scores(items, asked, shown, preset)
+        right = nearest_candidate.credits(scores, [item.answer for item in items])
         name = embedder.name
-        told += nearest.told(name, items, scores)
+        told += nearest_candidate.told(name, items, scores)
         how = (None, cfg.seed, cfg.suite)
         rows.append(selection_row(store.name, name, SIMILARITY, items, right, *how))
         subtypes[name] = by_subtype(items, right)
-        letters[name] = positions(nearest.letters(scores), [item.letter for item in items])
+        letters[name] = positions(
+            nearest_candidate.letters(scores), [item.letter for item in items]
+        )
         if cfg.suite == MATCHED:
             credits = {item.item_id: credit for item, credit in zip(items, right, strict=True)}
             apart.append((name, anchors(items, credits, cfg.seed)))

@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.two_stage", TwoStageCommand)
 def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
-    from train.trained import measured, modes_of
+    from models.trained_runs import measured, modes_of
 
     folder, trained = measured(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
     matched_by, frozen = measured(
@@ -43,15 +43,17 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
-    from data.frames import Frames
-    from evaluation import foreseen, matching, measures, paper, ranked, tables
-    from evaluation.asked import asked_model
-    from evaluation.embedding import embedders
-    from evaluation.rows import UNTRAINED
-    from train.conversation import told_sample
-    from train.precision import settled
+    from data.render.frame_cache import Frames
+    from evaluation.embedders.embed import embedders
+    from evaluation.generators.model_source import asked_model
+    from evaluation.metrics.accuracy import breakdown
+    from evaluation.reporting import paper, tables
+    from evaluation.reporting.rows import UNTRAINED
+    from evaluation.retrieval import predicted_texts, standard_test, text_matching
+    from models.precision import settled
+    from models.student.prompts import told_sample
 
-    queries, database = ranked.standard_test(store)
+    queries, database = standard_test.standard_test(store)
     precision = settled(frozen.train.precision)
     matcher = next(embedders(matched_by, frozen.retriever, precision, store, run.folder))
     student = trained.student
@@ -59,28 +61,32 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     model = asked_model(cfg, folder, trained)
     name = model.name
     log.info("asking %s", name)
-    modes = foreseen.modes_of(routes)
-    written = foreseen.write_texts(cfg, student, model, sample_of, modes, queries, database, store)
-    texts = {mode: foreseen.texts_of(told) for mode, told in written.items()}
+    modes = predicted_texts.modes_of(routes)
+    written = predicted_texts.write_texts(
+        cfg, student, model, sample_of, modes, queries, database, store
+    )
+    texts = {mode: predicted_texts.texts_of(told) for mode, told in written.items()}
     # The matcher needs the room.
     del model
 
     rows, curves, matched, metrics = [], [], [], {}
     for key in routes:
-        route = foreseen.ROUTES[key]
+        route = predicted_texts.ROUTES[key]
         log.info("matching %s with %s", route.title, matcher.name)
-        ranks = matching.ranks(cfg, route, matcher, texts, queries, database, store)
+        ranks = text_matching.ranks(cfg, route, matcher, texts, queries, database, store)
         title = f"{name} {route.title}, {matcher.name.removeprefix(UNTRAINED).strip()}"
-        found = measures.retrieval_rows(store.name, title, ranks, queries, cfg.seed)
+        found = breakdown.retrieval_rows(store.name, title, ranks, queries, cfg.seed)
         rows += found
-        curves += measures.recall_curves(title, ranks, queries)
-        matched += matching.matched(key, queries, texts[route.mode], ranks)
+        curves += breakdown.recall_curves(title, ranks, queries)
+        matched += text_matching.matched(key, queries, texts[route.mode], ranks)
         metrics |= {f"{key}_{m}": i.value for m, i in found[0].measures.items() if m != "tie_rate"}
 
-    told = {mode: foreseen.counts(of) for mode, of in written.items()}
+    told = {mode: predicted_texts.counts(of) for mode, of in written.items()}
     reading = tables.reading_table(told, "What was written")
     also = {"build": store.identity, "indexes": [], "texts": told}
-    ranked.write_report(run.folder, rows, curves, [reading], paper.RETRIEVAL_TWO_STAGE, **also)
+    standard_test.write_report(
+        run.folder, rows, curves, [reading], paper.RETRIEVAL_TWO_STAGE, **also
+    )
     write_text(run.folder / "matched.jsonl", "".join(json.dumps(m) + "\n" for m in matched))
     return metrics
 

@@ -22,17 +22,17 @@ from conf.errors import UserError
 from conf.runs import write_json, write_text
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
-from teacher.journal import Journal, save_accepted
-from teacher.judging import Judge, signature
+from teacher.narrator import narrate
 from teacher.predicates import predicates_of
 from teacher.progress import Progress, kinds
+from teacher.rationale_log import Journal, save_accepted
 from teacher.report.summary import Summary, accepted_of, summarise
 from teacher.servers.replies import Reply
-from teacher.template import narrate
+from teacher.validation.verdict import Judge, signature
 
 if TYPE_CHECKING:
     from data.store import Store
-    from teacher.servers.asking import Job, Keep
+    from teacher.servers.narration import Job, Keep
 
 log = logging.getLogger(__name__)
 
@@ -144,7 +144,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
             if cfg.url is None:
                 too_short = _narrate_all(jobs, store, judge, keep, progress)
             elif jobs:
-                from teacher.servers.asking import Asking
+                from teacher.servers.narration import Asking
 
                 too_short = asyncio.run(Asking(store, cfg, judge, keep, progress).run(jobs))
         if cfg.fallback:

@@ -13,8 +13,8 @@ from conf.schema import (
     SelectionConfig,
 )
 from data.build import ensure_benchmark
-from data.selection import event, time, window
 from data.store import Store, open_store
+from data.tracks.selection import event, time, window
 
 
 def micro_config(**changes: object) -> BenchmarkConfig:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import hours
+from benchmarks.speed import hours
 from conf.errors import UserError
 
 FAST = hours.Rate("sft_gpu", "qwen3_vl_8b", "nf4", 10.0, "a card", "2026-01-31")
@@ -38,7 +38,7 @@ def test_a_rate_gives_the_hours_of_the_steps_that_it_measures(
     assert f"{2 * 9_368 * 3 / 10 / 3600:.1f}  a card, 2026-01-31" in cot
     (missing,) = [line for line in shown.splitlines() if "No rate" in line]
     assert "train.contrastive" in missing
-    assert "python -m benchmarks.contrastive_gpu qwen3_vl_8b --base nf4" in missing
+    assert "python -m benchmarks.speed.contrastive_gpu qwen3_vl_8b --base nf4" in missing
 
 
 def test_without_a_rate_no_figure_is_given(steps: dict[str, hours.Step]) -> None:
@@ -46,7 +46,7 @@ def test_without_a_rate_no_figure_is_given(steps: dict[str, hours.Step]) -> None
     for rates in ([], [r for r in other if r.preset == "qwen3_vl_2b"]):
         shown = hours.table(list(steps.values()), rates)
         assert all(line.startswith("No rate is measured for") for line in shown.splitlines())
-        assert "python -m benchmarks.sft_gpu qwen3_vl_8b --base nf4" in shown
+        assert "python -m benchmarks.speed.sft_gpu qwen3_vl_8b --base nf4" in shown
 
 
 def test_of_a_card_the_last_rate_counts(tmp_path: Path, steps: dict[str, hours.Step]) -> None:

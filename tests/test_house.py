@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-FLOW = ("conf", "data", "teacher", "train", "evaluation")
+FLOW = ("conf", "data", "teacher", "models", "train", "evaluation")
 COMMANDS = (
     "data.build",
     "data.statistics",

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from conf.entry import Run, command
-from conf.processes import keep_to_one_gpu
+from conf.multirun.processes import keep_to_one_gpu
 from conf.runs import finished
 from conf.schema import ContrastiveCommand
 from conf.trackers import check_trackers
@@ -28,13 +28,13 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     check_trackers(cfg.train.report_to)
     keep_to_one_gpu()
 
-    from train import ranks
+    from models import distributed
 
-    ranks.check_unsharded()
-    share = ranks.share(cfg.train.batch)
-    store = ranks.from_main(partial(prepared, cfg))
+    distributed.check_unsharded()
+    share = distributed.share(cfg.train.batch)
+    store = distributed.from_main(partial(prepared, cfg))
 
-    from train.contrast import train_retriever
+    from train.retriever.run import train_retriever
 
     return train_retriever(cfg, run, store, share)
 

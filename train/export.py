@@ -70,10 +70,10 @@ def main(cfg: ExportModelCommand, run: Run) -> Measured:
     trained = find(cfg)
 
     from data.store import digest
-    from train.card import text
-    from train.compatible import check_base
-    from train.precision import of_run
-    from train.trained import EXPORT, export_record
+    from models.checks import check_base
+    from models.precision import of_run
+    from models.trained_runs import EXPORT, export_record
+    from train.common.model_card import text
 
     adapters = trained.saved / "adapter_model.safetensors"
     if not adapters.exists():
@@ -115,7 +115,7 @@ def find(cfg: ExportModelCommand) -> Trained:
     Raises:
         UserError: there is none of that name, it is not finished, or it trained the whole model.
     """
-    from train.trained import settings_of
+    from models.trained_runs import settings_of
 
     runs = runs_of(cfg.checkpoints, cfg.product)
     name = run_below(cfg.run, runs)
@@ -149,7 +149,7 @@ def renamed_when_whole(folder: Path) -> Iterator[Path]:
 
 def write_adapter(trained: Trained, folder: Path) -> Measured:
     """Copy the adapters and the processor, and the hash of the base that they were trained over."""
-    from train.compatible import BASE
+    from models.checks import BASE
 
     shutil.copytree(trained.saved, folder, dirs_exist_ok=True)
     if (trained.folder / BASE).exists():
@@ -159,9 +159,11 @@ def write_adapter(trained: Trained, folder: Path) -> Measured:
 
 def write_merged(trained: Trained, cfg: ExportModelCommand, folder: Path) -> Measured:
     """Write the merged model, and measure how far what it gives is from what was trained."""
-    from train import merged_retriever, merged_student
 
-    write = {"student": merged_student, "retriever": merged_retriever}[trained.product].write_merged
+    from train.retriever import merge as retriever_merge
+    from train.student import merge as student_merge
+
+    write = {"student": student_merge, "retriever": retriever_merge}[trained.product].write_merged
     return write(trained.settings, trained.saved, cfg, folder)
 
 

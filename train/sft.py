@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from conf.entry import Run, command
-from conf.processes import keep_to_one_gpu
+from conf.multirun.processes import keep_to_one_gpu
 from conf.runs import finished
 from conf.schema import SftCommand
 from conf.trackers import check_trackers
@@ -29,13 +29,13 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     check_trackers(cfg.train.report_to)
     keep_to_one_gpu()
 
-    from train import ranks
+    from models import distributed
 
     smallest = 1 if cfg.train.micro_batch == "auto" else cfg.train.micro_batch
-    ranks.accumulation(cfg.train.batch, smallest)
-    store, rationales = ranks.from_main(partial(prepared, cfg))
+    distributed.accumulation(cfg.train.batch, smallest)
+    store, rationales = distributed.from_main(partial(prepared, cfg))
 
-    from train.student import train_student
+    from train.student.run import train_student
 
     return train_student(cfg, run, store, rationales)
 

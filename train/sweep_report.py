@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from conf.errors import UserError
-from conf.sweep import report
+from conf.multirun.summary import report
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from data.records import FAMILIES, LETTERS
-from evaluation.metrics import accuracy_table
+from evaluation.metrics.accuracy import accuracy_table
 from evaluation.study.votes import Vote
 
 
@@ -28,7 +28,8 @@ def summary(votes: Sequence[Vote], items: int, annotators: Sequence[str]) -> dic
     Returns:
         `items`, `judgments`; `annotators`, those who answered; `depth`, how many items have each
         number of votes; `accuracy` by annotator, with `families`, `macro` and `micro` as in
-        `evaluation.metrics.Accuracy`; `majority`, the same of the items that have a vote, and how
+        `evaluation.metrics.accuracy.Accuracy`; `majority`, the same of the items that have a vote,
+        and how
         many of them are `undecided`; `fleiss_kappa` with the `items` that all of them answered;
         `krippendorff_alpha` with the `items` of two votes or more; and median `seconds` by family.
     """

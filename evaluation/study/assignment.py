@@ -11,7 +11,7 @@ from itertools import chain, permutations
 import numpy as np
 
 from data.records import LETTERS, SelectionItem
-from data.selection.drafts import cell_rng
+from data.tracks.selection.distractors import cell_rng
 
 Column = tuple[int, ...]
 """The letters, by number, at which a candidate stands for four annotators."""

@@ -18,10 +18,10 @@ VOTES = "votes.jsonl"
 
 @command("evaluation.study.export", ExportStudyCommand)
 def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
+    from evaluation.reporting.tables import human_table
     from evaluation.study import storage
     from evaluation.study.agreement import summary
     from evaluation.study.votes import votes_of
-    from evaluation.tables import human_table
 
     runs = Path(cfg.checkpoints) / "study"
     path = runs / run_below(cfg.run, str(runs)) / storage.DATABASE

@@ -9,8 +9,8 @@ from fractions import Fraction
 import numpy as np
 
 from conf.errors import UserError
-from data.frames import Frames
 from data.records import SelectionItem
+from data.render.frame_cache import Frames
 
 VIDEO, IMAGE = "video/mp4", "image/png"
 PREFIX = -1

@@ -11,8 +11,8 @@ from tqdm import tqdm
 from conf.errors import UserError
 from conf.schema import StudyCommand
 from data.build import ensure_benchmark
-from data.frames import Frames
 from data.records import SelectionItem
+from data.render.frame_cache import Frames
 from data.store import Store
 from evaluation.study import accounts, sampling, storage
 from evaluation.study.assignment import plan
@@ -100,6 +100,6 @@ def check_names(cfg: StudyCommand, db: sqlite3.Connection) -> None:
 
 def suites(store: Store) -> list[str]:
     """Suites whose items a study may ask."""
-    from data.controls import MATCHED
+    from data.tracks.controls import MATCHED
 
     return [store.suite, MATCHED]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from conf.errors import UserError
 from data.records import FAMILIES, SelectionItem
-from data.selection.drafts import cell_rng
+from data.tracks.selection.distractors import cell_rng
 
 
 def named(text: str) -> list[str]:

@@ -11,8 +11,8 @@ import numpy as np
 
 from conf.runs import write_text
 from data.gallery import Looker
+from data.publish.contact_sheets import sheet
 from data.records import Rationale
-from data.sheets import sheet
 from data.store import Store, write_atomically
 from teacher.predicates import predicates_of
 

@@ -6,8 +6,8 @@ from itertools import permutations
 import pytest
 
 from conf.errors import SettingsError, UserError
+from conf.multirun.summary import best, report, varying
 from conf.runs import Run, open_run, run_name
-from conf.sweep import best, report, varying
 
 SETTINGS = {"seed": 0, "run": None, "store": "store", "checkpoints": "c", "workers": 2, "x": 1.0}
 

@@ -20,10 +20,10 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 
 from conf.compose import compose, preflight
 from conf.errors import SettingsError, UserError
-from conf.processes import visible_gpus
+from conf.multirun.optuna_sweeper import JOURNAL, distribution, open_study
+from conf.multirun.processes import visible_gpus
 from conf.schema import ContrastiveCommand, SftCommand
 from conf.schema.training import REGIMES
-from conf.search import JOURNAL, distribution, open_study
 from tests.conf.test_presets import SCHEMAS
 
 PRESETS = Path(str(files("conf"))) / "sweep"

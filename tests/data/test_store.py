@@ -17,11 +17,11 @@ import pytest
 from conf.errors import SettingsError, UserError
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from data.build import build, ensure_benchmark, ensure_items
-from data.growing import growing_folder
 from data.parallel import Workers
-from data.sampling import scene_id
-from data.scenes import split_scenes
+from data.partial_build import growing_folder
 from data.store import MANIFEST, digest, digests, open_store, write_atomically
+from data.world.sampling import scene_id
+from data.world.scenes import split_scenes
 
 
 def small(**changes: object) -> BenchmarkConfig:

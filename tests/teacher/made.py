@@ -9,9 +9,9 @@ import numpy as np
 
 from conf.schema import TeacherConfig
 from data.records import Scene, SelectionItem
+from teacher.narrator import narrate
 from teacher.predicates import predicates_of
 from teacher.prompts import messages
-from teacher.template import narrate
 from tests.teacher import synthetic
 
 

@@ -10,9 +10,9 @@ from socket import SO_LINGER, SOL_SOCKET
 from typing import Any
 
 from conf.schema import TeacherConfig
+from teacher.narrator import narrate
 from teacher.predicates import predicates_of
 from teacher.prompts import messages
-from teacher.template import narrate
 from tests.local import JsonHandler, LocalServer
 from tests.teacher.made import MadeStore
 

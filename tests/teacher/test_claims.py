@@ -10,11 +10,11 @@ from random import Random
 
 import pytest
 
-from benchmarks.mutations import KINDS, falsehoods, predicates_from
-from benchmarks.paraphrases import paraphrase
-from benchmarks.prose import EDITS
+from benchmarks.experiments.mutations import KINDS, falsehoods, predicates_from
+from benchmarks.experiments.paraphrases import paraphrase
+from benchmarks.experiments.prose import EDITS
 from conf.schema import TeacherConfig
-from teacher.claims import find_claims
+from teacher.narrator import narrate
 from teacher.predicates import (
     OUT,
     CandidateFacts,
@@ -27,8 +27,8 @@ from teacher.predicates import (
 )
 from teacher.reading.phrases import PHRASES
 from teacher.sections import SECTIONS
-from teacher.template import narrate
-from teacher.validate import validate
+from teacher.validation.claims import find_claims
+from teacher.validation.validate import validate
 
 HERE = Path(__file__).parent
 SECTION = {"S": SECTIONS[0], "M": SECTIONS[1], "P": SECTIONS[2], "C": SECTIONS[3], "O": SECTIONS[4]}

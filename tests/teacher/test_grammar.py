@@ -13,10 +13,10 @@ import pytest
 from conf.errors import UserError
 from conf.schema import TeacherConfig
 from teacher.grammar import OPENERS, grammar
+from teacher.narrator import narrate
 from teacher.numbers import lexicon
 from teacher.predicates import predicates_of
-from teacher.template import narrate
-from teacher.validate import validate, word_count
+from teacher.validation.validate import validate, word_count
 from tests.teacher import synthetic
 
 ENGINE = Path(__file__).parents[2] / ".venv-vllm/bin/python"

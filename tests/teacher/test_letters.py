@@ -7,9 +7,9 @@ import pytest
 
 from conf.schema import TeacherConfig
 from teacher.letters import letters, relabel, reorder
+from teacher.narrator import narrate
 from teacher.predicates import predicates_of
-from teacher.template import narrate
-from teacher.validate import validate
+from teacher.validation.validate import validate
 
 ORDERS = list(permutations(range(4)))
 

@@ -11,8 +11,8 @@ from conf.errors import UserError
 from conf.schema import TeacherConfig
 from data.records import Rationale
 from teacher.grammar import GRAMMAR_VERSION, grammar
-from teacher.journal import Journal, read_rationales
 from teacher.narrate import ensure_rationales, narrate_store
+from teacher.rationale_log import Journal, read_rationales
 
 TEMPLATE = TeacherConfig(name="template")
 

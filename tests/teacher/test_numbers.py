@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.numbers import PIECES, hostile
+from benchmarks.speed.numbers import PIECES, hostile
+from teacher.narrator import describe, narrate
 from teacher.numbers import find_numbers
-from teacher.template import describe, narrate
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import cases
 

@@ -20,12 +20,12 @@ from conf.errors import UserError
 from conf.schema import ServeCommand, TeacherConfig
 from teacher import serve
 from teacher.grammar import GRAMMAR_VERSION
-from teacher.journal import read_rationales
 from teacher.narrate import narrate_store
+from teacher.rationale_log import read_rationales
 from teacher.serve import Machine
 from teacher.servers import process
-from teacher.servers.asking import request_of
 from teacher.servers.client import Client
+from teacher.servers.narration import request_of
 from tests.teacher.made import corpus, made_store
 from tests.teacher.serving import ROOT, Serving, free_port
 from tests.teacher.tiny_qwen3 import save_tiny_qwen3

@@ -12,8 +12,8 @@ from conf.errors import UserError
 from conf.schema import TeacherConfig
 from teacher.grammar import grammar
 from teacher.narrate import narrate_store
-from teacher.servers.asking import request_of
 from teacher.servers.client import Client, jitter
+from teacher.servers.narration import request_of
 from tests.teacher.odd import OddServer, completion
 
 CHAT = [{"role": "user", "content": "Are you there?"}]

@@ -28,8 +28,8 @@ from transformers import (
     SiglipProcessor,
 )
 
-from evaluation.languagebind import LanguageBindVideo
-from train.tiny import CHAT_TEMPLATE, SPECIAL_TOKENS
+from evaluation.embedders.languagebind import LanguageBindVideo
+from models.tiny_qwen3_vl import CHAT_TEMPLATE, SPECIAL_TOKENS
 
 SIZE, TIMES = 56, 4
 TOWER = {

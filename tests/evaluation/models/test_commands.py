@@ -26,9 +26,11 @@ from conf.schema import (
     TeacherConfig,
 )
 from evaluation import report, retrieve, select
-from evaluation.answers import AnswerLog
-from train import backbone, retriever, samples
-from train.trained import check_unseen, measured, settings_of
+from evaluation.generators.response_log import AnswerLog
+from models import loading
+from models.retriever import embedder
+from models.trained_runs import check_unseen, measured, settings_of
+from train.student import dataset
 
 SMALL = ArchitectureConfig(
     hidden=64, layers=1, heads=2, kv_heads=2, feed_forward=64,
@@ -48,10 +50,10 @@ def runs(tmp_path_factory, micro, micro_store) -> Path:
     sft = SftCommand(benchmark=micro, teacher=TeacherConfig(name="template"), student=student)
     folder = root / "sft" / "run"
     folder.mkdir(parents=True)
-    model, processor = backbone.load_student(
-        student, "bf16", lambda: samples.corpus(micro_store, [])
+    model, processor = loading.load_student(
+        student, "bf16", lambda: dataset.corpus(micro_store, [])
     )
-    backbone.save(model, processor, folder / "student", "bf16")
+    loading.save(model, processor, folder / "student", "bf16")
     OmegaConf.save(OmegaConf.structured(sft), folder / "config.yaml")
     (folder / "metrics.json").write_text('{"answer_loss": 1.0, "answer_loss_at_start": 2.0}')
     (folder / "run.json").write_text(RECORD)
@@ -59,8 +61,8 @@ def runs(tmp_path_factory, micro, micro_store) -> Path:
     cfg = RetrieverConfig(name="small", widths=[64, 32], **SHARED)
     folder = root / "contrastive" / "run"
     folder.mkdir(parents=True)
-    texts = retriever.corpus(micro_store.retrieval("train"), cfg)
-    built = retriever.load_retriever(cfg, "fp32", texts, folder / "untrained")
+    texts = embedder.corpus(micro_store.retrieval("train"), cfg)
+    built = embedder.load_retriever(cfg, "fp32", texts, folder / "untrained")
     built.save_pretrained(str(folder / "retriever"), create_model_card=False)
     settings = ContrastiveCommand(benchmark=micro, retriever=cfg)
     OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
@@ -237,12 +239,12 @@ def test_a_torn_model_is_named(runs, tmp_path) -> None:
     weights.write_bytes(weights.read_bytes()[:1000])
     cfg = StudentConfig(name="small", max_length=1500, **SHARED)
     with pytest.raises(UserError, match="cannot be loaded from that folder"):
-        backbone.load_trained(cfg, "bf16", folder)
+        loading.load_trained(cfg, "bf16", folder)
     shutil.copytree(runs / "contrastive" / "run" / "retriever", tmp_path / "retriever")
     (tmp_path / "retriever" / "model.safetensors").write_bytes(b"{")
     cfg = RetrieverConfig(name="small", widths=[64, 32], **SHARED)
     with pytest.raises(UserError, match="is damaged and cannot be read"):
-        retriever.load_trained(cfg, "bf16", tmp_path / "retriever")
+        embedder.load_trained(cfg, "bf16", tmp_path / "retriever")
 
 
 def test_nothing_to_report_says_what_to_run_first(tmp_path) -> None:

@@ -12,12 +12,12 @@ import pytest
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig, SelectCommand, ServerConfig, StudentConfig
-from data.controls import MATCHED, pairs
+from data.tracks.controls import MATCHED, pairs
 from evaluation import select
-from evaluation.answers import judge
-from evaluation.rows import SelectionRow
-from evaluation.selected import write_report
-from train.generate import Written
+from evaluation.generators.response_log import judge
+from evaluation.reporting.rows import SelectionRow
+from evaluation.reporting.selection_results import write_report
+from models.student.generation import Written
 
 STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from sentence_transformers.util.similarity import maxsim
 
-from evaluation import late
-from evaluation.cache import Embeddings, filled_up
-from evaluation.late import late_ranks, pair_scores
-from evaluation.metrics import ranks_of
+from evaluation.embedders.cache import Embeddings, filled_up
+from evaluation.metrics.accuracy import ranks_of
+from evaluation.retrieval import late_interaction
+from evaluation.retrieval.late_interaction import late_ranks, pair_scores
 
 WIDTH = 24
 
@@ -77,8 +77,8 @@ def test_what_is_stored_is_counted_without_what_fills_it_up(asked, shown) -> Non
 @pytest.mark.parametrize(("size", "block", "cells"), [(1, 9, 1), (7, 64, 2**10), (50, 1, 2**23)])
 def test_no_cut_changes_a_rank(monkeypatch, asked, shown, size, block, cells) -> None:
     whole = ranks(asked, shown)
-    monkeypatch.setattr(late, "VECTORS", block)
-    monkeypatch.setattr(late, "CELLS", cells)
+    monkeypatch.setattr(late_interaction, "VECTORS", block)
+    monkeypatch.setattr(late_interaction, "CELLS", cells)
     assert same(ranks(asked, shown, size=size), whole)
 
 
@@ -104,7 +104,7 @@ def test_filling_up_changes_no_rank(asked, shown) -> None:
 def test_sums_of_as_many_vectors_as_there_may_be_are_exact() -> None:
     """All of them alike, so that the sum is the largest there is."""
     vector = np.full((1, WIDTH), WIDTH**-0.5, np.float32)
-    whole = np.rint(vector.astype(np.float64) * late.GRID).astype(object)
+    whole = np.rint(vector.astype(np.float64) * late_interaction.GRID).astype(object)
     for count in (1, 7999, 8000):
         query = np.repeat(vector, count, axis=0).reshape(1, -1)
         (score,) = pair_scores(query, vector, WIDTH)

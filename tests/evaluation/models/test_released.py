@@ -24,13 +24,14 @@ from conf.schema import (
     RetrieverConfig,
     SimilarityCommand,
 )
-from data.frames import Frames
 from data.records import FPS, FRAMES, LETTERS, FrameRef, shown_frames
-from evaluation import nearest, retrieve, similarity
-from evaluation.dual import unit
-from evaluation.embedding import EMBEDDINGS
-from evaluation.encoders import released_encoder
-from evaluation.languagebind import LanguageBindVideo, spread
+from data.render.frame_cache import Frames
+from evaluation import retrieve, similarity
+from evaluation.embedders.base import released_encoder
+from evaluation.embedders.dual_encoder import unit
+from evaluation.embedders.embed import EMBEDDINGS
+from evaluation.embedders.languagebind import LanguageBindVideo, spread
+from evaluation.retrieval import nearest_candidate
 from tests.evaluation.models import released
 
 KINDS = ("clip", "siglip2", "languagebind", "vlm2vec")
@@ -238,7 +239,7 @@ def test_released_models_are_ranked_as_retrievers(measure, presets) -> None:
 
 def test_a_tie_is_shared() -> None:
     scores = np.array([[1, 1, 0, 0], [1, 1, 1, 1], [0, 2, 1, 0], [3, 3, 3, 4]], np.float32)
-    assert nearest.credits(scores, [1, 0, 1, 0]).tolist() == [0.5, 0.25, 1, 0]
+    assert nearest_candidate.credits(scores, [1, 0, 1, 0]).tolist() == [0.5, 0.25, 1, 0]
 
 
 def test_a_tie_is_no_choice() -> None:
@@ -246,10 +247,10 @@ def test_a_tie_is_no_choice() -> None:
     scores, answers = rng.integers(3, size=(200, 4)).astype(np.float32), rng.integers(4, size=200)
     scores[:5, 1:] = np.nan
     scores[5] = np.nan
-    chosen = nearest.letters(scores)
+    chosen = nearest_candidate.letters(scores)
     assert chosen[:6] == ["A"] * 5 + [None]
     # What is chosen is right where the credit is whole.
-    credits = nearest.credits(scores, answers)
+    credits = nearest_candidate.credits(scores, answers)
     right = [c == LETTERS[a] for c, a in zip(chosen, answers, strict=True)]
     assert right == (credits == 1).tolist()
 

@@ -26,12 +26,13 @@ from conf.schema import (
     RetrieveCommand,
     RetrieverConfig,
 )
-from data.frames import Frames
+from data.render.frame_cache import Frames
 from data.store import open_store
-from evaluation import encoders, retrieve
-from evaluation.embedding import EMBEDDINGS, embed_frames, embed_queries, embedders
-from evaluation.metrics import metrics_from_counts, rank_metrics
-from train import retriever
+from evaluation import retrieve
+from evaluation.embedders import base
+from evaluation.embedders.embed import EMBEDDINGS, embed_frames, embed_queries, embedders
+from evaluation.metrics.accuracy import metrics_from_counts, rank_metrics
+from models.retriever import embedder
 
 CFG = RetrieverConfig(
     name="small", widths=[64, 32], quantization="none", lora=LoraConfig(rank=0), image_size=96,
@@ -49,8 +50,8 @@ def saved(tmp_path_factory, micro, micro_store) -> Path:
 
 def save_run(cfg: RetrieverConfig, folder: Path, micro, micro_store) -> Path:
     """A finished run of the trainer, as it leaves it."""
-    texts = retriever.corpus(micro_store.retrieval("train"), cfg)
-    built = retriever.load_retriever(cfg, "fp32", texts, folder / "untrained")
+    texts = embedder.corpus(micro_store.retrieval("train"), cfg)
+    built = embedder.load_retriever(cfg, "fp32", texts, folder / "untrained")
     # Far enough from its start that frames are apart: a new model's cosines differ by fp32's noise.
     noise = torch.Generator().manual_seed(0)
     for weight in built.parameters():
@@ -105,9 +106,9 @@ def test_it_is_measured_once_and_read_back(world, tmp_path, micro_store) -> None
     # What was kept is what the saved model gives anyone, and the report is the plain definition's,
     # whichever way the frames fall that fp32 hardly tells from the right one.
     model = SentenceTransformer(str(tmp_path / "run" / "retriever"), device="cpu")
-    plain = [retriever.query_input(q, frames, CFG) for q in queries]
+    plain = [embedder.query_input(q, frames, CFG) for q in queries]
     np.testing.assert_allclose(model.encode(plain, prompt_name="query"), asked, atol=1e-5)
-    plain = [retriever.frame_input(f, frames) for f in database]
+    plain = [embedder.frame_input(f, frames) for f in database]
     np.testing.assert_allclose(model.encode(plain, prompt_name="document"), shown, atol=1e-5)
     gold = np.array([database.index(q.target) for q in queries])
     for row in first["rows"][:2]:
@@ -162,9 +163,9 @@ def test_one_of_many_vectors_is_measured_by_late_interaction(
     first = world()
     queries, database = micro_store.standard_test(), micro_store.database()
     frames = Frames(micro_store, 96)
-    model = retriever.load_trained(cfg, "fp32", tmp_path / "run" / "retriever")
-    asked = model.encode_query([retriever.query_input(q, frames, CFG) for q in queries])
-    shown = model.encode_document([retriever.frame_input(f, frames) for f in database])
+    model = embedder.load_trained(cfg, "fp32", tmp_path / "run" / "retriever")
+    asked = model.encode_query([embedder.query_input(q, frames, CFG) for q in queries])
+    shown = model.encode_document([embedder.frame_input(f, frames) for f in database])
     gold = np.array([database.index(q.target) for q in queries])
     row = first["rows"][0]
     plain = rank_metrics(model.similarity(asked, shown).numpy(), gold, [1])
@@ -210,7 +211,7 @@ def test_a_batch_that_does_not_fit_is_told(world, monkeypatch) -> None:
     def full(*_: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
-    monkeypatch.setattr("evaluation.encoders.JointEncoder.frames", full)
+    monkeypatch.setattr("evaluation.embedders.base.JointEncoder.frames", full)
     with pytest.raises(
         UserError, match=r"out of memory where \d+ are embedded at once: lower batch"
     ):
@@ -302,7 +303,7 @@ def test_long_texts_pass_a_few_at_a_time_and_come_to_the_same(saved, micro_store
     monkeypatch.setattr(encoder, "_embedded", lambda *a: passed.append(a[0]) or plain(*a))
     longest = max(map(len, encoder._model.tokenizer(texts)["input_ids"]))
     for pairs, parts in ((3 * longest**2, [3, 3]), (1, [1] * 6), (6 * longest**2, [6])):
-        monkeypatch.setattr(encoders, "PAIRS", pairs)
+        monkeypatch.setattr(base, "PAIRS", pairs)
         passed.clear()
         np.testing.assert_allclose(encoder.texts(texts), whole, atol=1e-5)
         assert [len(some) for some in passed] == parts

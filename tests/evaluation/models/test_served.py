@@ -16,14 +16,14 @@ from PIL import Image
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import SelectCommand, ServerConfig, StudentConfig
-from data.frames import Frames
+from data.render.frame_cache import Frames
 from evaluation import select
-from evaluation.answers import AnswerLog, ask_all, judge
-from evaluation.asked import known_by, model_served, shown
-from evaluation.protocol import instruction, schema
-from evaluation.served import revision, say, written
+from evaluation.generators.model_source import known_by, model_served, shown
+from evaluation.generators.openai_server import revision, say, written
+from evaluation.generators.response_log import AnswerLog, ask_all, judge
+from evaluation.generators.response_schema import instruction, schema
 from teacher.servers.replies import CUT_OFF, Reply
-from tests.evaluation.test_protocol import FULL
+from tests.evaluation.generators.test_response_schema import FULL
 
 STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
 THINKING = replace(STUDENT, thinking=True, temperature=0.6, top_p=0.95, top_k=20)

@@ -30,17 +30,19 @@ from conf.schema import (
     TeacherConfig,
     TwoStageCommand,
 )
-from data.frames import Frames
+from data.render.frame_cache import Frames
 from data.store import Store, open_store
-from evaluation import matching, two_stage
-from evaluation.embedding import embed_queries, embedders, untrained_embedder
-from evaluation.encoders import released_encoder
-from evaluation.foreseen import ROUTES, foreseen
-from evaluation.measures import retrieval_rows
-from evaluation.metrics import query_measures, rank_metrics
-from evaluation.ranked import ranks_of, standard_test
+from evaluation import two_stage
+from evaluation.embedders.base import released_encoder
+from evaluation.embedders.embed import embed_queries, embedders, untrained_embedder
+from evaluation.metrics.accuracy import query_measures, rank_metrics
+from evaluation.metrics.breakdown import retrieval_rows
+from evaluation.retrieval import text_matching
+from evaluation.retrieval.predicted_texts import ROUTES, foreseen
+from evaluation.retrieval.standard_test import ranks_of, standard_test
+from models import loading
 from tests.evaluation.models import released
-from train import backbone, samples
+from train.student import dataset
 
 SMALL = ArchitectureConfig(
     hidden=64, layers=1, heads=2, kv_heads=2, feed_forward=64,
@@ -76,7 +78,7 @@ def store(tmp_path, micro_store) -> Store:
 
 
 @pytest.fixture
-def ranks(store, clip, tmp_path) -> Callable[..., matching.Ranks]:
+def ranks(store, clip, tmp_path) -> Callable[..., text_matching.Ranks]:
     """Ranks of the standard test by texts of its queries, and of frames."""
     queries, database = standard_test(store)
     matcher = untrained_embedder(clip, "fp32", tmp_path)
@@ -85,7 +87,7 @@ def ranks(store, clip, tmp_path) -> Callable[..., matching.Ranks]:
         texts = {ROUTES[route].mode: dict(zip((q.name for q in queries), said, strict=True))}
         texts["caption"] = dict(zip((f.name for f in database), captions, strict=False))
         cfg = TwoStageCommand(images=ImageServerConfig(model="painter", **images))
-        return matching.ranks(cfg, ROUTES[route], matcher, texts, queries, database, store)
+        return text_matching.ranks(cfg, ROUTES[route], matcher, texts, queries, database, store)
 
     return rank
 
@@ -254,8 +256,8 @@ def log_of(store: Store) -> Path:
 @pytest.mark.slow
 def test_a_student_writes_once_for_every_matcher(world, store, micro, clip, tmp_path) -> None:
     folder = tmp_path / "sft"
-    model, processor = backbone.load_student(STUDENT, "bf16", lambda: samples.corpus(store, []))
-    backbone.save(model, processor, folder / "student", "bf16")
+    model, processor = loading.load_student(STUDENT, "bf16", lambda: dataset.corpus(store, []))
+    loading.save(model, processor, folder / "student", "bf16")
     settings = SftCommand(benchmark=micro, teacher=TeacherConfig(name="template"), student=STUDENT)
     OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
     (folder / "metrics.json").write_text("{}")

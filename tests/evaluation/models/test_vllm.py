@@ -14,14 +14,15 @@ from transformers import AutoModelForImageTextToText, AutoProcessor
 
 from conf.entry import Run
 from conf.schema import ArchitectureConfig, LoraConfig, SelectCommand, ServerConfig, StudentConfig
-from data.frames import Frames
+from data.render.frame_cache import Frames
 from evaluation import select
-from evaluation.asked import shown
-from evaluation.protocol import Reason, parse, schema
-from evaluation.served import chat_of, request_of
+from evaluation.generators.model_source import shown
+from evaluation.generators.openai_server import chat_of, request_of
+from evaluation.generators.response_schema import Reason, parse, schema
+from models import loading
+from models.student.collator import Collator, encode
 from tests.teacher.serving import Serving
-from train import backbone, samples
-from train.collate import Collator, encode
+from train.student import dataset
 
 pytestmark = pytest.mark.slow
 
@@ -40,9 +41,9 @@ def base(tmp_path_factory, micro_store):
     """A base on disk, whose processor has sizes of its own, as a released one's has, and sees
     single images in other shades than clips, as the tiny base's does."""
     folder = tmp_path_factory.mktemp("base")
-    model, processor = backbone.load_base(STUDENT, "fp32", lambda: samples.corpus(micro_store, []))
+    model, processor = loading.load_base(STUDENT, "fp32", lambda: dataset.corpus(micro_store, []))
     processor.image_processor.image_mean = [0.4, 0.45, 0.5]
-    backbone.save(model, processor, folder, "fp32")
+    loading.save(model, processor, folder, "fp32")
     return folder
 
 
@@ -57,12 +58,12 @@ def adapters(cfg, tmp_path_factory):
     folder = tmp_path_factory.mktemp("student")
     torch.manual_seed(0)
     trained = replace(cfg, lora=LoraConfig(rank=4))
-    model, processor = backbone.load_student(trained, "fp32", list)
+    model, processor = loading.load_student(trained, "fp32", list)
     with torch.no_grad():
         for name, weight in model.named_parameters():
             if "lora_B" in name:
                 weight.normal_(std=0.2)
-    backbone.save(model, processor, folder, "fp32")
+    loading.save(model, processor, folder, "fp32")
     return folder
 
 
@@ -70,8 +71,8 @@ def adapters(cfg, tmp_path_factory):
 def merged(cfg, adapters, tmp_path_factory):
     """The same student merged into its base, as `train.export` writes it."""
     folder = tmp_path_factory.mktemp("merged")
-    model, processor = backbone.load_base(cfg, "fp32", list)
-    backbone.write(backbone.merged(model, adapters, "none", "fp32"), processor, folder)
+    model, processor = loading.load_base(cfg, "fp32", list)
+    loading.write(loading.merged(model, adapters, "none", "fp32"), processor, folder)
     return folder
 
 
@@ -97,7 +98,7 @@ def test_the_server_is_asked_with_the_ids_that_a_model_here_reads(
     server, cfg, base, micro_store, control
 ) -> None:
     frames, processor = Frames(micro_store, cfg.image_size), AutoProcessor.from_pretrained(base)
-    backbone.pin_sizes(processor, cfg.image_size, cfg.frames)
+    loading.pin_sizes(processor, cfg.image_size, cfg.frames)
     client = openai.OpenAI(base_url=server.url, api_key="none")
     for mode, item in zip(("record", "answer"), micro_store.selection("test"), strict=False):
         sample = shown("cot", frames, cfg, control, mode, item)
@@ -185,7 +186,7 @@ def scored_here(folder, cfg, store, item) -> np.ndarray:
     """The log-probability of every token there, by the standard classes."""
     sample = shown("cot", Frames(store, cfg.image_size), cfg, None, "answer", item)
     processor = AutoProcessor.from_pretrained(folder)
-    backbone.pin_sizes(processor, cfg.image_size, cfg.frames)
+    loading.pin_sizes(processor, cfg.image_size, cfg.frames)
     model = AutoModelForImageTextToText.from_pretrained(folder, dtype="auto").eval()
     with torch.no_grad():
         logits = model(**Collator(processor, cfg.max_length)([sample])).logits

@@ -15,9 +15,9 @@ from conf.errors import UserError
 from conf.schema import ReportCommand
 from data.records import FAMILIES
 from evaluation import report
+from evaluation.reporting.tables import human_table
 from evaluation.study.agreement import fleiss_kappa, krippendorff_alpha, majority, summary
 from evaluation.study.votes import Vote
-from evaluation.tables import human_table
 
 
 def vote(annotator: str, item: int, choice: int, family: str = "event", **changes) -> Vote:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data.frames import Frames
+from data.render.frame_cache import Frames
 from evaluation.study.media import IMAGE, PREFIX, VIDEO, encode_video, media_of
 
 END = b"\x00\x00\x00\x00IEND\xaeB`\x82"

@@ -21,8 +21,8 @@ from starlette.responses import PlainTextResponse
 
 from conf.entry import Run
 from conf.schema import ExportStudyCommand
-from data.frames import Frames
 from data.records import LETTERS
+from data.render.frame_cache import Frames
 from evaluation.study import accounts, export, storage
 from evaluation.study.app import make_app
 from evaluation.study.guards import HEADERS, Guard

@@ -1,0 +1,119 @@
+"""How long a benchmark takes to build without its frames, and how that grows with its scenes.
+
+    python -m benchmarks.speed.build 100 1000 10000
+
+For each number of scenes the dynapix preset is built with its quotas in proportion, stage by stage:
+scenes with their oracle, then items and queries, then databases. Given are seconds, scenes a second
+and a worker, and the most memory that all processes held together. The last one's report is printed
+whole. Builds go on below FOLDER (store/growth) where they were stopped, so a figure holds only for
+one that ran through.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+
+import psutil
+
+from conf.compose import compose
+from conf.schema import BenchmarkConfig, BuildCommand, Quota
+from data.parallel import Workers
+from data.partial_build import growing_folder
+from data.store import load_scene, scene_path
+from data.tracks.build_items import family_quotas, make_items_and_queries
+from data.tracks.retrieval.database import make_databases
+from data.tracks.shortfalls import count, shortfalls
+from data.world.scenes import make_scenes
+
+PAPER_SCENES = 10_000
+
+
+def preset(scenes: int) -> BenchmarkConfig:
+    """The dynapix preset at another size, its quotas and databases in proportion."""
+    cfg = compose("data.build", BuildCommand, ["benchmark=dynapix"]).benchmark
+    cfg.name, cfg.scenes, share = f"growth-{scenes}", scenes, scenes / PAPER_SCENES
+
+    def scaled(quota: Quota) -> Quota:
+        return Quota(round(share * quota.train), round(share * quota.test))
+
+    for quotas in (*family_quotas(cfg).values(), cfg.retrieval.builders):
+        for name, quota in quotas.items():
+            quotas[name] = scaled(quota)
+    cfg.selection.matched = scaled(cfg.selection.matched)
+    cfg.retrieval.counterfactual = scaled(cfg.retrieval.counterfactual)
+    for key in ("standard", "database", "source", "counterfactual_source"):
+        setattr(cfg.retrieval, key, round(share * getattr(cfg.retrieval, key)))
+    return cfg
+
+
+class Peak:
+    """The most memory (GiB) that this process and its children held at once since it was begun."""
+
+    def __init__(self) -> None:
+        self.gib = 0.0
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def _watch(self) -> None:
+        own = psutil.Process()
+        while True:
+            held = 0
+            for process in (own, *own.children(recursive=True)):
+                try:
+                    held += process.memory_info().rss
+                except psutil.NoSuchProcess:
+                    continue
+            self.gib = max(self.gib, held / 2**30)
+            time.sleep(0.5)
+
+
+@contextmanager
+def timed(times: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    times[stage] = time.perf_counter() - start
+
+
+def measure(scenes: int, folder: Path, workers: int) -> str:
+    cfg, pool, peak = preset(scenes), Workers(workers), Peak()
+    times: dict[str, float] = {}
+    with growing_folder(cfg, folder / cfg.name) as growing:
+        with timed(times, "scenes"):
+            scene_ids, _ = make_scenes(cfg, growing, pool, strict=True)
+        with timed(times, "items"):
+            items, queries, dropped = make_items_and_queries(cfg, growing, scene_ids, pool)
+        with timed(times, "databases"):
+            scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(growing, name)))
+            queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
+    found = count(scene_ids, items, queries, databases) | dropped | left_out
+    short = shortfalls(cfg, items, queries, databases)
+    print("\n".join(f"  {name:<40}{many:>8,}" for name, many in found.items()))
+    print("\n".join(f"  short: {cell} has {has}" for cell, has in short.items()))
+    absent = len(list(growing.glob("scenes/*-without-*.npz")))
+    rate = (scenes + absent) / times["scenes"] / workers
+    row = "".join(f"{times[stage]:>11.1f}" for stage in ("scenes", "items", "databases"))
+    return f"{scenes:>8,}{absent:>9,}{row}{rate:>14.1f}{peak.gib:>10.1f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scenes", type=int, nargs="+")
+    parser.add_argument("--folder", type=Path, default=Path("store/growth"))
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args()
+    logging.basicConfig(level=logging.WARNING)
+    rows = [measure(scenes, options.folder, options.workers) for scenes in options.scenes]
+    print(f"\n{options.workers} workers; seconds a stage; scenes counted with those that lack one")
+    head = f"{'scenes':>8}{'absent':>9}{'scenes':>11}{'items':>11}{'databases':>11}"
+    print(head + f"{'scenes/s/core':>14}{'peak GiB':>10}")
+    print("\n".join(rows))
+
+
+if __name__ == "__main__":
+    main()

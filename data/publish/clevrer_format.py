@@ -1,0 +1,170 @@
+"""Export scenes as CLEVRER's release has them, so that a loader written for it reads them."""
+
+from __future__ import annotations
+
+import io
+import json
+import warnings
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from conf.errors import UserError
+from data.parallel import Workers
+from data.records import FPS, FRAMES, Scene
+from data.releases.clevrer import EULER, VECTORS
+from data.render.frame_cache import FrameCache, load_frames
+from data.store import Store, load_scene, scene_path, write_atomically
+
+FIRST_VALIDATION, FIRST_TEST = 10_000, 15_000
+BLOCK = 1_000
+"""Scenes that share a folder."""
+QUALITY = "6"
+"""x264's constant rate factor: no loss that is seen."""
+
+
+def export_clevrer(store: Store, folder: Path, workers: Workers) -> int:
+    """Write every scene of a benchmark with all its frames as a release of CLEVRER, training scenes
+    as its train part and test scenes as its validation part; scenes that are there stay.
+
+    Returns:
+        How many scenes the release has.
+
+    Raises:
+        UserError: CLEVRER has no room for so many, or no scenes like these.
+    """
+    indices = {
+        name: first + k
+        for split, first in (("train", 0), ("test", FIRST_VALIDATION))
+        for k, name in enumerate(store.scene_ids(split))
+    }
+    cache = FrameCache.of(store)
+    jobs = {
+        name: partial(_export_one, cache, name, folder, index)
+        for name, index in indices.items()
+        if not annotation_path(folder, index).exists()
+    }
+    done = len(indices) - len(jobs)
+    for _ in workers.run(jobs, "exporting scenes", "scene", done):
+        pass
+    return len(indices)
+
+
+def _export_one(cache: FrameCache, scene_id: str, folder: Path, index: int) -> None:
+    scene = load_scene(scene_path(cache.folder, scene_id))
+    pixels = load_frames(cache.path(scene_id))
+    pixels |= cache.draw(scene_id, [f for f in range(scene.frames) if f not in pixels])
+    write_clevrer(scene, {f: Image.fromarray(p) for f, p in pixels.items()}, folder, index)
+
+
+def annotation_path(folder: Path, index: int) -> Path:
+    """Where a release has the annotation of scene `index`."""
+    part = "train" if index < FIRST_VALIDATION else "validation"
+    block = index // BLOCK * BLOCK
+    span = f"{block:05d}-{block + BLOCK:05d}"
+    return folder / f"annotation_{part}/annotation_{span}/annotation_{index:05d}.json"
+
+
+def write_clevrer(
+    scene: Scene, images: dict[int, Image.Image], folder: Path, index: int
+) -> tuple[Path, Path]:
+    """Write a scene and its frames as scene `index` of a release, so that a loader of CLEVRER reads
+    it; `index` says which split it is in: train below 10,000, validation below 15,000.
+
+    An oracle does not say where two objects touched: the middle between their centres stands for
+    it.
+
+    Returns:
+        The paths of the annotation and of the video.
+
+    Raises:
+        UserError: CLEVRER has no such index, or no scene like this one.
+    """
+    if not 0 <= index < FIRST_TEST:
+        raise UserError(
+            f"scene {scene.scene_id} cannot be number {index} of a release: annotations are "
+            f"numbered 0 to {FIRST_TEST - 1}"
+        )
+    if scene.frames != FRAMES or sorted(images) != list(range(FRAMES)):
+        raise UserError(
+            f"scene {scene.scene_id} has {scene.frames} frames and {len(images)} images: CLEVRER "
+            f"has {FRAMES} of each"
+        )
+    annotation = annotation_path(folder, index)
+    beside = str(annotation.relative_to(folder)).replace("annotation", "video")
+    video = (folder / beside).with_suffix(".mp4")
+    # The annotation last, for where it stands the scene is whole.
+    write_atomically(video, _encoded([images[frame] for frame in range(FRAMES)]))
+    write_atomically(annotation, json.dumps(_annotation(scene, index, video.name)).encode())
+    return annotation, video
+
+
+def _annotation(scene: Scene, index: int, video: str) -> dict[str, Any]:
+    vectors = {
+        "location": scene.positions,
+        "orientation": _angles(scene.quaternions),
+        "velocity": scene.velocities,
+        "angular_velocity": scene.angular_velocities,
+    }
+    return {
+        "scene_index": index,
+        "video_filename": video,
+        "object_property": [
+            {"object_id": k, "color": o.color, "material": o.material, "shape": o.shape}
+            for k, o in enumerate(scene.objects)
+        ],
+        "motion_trajectory": [
+            {
+                "frame_id": frame,
+                "objects": [
+                    {
+                        "object_id": k,
+                        **{key: vectors[key][frame, k].tolist() for key in VECTORS},
+                        "inside_camera_view": bool(scene.in_view[frame, k]),
+                    }
+                    for k in range(len(scene.objects))
+                ],
+            }
+            for frame in range(scene.frames)
+        ],
+        "collision": [
+            {
+                "object_ids": list(c.objects),
+                "frame_id": c.frame,
+                "location": scene.positions[c.frame, list(c.objects)].mean(axis=0).tolist(),
+            }
+            for c in scene.collisions
+        ],
+    }
+
+
+def _angles(quaternions: np.ndarray) -> np.ndarray:
+    """(..., 4) quaternions in x y z w order -> (..., 3) radians, the inverse of
+    `clevrer.quaternions`."""
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_quat(quaternions.reshape(-1, 4).astype(np.float64))
+    with warnings.catch_warnings():
+        # On its side a cylinder's angles are not unique; any of them is the same rotation.
+        warnings.filterwarnings("ignore", "Gimbal lock")
+        return turns.as_euler(EULER).reshape(*quaternions.shape[:-1], 3)
+
+
+def _encoded(images: list[Image.Image]) -> bytes:
+    """An mp4 of images of one size, both sides even."""
+    import av
+
+    width, height = images[0].size
+    if width % 2 or height % 2:
+        raise UserError(f"a video of {width} x {height} px cannot be written: both must be even")
+    target = io.BytesIO()
+    with av.open(target, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=FPS, options={"crf": QUALITY})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_image(image)))
+        container.mux(stream.encode())
+    return target.getvalue()

@@ -1,0 +1,121 @@
+"""How a scene is watched and lit, and what its objects look like: colours, meshes and the textures
+that stand for materials."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from data.records import COLORS
+from data.world.geometry import CUBE_HALF, RADIUS, STANDARD_CAMERA, Camera
+
+
+@dataclass(frozen=True)
+class View:
+    """How scenes are watched and lit."""
+
+    camera: Camera = STANDARD_CAMERA
+    """Its eye stands in the plane of x and z."""
+    floor: tuple[float, float, float] = (158.0, 156.0, 152.0)
+    """The floor's colour, RGB of 255, where its shade is 1."""
+    light: tuple[float, float, float] = (3.0, 3.0, 6.0)
+    """Where the lamp stands."""
+
+
+STANDARD_VIEW = View()
+
+RGB = dict(
+    zip(
+        COLORS,
+        [
+            (112, 112, 112),
+            (186, 38, 38),
+            (38, 72, 204),
+            (34, 136, 34),
+            (122, 66, 22),
+            (38, 196, 196),
+            (132, 38, 186),
+            (250, 230, 48),
+        ],
+        strict=True,
+    )
+)
+"""Colours as CLEVRER names them; green and brown a little darker so that small objects differ."""
+
+SEGMENTS = 48
+
+
+def mesh(shape: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (V, 3), normals (V, 3), texture coordinates (V, 2) and triangles (T, 3)."""
+    if shape == "sphere":
+        return _turned(*_sphere_profile())
+    if shape == "cylinder":
+        return _turned(*_cylinder_profile())
+    return _cube()
+
+
+def _sphere_profile() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    angle = np.linspace(0, np.pi, SEGMENTS // 2 + 1)
+    normals = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    return RADIUS * normals, normals, angle / np.pi
+
+
+def _cylinder_profile() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    # The rim stands twice, once with the cap's normal and once with the side's: a hard edge.
+    points = RADIUS * np.array([[0, 1], [1, 1], [1, 1], [1, -1], [1, -1], [0, -1]], dtype=float)
+    normals = np.array([[0, 1], [0, 1], [1, 0], [1, 0], [0, -1], [0, -1]], dtype=float)
+    return points, normals, np.array([0.05, 0.2, 0.25, 0.75, 0.8, 0.95])
+
+
+def _turned(
+    points: np.ndarray, normals: np.ndarray, down: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A profile of (radius, height) turned about the z axis."""
+    turns = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
+    around = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+
+    def spin(profile: np.ndarray) -> np.ndarray:
+        flat = profile[:, None, 0, None] * around[None]
+        return np.concatenate(
+            [flat, np.broadcast_to(profile[:, None, 1:], (*flat.shape[:2], 1))], -1
+        )
+
+    uvs = np.stack(np.broadcast_arrays(turns[None] / (2 * np.pi), down[:, None]), axis=-1)
+    row, column = np.meshgrid(np.arange(len(points) - 1), np.arange(SEGMENTS), indexing="ij")
+    a = (row * (SEGMENTS + 1) + column).ravel()
+    b = a + SEGMENTS + 1
+    triangles = np.concatenate([np.stack([a, b, a + 1], 1), np.stack([a + 1, b, b + 1], 1)])
+    return spin(points).reshape(-1, 3), spin(normals).reshape(-1, 3), uvs.reshape(-1, 2), triangles
+
+
+def _cube() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)
+    vertices, normals, triangles = [], [], []
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            face = np.insert(corners, axis, side, axis=1)
+            first, second, third = face[0], face[1], face[2]
+            outward = np.cross(second - first, third - second)[axis] * side > 0
+            base = 4 * len(vertices)
+            vertices.append(face if outward else face[::-1])
+            normals.append(np.tile(np.insert(np.zeros(2), axis, side), (4, 1)))
+            triangles += [[base, base + 1, base + 2], [base, base + 2, base + 3]]
+    uvs = np.tile((corners + 1) / 2, (6, 1))
+    return (
+        CUBE_HALF * np.concatenate(vertices),
+        np.concatenate(normals),
+        uvs,
+        np.array(triangles),
+    )
+
+
+def texture(material: str) -> np.ndarray:
+    """(64, 64, 3) uint8 that multiplies an object's colour: a mirrored sky above a dark horizon
+    for metal, plain for rubber."""
+    if material == "rubber":
+        return np.full((64, 64, 3), 215, dtype=np.uint8)
+    across, down = np.meshgrid(np.linspace(0, 1, 64), np.linspace(0, 1, 64))
+    sky = np.where(down < 0.5, 1.0 - 0.5 * down, 0.15 + 1.1 * (down - 0.5))
+    room = sky * (1 + 0.25 * np.cos(4 * np.pi * across))
+    return (255 * np.clip(room, 0.1, 1)).astype(np.uint8)[..., None].repeat(3, 2)

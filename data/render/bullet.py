@@ -1,0 +1,190 @@
+"""Frames of a scene by Bullet's rasteriser.
+
+Bullet's software renderer (TinyRenderer, no OpenGL) draws the objects from smooth meshes, metal
+with a reflection-like texture and a sharp highlight, rubber matt. It cannot clip a large floor nor
+soften a shadow, so floor and contact shadows are shaded here, behind the objects' mask. Frames are
+drawn at twice the size and averaged, which smooths the outlines.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from data.records import MATERIALS, Scene, SceneObject
+from data.render.appearance import RGB, STANDARD_VIEW, View, mesh, texture
+from data.render.floor import Floor
+from data.world.geometry import Camera
+from data.world.physics import connect
+
+if TYPE_CHECKING:
+    from pybullet_utils.bullet_client import BulletClient
+
+VERSION = "bullet-1"
+
+OVERSAMPLING = 2
+NEAR, FAR = 0.1, 50.0
+
+
+class BulletRenderer:
+    """Draws frames of any scene at one size, in this process, without a window."""
+
+    version = VERSION
+
+    def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
+        self._seen_as = view
+        self._bullet, self._rasteriser = self._connect()
+        self._fine = view.camera.sized(width * OVERSAMPLING, height * OVERSAMPLING)
+        self._view = self._bullet.computeViewMatrix(self._fine.eye, [0, 0, 0], [0, 0, 1])
+        self._projection = _projection(self._fine)
+        self._floor = Floor(view.camera.sized(width, height), view.light)
+        self._textures = self._load_textures()
+        self._visuals: dict[SceneObject, int] = {}
+        self._scene_id: str | None = None
+        self._handles: list[int] = []
+
+    @staticmethod
+    def check() -> None:
+        """It runs wherever scenes are simulated."""
+
+    def render(self, scene: Scene, frame: int) -> Image.Image:
+        """One frame as an RGB image of this renderer's size."""
+        self.pose(scene, frame)
+        touched, objects, cover = _average(*self.photograph())
+        shade = self._floor.shade(scene.positions[frame], self._shadows[frame])
+        bands = []
+        for drawn, tint in zip(objects, self._seen_as.floor, strict=True):
+            plane = shade * tint
+            pixels = plane.reshape(-1)
+            pixels[touched] = drawn + (1 - cover) * pixels[touched]
+            bands.append(Image.fromarray(np.rint(plane, out=plane).astype(np.uint8)))
+        return Image.merge("RGB", bands)
+
+    def pose(self, scene: Scene, frame: int) -> list[int]:
+        """Put a scene's objects where they are at a frame, and give their handles in the mask."""
+        if scene.scene_id != self._scene_id:
+            self._load(scene)
+        for handle, look, place, turn in zip(
+            self._handles,
+            scene.objects,
+            scene.positions[frame].tolist(),
+            scene.quaternions[frame].tolist(),
+            strict=True,
+        ):
+            # A reflection stays where the room is while a ball rolls.
+            turn = [0, 0, 0, 1] if look.shape == "sphere" else turn
+            self._bullet.resetBasePositionAndOrientation(handle, place, turn)
+        return list(self._handles)
+
+    def photograph(self) -> tuple[np.ndarray, np.ndarray]:
+        """The posed objects without a floor at OVERSAMPLING times the size: (H, W, 4) uint8, and
+        the mask (H, W) int32, an object's handle or -1."""
+        _, _, pixels, _, mask = self._bullet.getCameraImage(
+            self._fine.width,
+            self._fine.height,
+            self._view,
+            self._projection,
+            lightDirection=self._seen_as.light,
+            lightColor=[1, 1, 1],
+            shadow=0,
+            lightAmbientCoeff=0.45,
+            lightDiffuseCoeff=0.6,
+            lightSpecularCoeff=0.6,
+            renderer=self._rasteriser,
+        )
+        return pixels, mask
+
+    def _connect(self) -> tuple[BulletClient, int]:
+        """A Bullet client, and which of its rasterisers draws."""
+        bullet = connect()
+        return bullet, bullet.ER_TINY_RENDERER
+
+    def _load_textures(self) -> dict[str, int]:
+        with tempfile.TemporaryDirectory() as folder:
+            paths = save_textures(Path(folder))
+            return {m: self._bullet.loadTexture(str(path)) for m, path in paths.items()}
+
+    def _load(self, scene: Scene) -> None:
+        self._clear()
+        self._handles = [self._add(look) for look in scene.objects]
+        self._shadows = self._floor.shadows(scene.positions)
+        self._scene_id = scene.scene_id
+
+    def _clear(self) -> None:
+        # Bodies are taken out one by one: resetting the simulation loses megabytes each time.
+        for handle in self._handles:
+            self._bullet.removeBody(handle)
+        self._handles, self._scene_id = [], None
+
+    def _add(self, look: SceneObject) -> int:
+        handle = self._new_body(look)
+        texture_id = self._textures[look.material]
+        self._bullet.changeVisualShape(handle, -1, textureUniqueId=texture_id)
+        return handle
+
+    def _new_body(self, look: SceneObject) -> int:
+        bullet = self._bullet
+        if look not in self._visuals:
+            shine = 1.0 if look.material == "metal" else 0.05
+            self._visuals[look] = bullet.createVisualShape(
+                bullet.GEOM_MESH,
+                **self._mesh(look),
+                rgbaColor=[*(np.array(RGB[look.color]) / 255), 1],
+                specularColor=[shine] * 3,
+            )
+        return bullet.createMultiBody(0, -1, self._visuals[look])
+
+    def _mesh(self, look: SceneObject) -> dict[str, Any]:
+        """An object's mesh as createVisualShape takes it."""
+        vertices, normals, uvs, triangles = mesh(look.shape)
+        return {
+            "vertices": vertices.tolist(),
+            "normals": normals.tolist(),
+            "uvs": uvs.tolist(),
+            "indices": triangles.ravel().tolist(),
+        }
+
+
+def save_textures(folder: Path) -> dict[str, Path]:
+    """Write each material's texture as a PNG, since Bullet reads textures from files alone."""
+    paths = {material: folder / f"{material}.png" for material in MATERIALS}
+    for material, path in paths.items():
+        Image.fromarray(texture(material)).save(path)
+    return paths
+
+
+def _average(pixels: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Objects averaged down by two, at the few pixels that they touch.
+
+    Args:
+        pixels: (2H, 2W, 4) uint8, and mask (2H, 2W) int32, negative where no object is.
+
+    Returns:
+        (P,) flat indices of the touched pixels of the small image, there (3, P) float32 objects on
+        black, and (P,) float32 the share of the pixel that they cover.
+    """
+    # Two neighbours at once: only where no object is has a mask all bits set.
+    pairs = mask.view(np.int64)
+    touched = np.flatnonzero((pairs[0::2] & pairs[1::2]) != -1)
+    width = mask.shape[1]
+    row, column = np.divmod(touched, width // 2)
+    first = 2 * row * width + 2 * column
+    four = first + np.array([[0], [1], [width], [width + 1]])
+    seen = mask.ravel()[four] >= 0
+    drawn = pixels.view(np.uint32).ravel()[four] * seen
+    total = drawn.view(np.uint8).reshape(4, -1).sum(axis=0, dtype=np.uint16)
+    objects = ((total + 2) // 4).reshape(-1, 4)[:, :3].T.astype(np.float32)
+    # To whole 255ths, as if the cover were a fourth channel of the image.
+    cover = (seen.sum(axis=0, dtype=np.uint16) * 255 + 2) // 4
+    return touched, objects, cover.astype(np.float32) / 255
+
+
+def _projection(camera: Camera) -> list[float]:
+    """OpenGL's projection matrix, column by column, for square pixels."""
+    x, y = 2 * camera.focal / camera.width, 2 * camera.focal / camera.height
+    depth, shift = -(FAR + NEAR) / (FAR - NEAR), -2 * FAR * NEAR / (FAR - NEAR)
+    return [x, 0, 0, 0, 0, y, 0, 0, 0, 0, depth, -1, 0, 0, shift, 0]

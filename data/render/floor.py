@@ -1,0 +1,72 @@
+"""The ground that objects stand on, shaded pixel by pixel: one soft lamp and contact shadows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data.world.geometry import RADIUS, Camera
+
+SHADOW_DEPTH = 0.55
+
+_SPREAD = 2 * (0.85 * RADIUS) ** 2
+_REACH = 1.0
+"""How far a shadow is drawn, simulator units. Beyond 0.984 it takes so little that float32 does not
+change: exp(-d^2 / _SPREAD) times SHADOW_DEPTH is under 2^-25."""
+
+
+class Floor:
+    """The floor as one camera sees it, under a lamp at `light`."""
+
+    def __init__(self, camera: Camera, light: tuple[float, float, float]) -> None:
+        self._camera, self._light = camera, light
+        columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+        rays = camera.rays(columns.astype(float), rows.astype(float))
+        reach = camera.eye[2] / -rays[..., 2]
+        points = np.asarray(camera.eye)[:2] + reach[..., None] * rays[..., :2]
+        distance = np.linalg.norm(points - np.array([0.3, 0.0]), axis=-1)
+        self._lit = (1.12 / (1 + (distance / 7.5) ** 2)).astype(np.float32)
+        self._y = points[..., 1].astype(np.float32).astype(float)
+        self._x = points[:, :1, 0].astype(np.float32).astype(float)
+
+    def shade(self, positions: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+        """How bright the floor is: brightest in the middle, falling off with distance as under one
+        lamp, and darkened around where each object stands.
+
+        Args:
+            positions: (N, 3) where the objects are, and boxes (N, 4) where `shadows` has them.
+
+        Returns:
+            (H, W) float32.
+        """
+        shade = self._lit.copy()
+        for (x, y), (left, top, right, bottom) in zip(
+            self._shadow_centres(positions).tolist(), boxes.tolist(), strict=True
+        ):
+            if left < right and top < bottom:
+                box = np.s_[top:bottom, left:right]
+                across, along = self._y[box] - y, self._x[top:bottom] - x
+                across *= across
+                along *= along
+                across += along
+                across /= -_SPREAD
+                np.exp(across, out=across)
+                across *= -SHADOW_DEPTH
+                across += 1
+                shade[box] *= across
+        return shade
+
+    def shadows(self, positions: np.ndarray) -> np.ndarray:
+        """(..., 4) left, top, right and bottom of the pixels that the shadows of objects at
+        (..., 3) reach."""
+        ground = np.zeros(positions.shape)
+        ground[..., :2] = self._shadow_centres(positions)
+        corners = _REACH * np.array([[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]])
+        # A corner behind the camera is projected far below the image, where it does no harm.
+        pixels, _ = self._camera.project(ground[..., None, :] + corners)
+        size = self._camera.width, self._camera.height
+        boxes = np.concatenate([pixels.min(axis=-2), pixels.max(axis=-2) + 1], axis=-1)
+        return np.clip(boxes, 0, [*size, *size]).astype(int)
+
+    def _shadow_centres(self, positions: np.ndarray) -> np.ndarray:
+        """(..., 2) where on the ground the shadows of objects at (..., 3) are darkest."""
+        return positions[..., :2] - 0.5 * RADIUS * np.asarray(self._light[:2]) / self._light[2]

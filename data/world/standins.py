@@ -1,0 +1,129 @@
+"""Bullet's scenes of another look and physics, which stand in for MoVi-A's and Physion's.
+
+No release of theirs is needed to try a transfer suite's recipe, or to see whether a student carries
+over to motions, light and a camera that it never saw. They are no measurement of the paper's
+suites, and are named so everywhere: `standin_movi_a`, `standin_physion`. As there, MoVi-A's objects
+fall and bounce for two seconds; Physion's stand, and are struck or fallen upon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from conf.schema import BenchmarkConfig
+from data.records import Scene, SceneObject
+from data.render.appearance import STANDARD_VIEW, View
+from data.world.geometry import RADIUS, Camera
+from data.world.physics import GENERATOR_VERSION, Body, Physics, world
+from data.world.sampling import pair, record, sample_looks, shows, unit
+
+STANDINS_VERSION = "2"
+"""Changes whenever a stand-in would have other scenes or another look."""
+
+ROW_STEP = (0.75, 1.1)
+"""From one standing object to the next, simulator units."""
+
+Start = tuple[str, list[Body]]
+"""A scenario and the bodies that begin it."""
+
+
+@dataclass(frozen=True)
+class Standin:
+    """A kind of scenes: how long, by what physics, how it looks, and how one begins."""
+
+    frames: int
+    physics: Physics
+    view: View
+    start: Callable[[list[SceneObject], View, np.random.Generator], Start | None]
+    """Bodies of such looks; None where a place was not found."""
+
+
+def thrown(looks: list[SceneObject], view: View, rng: np.random.Generator) -> Start | None:
+    """Objects in the air, thrown towards the middle."""
+    bodies = []
+    for look in looks:
+        place = rng.uniform([-1.5, -1.6], [0.9, 1.6])
+        height = rng.uniform(0.5, 1.5)
+        if not shows(place, height, view.camera):
+            return None
+        toward = rng.uniform(-0.5, 0.5, 2) - place
+        velocity = rng.uniform(0.6, 1.6) * toward / np.linalg.norm(toward)
+        bodies.append(Body(look, pair(place), rng.uniform(0, np.pi), pair(velocity), height))
+    return "", bodies
+
+
+def struck(looks: list[SceneObject], view: View, rng: np.random.Generator) -> Start | None:
+    """Objects in a row, the first of which is struck by one that comes from afar, along the row
+    (scenario Collide), or on which one falls (Drop)."""
+    last, *row = looks
+    # Across the view: of a row that leads away from the camera, little shows.
+    bearing = rng.choice([-1, 1]) * np.pi / 2 + rng.uniform(-0.7, 0.7)
+    place = rng.uniform([-0.8, -1.0], [1.0, 1.0])
+    first, bodies = place, []
+    for look in row:
+        if not shows(place, RADIUS, view.camera):
+            return None
+        bodies.append(Body(look, pair(place), rng.uniform(0, np.pi), (0.0, 0.0)))
+        place = place + rng.uniform(*ROW_STEP) * unit(bearing + rng.normal(0, 0.15))
+    if rng.random() < 0.5:
+        start = first - rng.uniform(1.5, 3.0) * unit(bearing + rng.normal(0, 0.05))
+        velocity = first - start
+        velocity *= rng.uniform(1.5, 3.0) / np.linalg.norm(velocity)
+        bodies.append(Body(last, pair(start), rng.uniform(0, np.pi), pair(velocity)))
+        return "Collide", bodies
+    start = first + rng.normal(0, 0.25, 2)
+    height = rng.uniform(0.9, 1.6)
+    if not shows(start, height, view.camera):
+        return None
+    velocity = rng.uniform(0.2, 0.8) * unit(rng.uniform(0, 2 * np.pi))
+    bodies.append(Body(last, pair(start), rng.uniform(0, np.pi), pair(velocity), height))
+    return "Drop", bodies
+
+
+STANDINS = {
+    "movi_a": Standin(
+        frames=24,
+        physics=Physics(
+            fps=12, substeps=15, gravity=6.0, ground_friction=0.6, object_friction=0.4,
+            ground_restitution=0.9, rubber_restitution=0.8, metal_restitution=0.5,
+        ),
+        view=View(Camera(eye=(3.6, 0.0, 3.5)), (184.0, 188.0, 194.0), (-3.0, 4.0, 7.0)),
+        start=thrown,
+    ),
+    "physion": Standin(
+        frames=150,
+        physics=Physics(fps=30, substeps=6, gravity=4.0, metal_restitution=0.4),
+        view=View(Camera(eye=(4.5, 0.0, 2.0)), (176.0, 148.0, 112.0), (4.0, -4.0, 5.0)),
+        start=struck,
+    ),
+}  # fmt: skip
+"""By the suite that they stand in for, with its frame rate. Neither's physics is its suite's own:
+things fall more slowly than on Earth, so that some are still in the air when a prefix ends."""
+
+
+def generator_version(standin: str | None) -> str:
+    """Of what simulates a benchmark's scenes."""
+    return GENERATOR_VERSION + (f", stand-ins {STANDINS_VERSION}" if standin else "")
+
+
+def view_of(standin: str | None) -> View:
+    """How a stand-in's scenes are watched and lit, or standard ones."""
+    return STANDINS[standin].view if standin else STANDARD_VIEW
+
+
+def simulate_standin(name: str, index: int, split: str, cfg: BenchmarkConfig) -> Scene:
+    """Scene `index` of the benchmark's stand-in, a pure function of that and its seed; one in which
+    no two objects meet, or some touch at the start, is begun anew."""
+    kind = STANDINS[cfg.standin]
+    rng = np.random.default_rng([cfg.seed, index])
+    while True:
+        began = kind.start(sample_looks(rng, cfg), kind.view, rng)
+        if began is None:
+            continue
+        scenario, bodies = began
+        motion = world().simulate(bodies, kind.frames, kind.physics)
+        if motion.collisions and not motion.touching_at_start:
+            return record(name, split, bodies, motion, kind.physics, kind.view.camera, scenario)

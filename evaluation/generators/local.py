@@ -1,0 +1,56 @@
+"""A model that answers on this machine, a batch of what it is asked at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from torch import nn
+from transformers import ProcessorMixin
+from xgrammar.contrib.hf import LogitsProcessor
+
+from conf.schema import StudentConfig
+from evaluation.generators.constrained_decoding import record_grammar
+from evaluation.generators.response_log import Keep, Thing, seed_of
+from models.memory import within_memory
+from models.student.collator import Collator
+from models.student.generation import THOUGHT, generate, new_tokens
+from models.student.prompts import Sample
+from models.student.token_sampling import sampler
+
+
+def say(
+    model: nn.Module,
+    processor: ProcessorMixin,
+    cfg: StudentConfig,
+    precision: str,
+    batch: int,
+    seed: int,
+    mode: str,
+    sample_of: Callable[[Thing], Sample],
+    things: list[Thing],
+    keep: Keep,
+) -> None:
+    """Have a model answer in `mode`, as `sample_of` shows and asks each; in constrained mode it can
+    write nothing but a record.
+
+    Raises:
+        UserError: memory runs out.
+    """
+    collator = Collator(processor, cfg.max_length, cfg.thinking)
+    limit = new_tokens(mode, cfg)
+    grammar = record_grammar(model, processor) if mode == "constrained" else None
+    for start in range(0, len(things), batch):
+        group = things[start : start + batch]
+        steps = sampler(cfg, [seed_of(seed, thing, mode) for thing in group])
+        if grammar is not None:
+            # Before tokens are drawn from what is left.
+            steps.insert(0, LogitsProcessor(grammar))
+        inputs = collator([sample_of(thing) for thing in group])
+        when = f"where {len(group)} items are answered at once"
+        with within_memory(when, "lower batch, in a run of its own (run=NAME)"):
+            written = generate(model, processor, inputs, limit, precision, steps)
+        if grammar is not None:
+            # What is held to a record from its first token on has no thought.
+            written = [replace(w, text=w.text.removeprefix(THOUGHT)) for w in written]
+        keep(list(zip(group, written, strict=True)))

@@ -1,0 +1,139 @@
+"""Small files in exactly the two layouts of MoVi-A's release."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data.releases.tfrecord import masked_crc
+from tests.data.releases.pictures import picture, png
+
+MOVI_COLORS = ["blue", "brown", "cyan", "gray", "green", "purple", "red", "yellow"]
+
+
+def movi_example(contacts: list[tuple[float, int, int, float, float]] | None = None) -> dict:
+    """Three objects that fall, the last out of view; `contacts` are (frame, instance, instance,
+    height, vertical share of the normal)."""
+    s = np.arange(1, 25) / 12
+    x = np.stack([np.zeros(24), 1 + s, -1 - s])
+    z = np.stack([5 - 0.5 * 9.81 * s**2] * 3)
+    half = np.stack([s, s, s]) / 2
+    return {
+        "looks": [
+            ("cube", "large", "metal", "red"),
+            ("sphere", "small", "rubber", "cyan"),
+            ("cylinder", "small", "metal", "red"),
+        ],
+        "positions": np.stack([x, 0 * x, z], -1),
+        "quaternions": np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], -1),
+        "velocities": np.stack([0 * x, 0 * x, np.stack([-9.81 * s] * 3)], -1),
+        "angular_velocities": np.stack([0 * x, 0 * x, 0 * x + 1], -1),
+        "image_positions": np.stack([0.5 + x / 20, 0.9 - z / 10], -1),
+        "visibility": np.stack([np.full(24, 90), np.full(24, 30), np.arange(24) * 0]),
+        "contacts": contacts or [],
+    }
+
+
+def write_movi_folder(folder: Path, example: dict) -> Path:
+    folder.mkdir(parents=True)
+    arrays = ("positions", "quaternions", "velocities", "angular_velocities", "image_positions")
+    instances = [
+        {
+            "mass": 1.0, "friction": 0.4, "restitution": 0.3, "size": 1.4, "color": [0.5, 0.1, 0.1],
+            "shape": shape, "size_label": size, "material": material, "color_label": color,
+            "visibility": example["visibility"][k].tolist(),
+            **{key: example[key][k].tolist() for key in arrays},
+        }
+        for k, (shape, size, material, color) in enumerate(example["looks"])
+    ]  # fmt: skip
+    metadata = {
+        "flags": {},
+        "metadata": {
+            "resolution": [256, 256], "frame_rate": 12, "step_rate": 240, "gravity": [0, 0, -9.81],
+            "num_frames": 24, "num_instances": len(instances),
+        },
+        "camera": {"focal_length": 35.0, "sensor_width": 32.0, "field_of_view": 0.857},
+        "instances": instances,
+    }  # fmt: skip
+    collisions = [
+        {
+            "instances": [one, two], "frame": frame, "force": 0.01, "position": [0.0, 0.0, height],
+            "image_position": [0.5, 0.5], "contact_normal": [(1 - up**2) ** 0.5, 0.0, up],
+        }
+        for frame, one, two, height, up in example["contacts"]
+    ]  # fmt: skip
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+    (folder / "events.json").write_text(json.dumps({"collisions": collisions}))
+    for f in range(24):
+        seen = picture(f, (256, 256)).convert("RGBA")
+        seen.putalpha(128)
+        (folder / f"rgba_{f:05d}.png").write_bytes(png(seen))
+    return folder / "metadata.json"
+
+
+def movi_features(example: dict) -> dict[str, Any]:
+    """The example as TensorFlow Datasets flattens it: names to bytes, floats or integers."""
+    contacts = example["contacts"]
+    shapes, sizes, materials, colors = zip(*example["looks"], strict=True)
+    arrays = ("positions", "quaternions", "velocities", "angular_velocities", "image_positions")
+    return {
+        "metadata/video_name": [b"123"],
+        "metadata/width": [256],
+        "metadata/height": [256],
+        "metadata/num_frames": [24],
+        "metadata/num_instances": [len(example["looks"])],
+        "metadata/depth_range": [0.5, 20.0],
+        **{f"instances/{key}": example[key].ravel().tolist() for key in arrays},
+        "instances/visibility": example["visibility"].ravel().tolist(),
+        "instances/bboxes/ragged_flat_values": [0.0, 0.1, 0.2, 0.3],
+        "instances/bboxes/ragged_row_lengths_0": [1, 0, 0],
+        "instances/shape_label": [["cube", "cylinder", "sphere"].index(s) for s in shapes],
+        "instances/size_label": [["small", "large"].index(s) for s in sizes],
+        "instances/material_label": [["metal", "rubber"].index(m) for m in materials],
+        "instances/color_label": [MOVI_COLORS.index(c) for c in colors],
+        "events/collisions/frame": [int(c[0]) for c in contacts],
+        "events/collisions/instances": [i % 65536 for c in contacts for i in c[1:3]],
+        "events/collisions/force": [0.01 for _ in contacts],
+        "events/collisions/position": [v for c in contacts for v in (0.0, 0.0, c[3])],
+        "events/collisions/contact_normal": [
+            v for c in contacts for v in ((1 - c[4] ** 2) ** 0.5, 0.0, c[4])
+        ],
+        "video": [png(picture(f, (256, 256))) for f in range(24)],
+        "forward_flow": [-1, 70_000] * 50,
+    }
+
+
+def write_tfrecord(path: Path, examples: list[dict[str, Any]]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "wb") as file:
+        for features in examples:
+            data = _message(1, b"".join(_message(1, _feature(*f)) for f in features.items()))
+            length = len(data).to_bytes(8, "little")
+            for part in (length, data):
+                file.write(part + masked_crc(part).to_bytes(4, "little"))
+    return path
+
+
+def _feature(name: str, values: list) -> bytes:
+    if values and isinstance(values[0], bytes):
+        kind, packed = 1, b"".join(_message(1, v) for v in values)
+    elif values and isinstance(values[0], float):
+        kind, packed = 2, _message(1, np.array(values, "<f4").tobytes())
+    else:
+        kind, packed = 3, _message(1, b"".join(_varint(v % 2**64) for v in values))
+    return _message(1, name.encode()) + _message(2, _message(kind, packed))
+
+
+def _message(number: int, data: bytes) -> bytes:
+    return _varint(number << 3 | 2) + _varint(len(data)) + data
+
+
+def _varint(n: int) -> bytes:
+    groups = []
+    while n > 0x7F:
+        groups.append(n & 0x7F | 0x80)
+        n >>= 7
+    return bytes([*groups, n])

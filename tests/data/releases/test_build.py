@@ -1,0 +1,135 @@
+"""A build over another simulator's release: bad records are told and left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conf.errors import UserError
+from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
+from data.build import ensure_benchmark, ensure_items
+from data.parallel import Workers
+from data.publish.clevrer_format import export_clevrer
+from data.render.frame_cache import FrameCache, Frames
+from tests.data.releases.clevrer_files import clevrer_annotation, write_clevrer_scene
+from tests.data.releases.movi_a_files import movi_example, write_movi_folder
+from tests.data.releases.pictures import picture
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def movi(tmp_path_factory) -> Path:
+    """Twelve scenes, one of them broken; two objects touch at a frame of its own in each."""
+    folder = tmp_path_factory.mktemp("releases") / "movi_a"
+    for k in range(12):
+        example = movi_example([(12.0 + k % 5, 0, 1, 1.0, 0.0)])
+        example["image_positions"][..., 0] = 0.05 + 0.02 * k + np.arange(24) * 0.03
+        example["image_positions"][..., 1] = 0.5
+        write_movi_folder(folder / f"{k:05d}", example)
+    (folder / "00007" / "events.json").write_text('{"collisions": [')
+    return folder
+
+
+def config(folder: Path | None, **changes: object) -> BenchmarkConfig:
+    settings = {
+        "name": "movi",
+        "simulator": "movi_a",
+        "folder": folder and str(folder),
+        "test_share": 1.0,
+        "selection": SelectionConfig(
+            event={"contact": Quota(0, 6)}, time={"in_1s": Quota(0, 6)}, min_displacement=4.0
+        ),
+        "retrieval": RetrievalTrackConfig(standard=0, database=0, source=0),
+    }
+    return BenchmarkConfig(**{**settings, **changes})
+
+
+def test_a_release_becomes_a_suite_with_its_own_frames(movi, tmp_path, caplog) -> None:
+    caplog.set_level("INFO")
+    store = ensure_benchmark(config(movi), tmp_path, workers=2)
+    assert store.manifest["counts"]["bad records left out"] == 1
+    assert "00007" in caplog.text
+    items = store.selection("test")
+    assert {i.family for i in items} == {"event", "time"}
+    assert {i.suite for i in items} == {"movi_a"}
+    assert store.selection("train") == store.retrieval() == store.database() == []
+    # What the store keeps of a frame is what the release shows.
+    frames = Frames(store)
+    for candidate in items[0].candidates:
+        shown = np.asarray(picture(candidate.frame, (256, 256)))
+        np.testing.assert_array_equal(frames.array(candidate.scene_id, candidate.frame), shown)
+
+
+def test_a_bad_record_stops_a_strict_build(movi, tmp_path) -> None:
+    with pytest.raises(UserError, match=r"00007.*strict=false"):
+        ensure_items(config(movi), tmp_path, Workers(1), strict=True)
+    assert not (tmp_path / "movi").exists()
+
+
+def test_a_release_that_is_not_named_or_not_there_is_a_sentence(tmp_path) -> None:
+    with pytest.raises(UserError, match=r"benchmark\.folder=FOLDER"):
+        ensure_items(config(None), tmp_path, Workers(1))
+    with pytest.raises(UserError, match="there is no folder"):
+        ensure_items(config(tmp_path / "nowhere"), tmp_path, Workers(1))
+
+
+def test_a_cell_of_another_suite_is_named(movi, tmp_path) -> None:
+    cells = SelectionConfig(event={"A1_contact": Quota(0, 1)})
+    with pytest.raises(UserError, match=r"event\.A1_contact: .* did you mean contact\?"):
+        ensure_items(config(movi, selection=cells), tmp_path, Workers(1))
+
+
+def test_clevrers_scenes_take_the_benchmarks_own_recipes(tmp_path) -> None:
+    for k in range(8):
+        annotation = clevrer_annotation(k)
+        for moment in annotation["motion_trajectory"]:
+            for shown in moment["objects"]:
+                shown["location"][0] -= 0.2 * k
+        write_clevrer_scene(tmp_path / "release", annotation, k)
+    few = Quota(train=2, test=1)
+    cfg = BenchmarkConfig(
+        name="clevrer",
+        simulator="clevrer",
+        folder=str(tmp_path / "release"),
+        selection=SelectionConfig(time={"in_1s": few}),
+        retrieval=RetrievalTrackConfig(builders={"2": few}, standard=1, database=8, source=20),
+    )
+    store = ensure_benchmark(cfg, tmp_path, workers=1)
+    assert {i.suite for i in store.selection()} == {"dynapix"}
+    assert {q.split for q in store.retrieval()} == {"train", "test"}
+    assert len(store.scene_ids("train") + store.scene_ids("test")) == 8
+
+
+def test_an_exported_benchmark_is_read_as_a_release_with_the_same_items(tmp_path) -> None:
+    """Scenes go out as CLEVRER's release has them, and come back as the scenes they were."""
+    few = Quota(train=2, test=1)
+    cfg = BenchmarkConfig(
+        name="ours",
+        scenes=5,
+        width=96,
+        height=64,
+        selection=SelectionConfig(time={"in_1s": few}, event={"contact_offset": few}),
+        retrieval=RetrievalTrackConfig(),
+    )
+    ours = ensure_items(cfg, tmp_path, Workers(2))
+    assert export_clevrer(ours, tmp_path / "release", Workers(2)) == 5
+    release = replace(cfg, name="theirs", simulator="clevrer", folder=str(tmp_path / "release"))
+    theirs = ensure_items(release, tmp_path, Workers(2))
+    names = [*ours.scene_ids("train"), *ours.scene_ids("test")]
+    read = sorted([*theirs.scene_ids("train"), *theirs.scene_ids("test")])
+    for name, other in zip(names, read, strict=True):
+        scene, back = ours.scene(name), theirs.scene(other)
+        assert back.objects == scene.objects
+        assert back.collisions == scene.collisions
+        for array in ("positions", "velocities", "angular_velocities"):
+            np.testing.assert_allclose(getattr(back, array), getattr(scene, array), atol=1e-6)
+        places = [s.image_positions[scene.in_view] for s in (back, scene)]
+        np.testing.assert_allclose(*places, atol=1e-2)
+        np.testing.assert_array_equal(back.in_view, scene.in_view)
+        shown = FrameCache.of(theirs).draw(other, [60])[60].astype(float)
+        drawn = FrameCache.of(ours).draw(name, [60])[60].astype(float)
+        assert np.abs(shown - drawn).mean() < 3

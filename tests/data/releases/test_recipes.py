@@ -1,0 +1,208 @@
+"""Laws of the transfer suites' items: where prefix, target and the wrong frames lie."""
+
+from __future__ import annotations
+
+import pickle
+from collections import Counter
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conf.schema import Quota
+from data.records import Collision, Landing, Scene, SceneObject, SelectionItem
+from data.releases.parsing import BadRecord
+from data.releases.recipes import RECIPES
+from data.releases.registry import RELEASES
+from data.tracks.selection import event, time
+from data.tracks.selection.distractors import fill
+from data.world.events import onsets
+from data.world.geometry import displacement_across
+
+LEAST = 12.0
+SCENARIOS = ("Collide", "Drop", "Roll")
+
+
+def scene_of_suite(suite: str, k: int, frames: int, fps: float) -> Scene:
+    """Two objects, one of which rests and is then pushed by the other at a frame of its own. Looks
+    are shared by every second scene. Some are pushed too early for a prefix."""
+    rng = np.random.default_rng(k)
+    hit = int(rng.integers(6, 20) if suite.endswith("movi_a") else rng.integers(11, frames - 20))
+    t = np.arange(frames)
+    pushed = np.maximum(t - hit + 1, 0) * 3.0
+    height = rng.uniform(40, 300)
+    image = np.stack(
+        [
+            np.stack([20 + 6.0 * t, height + 0 * t], 1) * [24 / frames, 1],
+            np.stack([90 + pushed, height + 0 * t], 1),
+        ],
+        axis=1,
+    )
+    scenario = SCENARIOS[k % 3] if suite.endswith("physion") else ""
+    return Scene(
+        scene_id=f"{suite}-{k:03d}",
+        split="test",
+        objects=(SceneObject("bowl", "", "red"), SceneObject("cone", "", "blue" * (k % 2))),
+        collisions=(Collision(hit, (0, 1)),),
+        landings=(Landing(hit + 5, 1),),
+        positions=np.concatenate([image / 50, np.zeros((frames, 2, 1))], axis=2),
+        quaternions=np.tile([0.0, 0, 0, 1], (frames, 2, 1)),
+        velocities=np.zeros((frames, 2, 3)),
+        angular_velocities=np.zeros((frames, 2, 3)),
+        image_positions=image,
+        in_view=np.ones((frames, 2), bool),
+        visible_fraction=np.full((frames, 2), np.nan),
+        image_size=(480, 336),
+        fps=fps,
+        scenario=scenario,
+        footage=f"{k}",
+    )
+
+
+SCENES = {
+    suite: {scene.scene_id: scene for scene in (scene_of_suite(suite, k, *clip) for k in range(40))}
+    for name, clip in (("movi_a", (24, 12)), ("physion", (120, 30)))
+    for suite in (name, f"standin_{name}")
+}
+
+
+def items_of(
+    suite: str, family: str, subtype: str, scenes: dict[str, Scene]
+) -> list[SelectionItem]:
+    draw = partial(RECIPES[suite][family].draft, subtype)
+    names = {"train": [], "test": list(scenes)}
+    found, _ = fill(subtype, draw, names, scenes.__getitem__, Quota(0, 24), 0, LEAST)
+    return found
+
+
+CELLS = [
+    (suite, family, subtype)
+    for suite, families in RECIPES.items()
+    for family, recipe in families.items()
+    for subtype in recipe.CELLS
+]
+
+
+def cells(*words: str) -> pytest.MarkDecorator:
+    """Runs a test for every cell of a suite or family; `suite` and `items` are the cell's."""
+    chosen = [c for c in CELLS if set(words) <= set(c)]
+    return pytest.mark.parametrize("cell", chosen, ids="/".join)
+
+
+@pytest.fixture
+def suite(cell: tuple[str, str, str]) -> str:
+    return cell[0]
+
+
+@pytest.fixture
+def items(cell: tuple[str, str, str]) -> list[SelectionItem]:
+    return items_of(*cell, SCENES[cell[0]])
+
+
+@cells()
+def test_items_are_of_their_suite_and_ask_the_same_questions(suite: str, items: list) -> None:
+    assert len(items) == 24
+    assert {i.suite for i in items} == {suite}
+    (question,) = {i.question for i in items}
+    (subtype,) = {i.subtype for i in items}
+    timed = {"in_1s": time.question(1), "in_2s": time.question(2)}
+    assert question == timed.get(subtype, event.QUESTION)
+    assert max(Counter(i.answer for i in items).values()) == 6
+
+
+@cells()
+def test_candidates_can_be_told_apart_and_are_no_frame_of_the_prefix(
+    suite: str, items: list
+) -> None:
+    scenes = SCENES[suite]
+    for item in items:
+        gaps = [
+            displacement_across(scenes[a.scene_id], a.frame, scenes[b.scene_id], b.frame)
+            for a, b in combinations(item.candidates, 2)
+        ]
+        assert item.min_displacement == pytest.approx(min(gaps))
+        assert min(gaps) >= LEAST
+        own = [c.frame for c in item.candidates if c.scene_id == item.scene_id]
+        assert min(own) > item.prefix_stop
+
+
+@cells()
+def test_wrong_frames_are_of_the_scene_and_of_others_as_the_suite_has_them(
+    suite: str, items: list
+) -> None:
+    for item in items:
+        wrong = [c for c in item.candidates if c.source != "target"]
+        same = [c.frame for c in wrong if c.scene_id == item.scene_id]
+        assert [c.source for c in wrong].count("cross_scene") == 3 - len(same)
+        assert len({c.scene_id for c in wrong} - {item.scene_id}) == 3 - len(same)
+        assert len(same) == (1 if suite.endswith("movi_a") else 2)
+
+
+@cells("physion")
+def test_physions_wrong_frames_are_later_or_of_the_same_scenario(suite: str, items: list) -> None:
+    for item in items:
+        own = [c.frame for c in item.candidates if c.scene_id == item.scene_id]
+        assert min(own) == item.target_frame
+        assert {SCENES[suite][c.scene_id].scenario for c in item.candidates} == {
+            SCENES[suite][item.scene_id].scenario
+        }
+
+
+@cells("event")
+def test_an_event_items_prefix_ends_before_its_event(suite: str, items: list) -> None:
+    gap, step = (5, 10) if suite.endswith("movi_a") else (10, 20)
+    events_of = {
+        "contact": lambda s: [c.frame for c in s.collisions],
+        "A1_contact": lambda s: [c.frame for c in s.collisions],
+        "A2_motion": lambda s: [frame for frame, _ in onsets(s)],
+        "A3_landing": lambda s: [landing.frame for landing in s.landings],
+    }
+    for item in items:
+        events = events_of[item.subtype]
+        assert item.target_frame == item.event_frame
+        assert item.event_frame in events(SCENES[suite][item.scene_id])
+        assert (item.framing, item.gap) == ("future", gap)
+        assert item.event_frame - item.prefix_stop == gap
+        assert item.prefix_start == max(item.prefix_stop - step, 0)
+        assert item.prefix_stop - item.prefix_start + 1 >= 5
+        for other in (c for c in item.candidates if c.source == "cross_scene"):
+            assert other.frame in events(SCENES[suite][other.scene_id])
+
+
+@cells("time")
+def test_a_time_items_clock_is_its_scenes(suite: str, items: list) -> None:
+    second = 12 if suite.endswith("movi_a") else 30
+    for item in items:
+        seconds = int(item.subtype[3])
+        assert (item.prefix_start, item.prefix_stop) == (0, second - 1)
+        assert item.target_frame - item.prefix_stop == item.horizon == seconds * second
+        assert {c.frame for c in item.candidates if c.scene_id != item.scene_id} == {
+            item.target_frame
+        }
+
+
+def test_faster_trials_have_longer_seconds_and_the_same_events() -> None:
+    fast = {k: scene_of_suite("physion", k, 120, 100) for k in range(30)}
+    scenes = {s.scene_id: s for s in fast.values()}
+    assert items_of("physion", "time", "in_1s", scenes) == []
+    assert {i.gap for i in items_of("physion", "event", "A1_contact", scenes)} == {10}
+
+
+def test_what_cannot_be_told_apart_gives_no_item() -> None:
+    still = {name: pickle.loads(pickle.dumps(scene)) for name, scene in SCENES["physion"].items()}
+    for scene in still.values():
+        scene.image_positions[:] = scene.image_positions[0]
+    assert items_of("physion", "event", "A1_contact", still) == []
+
+
+def test_readers_and_refusals_can_be_sent_to_processes(tmp_path: Path) -> None:
+    for release in RELEASES.values():
+        job = pickle.loads(pickle.dumps(partial(release.read, tmp_path, tmp_path, "test")))
+        assert job.func is release.read
+        for name in ("scene_files", "check_footage", "images"):
+            assert callable(getattr(release, name))
+    refused = pickle.loads(pickle.dumps(BadRecord("a file: what differs")))
+    assert isinstance(refused, BadRecord)
+    assert str(refused) == "a file: what differs"

@@ -1,0 +1,169 @@
+"""What the camera sees: geometry against Bullet's own mask, and looks that can be told apart."""
+
+from __future__ import annotations
+
+import colorsys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from conf.schema import BenchmarkConfig
+from data.records import COLORS, MATERIALS, SHAPES, Scene, SceneObject
+from data.render import renderer
+from data.render.appearance import RGB
+from data.render.bullet import BulletRenderer
+from data.world.geometry import Camera, displacements, object_match
+from data.world.sampling import simulate_scene
+
+LIMITS = BenchmarkConfig(name="pixels")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return simulate_scene(0, 0, "train", LIMITS)
+
+
+def test_the_origin_is_seen_at_the_images_centre() -> None:
+    pixel, depth = Camera().project(np.zeros(3))
+    np.testing.assert_allclose(pixel, [240, 160], atol=1e-9)
+    assert depth == pytest.approx(5.0, abs=1e-3)
+
+
+SEEN_AT = [0, 10, 15, 20, 60, 100]
+
+
+def test_the_frames_looked_at_show_all_there_is_to_see(scene: Scene) -> None:
+    """Objects out of view, whole and partly hidden, or the next test could not fail."""
+    fractions = scene.visible_fraction[SEEN_AT]
+    assert not scene.in_view[SEEN_AT].all()
+    assert (fractions == 1).any()
+    assert ((fractions > 0.2) & (fractions < 0.8)).any()
+
+
+@pytest.mark.parametrize("frame", SEEN_AT)
+def test_visibility_agrees_with_bullets_mask(scene: Scene, frame: int) -> None:
+    drawn = BulletRenderer(240, 160)  # twice that inside: the oracle's own 480 x 320
+    handles = drawn.pose(scene, frame)
+    _, mask = drawn.photograph()
+    for k, handle in enumerate(handles):
+        seen = int((mask == handle).sum())
+        drawn.pose(alone(scene, k), frame)
+        covers = int((drawn.photograph()[1] >= 0).sum())
+        if covers > 8 or covers == 0:
+            assert scene.in_view[frame, k] == (covers > 0)
+        if covers > 100:
+            assert scene.visible_fraction[frame, k] == pytest.approx(seen / covers, abs=0.05)
+
+
+def alone(scene: Scene, k: int) -> Scene:
+    """A scene with only its object k."""
+    arrays = {name: getattr(scene, name)[:, k : k + 1] for name in Scene.ARRAYS}
+    name = f"{scene.scene_id}-only-{k}"
+    return replace(scene, scene_id=name, objects=(scene.objects[k],), collisions=(), **arrays)
+
+
+def test_a_frame_is_no_distance_from_itself(scene: Scene) -> None:
+    apart = displacements(scene)
+    np.testing.assert_array_equal(np.diag(apart), 0)
+    np.testing.assert_array_equal(apart, apart.T)
+    assert object_match(scene, 40)[40] == 0
+    assert (object_match(scene, 40) <= 1).all()
+
+
+def test_the_same_frame_is_the_same_pixels(scene: Scene) -> None:
+    first = BulletRenderer(192, 128).render(scene, 50).tobytes()
+    again = renderer("bullet", 192, 128)
+    again.render(simulate_scene(0, 1, "train", LIMITS), 3)
+    assert again.render(scene, 50).tobytes() == first
+
+
+def crop(look: SceneObject, place: tuple[float, float], yaw: float) -> np.ndarray:
+    """The pixels of one object alone, at the tiny preset's frame size, and its mask."""
+    height = 0.18 if look.shape == "cube" else 0.2
+    position = np.array([[[*place, height]]], np.float32)
+    turn = np.array([[[0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]]], np.float32)
+    none = np.zeros((1, 1, 3), np.float32)
+    there = np.ones((1, 1), bool)
+    one = Scene(
+        f"{look}{place}{yaw}", "train", (look,), (), position, turn, none, none,
+        none[..., :2], there, there.astype(np.float32),
+    )  # fmt: skip
+    drawn = renderer("bullet", 192, 128)
+    drawn.pose(one, 0)
+    pixels, mask = drawn.photograph()
+    seen = (mask >= 0)[..., None]
+    fine = np.dstack([pixels[..., :3] * seen, seen])
+    small = fine.reshape(128, 2, 192, 2, 4).mean(axis=(1, 3))
+    pixels, cover = small[..., :3], small[..., 3]
+    rows, columns = np.nonzero(cover > 0.5)
+    box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
+    return np.dstack([pixels[box], 255 * cover[box]])
+
+
+def features(picture: np.ndarray, what: str) -> np.ndarray:
+    """A few numbers that show colour, material or shape in a crop."""
+    inside = picture[..., 3] > 250
+    rgb = picture[inside][:, :3] / 255
+    light = rgb.max(axis=1)
+    if what == "color":
+        hue = [colorsys.rgb_to_hsv(*p) for p in rgb]
+        h, s, _ = np.array(hue).T
+        around = 2 * np.pi * h
+        strong = s.mean()
+        return np.array(
+            [strong * np.cos(around).mean(), strong * np.sin(around).mean(), 0.4 * light.mean()]
+        )
+    if what == "material":
+        column = picture[:, picture.shape[1] // 2, :3].max(axis=1) / max(light.max(), 1e-6) / 255
+        steps = np.abs(np.diff(column[1:-1]))
+        return np.array([light.std() / light.mean(), 3 * steps.max(), light.min() / light.max()])
+    size = 16
+    light = picture[..., :3].max(axis=-1) / picture[..., :3].max()
+    rows = np.linspace(0, picture.shape[0] - 1, size).round().astype(int)
+    columns = np.linspace(0, picture.shape[1] - 1, size).round().astype(int)
+    at = np.ix_(rows, columns)
+    tall = 8 * picture.shape[0] / picture.shape[1]
+    return np.concatenate([(picture[at][..., 3] / 255).ravel(), light[at].ravel(), [tall]])
+
+
+PLACES = [(x, y) for x in (-1.5, -0.5, 0.5) for y in (-0.8, 0.1, 0.9)]
+
+
+@pytest.fixture(scope="module")
+def crops() -> list[tuple[int, SceneObject, np.ndarray]]:
+    """Every look at every place, turned at random."""
+    rng = np.random.default_rng(0)
+    looks = [SceneObject(s, m, c) for s in SHAPES for m in MATERIALS for c in COLORS]
+    return [
+        (k, look, crop(look, place, rng.uniform(0, 6.28)))
+        for look in looks
+        for k, place in enumerate(PLACES)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("what", "values"), [("color", COLORS), ("material", MATERIALS), ("shape", SHAPES)]
+)
+def test_looks_can_be_told_apart_at_the_tiny_size(crops, what, values) -> None:
+    """The most alike of the crops at some places names the look of those at others."""
+    known, asked = [], []
+    for place, look, picture in crops:
+        # Materials are told apart within a shape and colour, as an eye would.
+        context = (look.shape, look.color) if what == "material" else ()
+        row = (context, getattr(look, what), features(picture, what))
+        (known if place % 2 == 0 else asked).append(row)
+    right = 0
+    for context, name, found in asked:
+        near = min(
+            (r for r in known if r[0] == context), key=lambda r: float(((r[2] - found) ** 2).sum())
+        )
+        right += near[1] == name
+    assert set(values) == {name for _, name, _ in known}
+    assert right / len(asked) >= 0.95
+
+
+def test_colors_are_far_apart_on_paper() -> None:
+    values = np.array(list(RGB.values()), float)
+    gaps = np.linalg.norm(values[:, None] - values[None], axis=-1)
+    assert gaps[~np.eye(len(values), dtype=bool)].min() > 60

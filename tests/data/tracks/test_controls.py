@@ -1,0 +1,57 @@
+"""Controls change one thing and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from data.records import shown_frames
+from data.tracks.controls import MATCHED, observed
+
+ALIKE = (
+    "scene_id", "prefix_start", "prefix_stop", "target_frame", "event_frame", "candidates",
+    "answer", "horizon", "distractors", "split",
+)  # fmt: skip
+
+
+def test_a_matched_pair_differs_in_its_anchor_alone(benchmark_store) -> None:
+    items = benchmark_store.selection(suite=MATCHED)
+    assert len(items) >= 4
+    for by_event, by_time in zip(items[::2], items[1::2], strict=True):
+        assert (by_event.family, by_time.family) == ("event", "time")
+        assert by_event.question != by_time.question
+        for axis in ALIKE:
+            assert getattr(by_event, axis) == getattr(by_time, axis)
+
+
+def test_both_questions_of_a_pair_are_answered_by_the_target(benchmark_store) -> None:
+    for item in benchmark_store.selection(suite=MATCHED):
+        events = [c.frame for c in benchmark_store.scene(item.scene_id).collisions]
+        assert item.target_frame == min(e for e in events if e > item.prefix_stop)
+        seconds = (item.target_frame - item.prefix_stop) / 26
+        assert item.prefix_stop - item.prefix_start + 1 == 26
+        if item.family == "time":
+            assert f"like {seconds:g} second" in item.question
+
+
+def test_the_benchmarks_own_items_hold_no_controls(benchmark_store) -> None:
+    assert {i.suite for i in benchmark_store.selection()} == {"dynapix"}
+
+
+@pytest.mark.parametrize("count", [2, 5, 12])
+def test_a_shuffled_prefix_shows_the_same_frames_in_another_order(benchmark_store, count) -> None:
+    for item in benchmark_store.selection("test"):
+        shown = shown_frames(item.prefix_start, item.prefix_stop, count)
+        shuffled = observed(item, count, "shuffled_prefix")
+        assert shuffled != shown
+        assert sorted(shuffled) == shown
+        assert observed(item, count, "shuffled_prefix") == shuffled
+    other = replace(item, item_id="another")
+    assert count == 2 or observed(other, count, "shuffled_prefix") != shuffled
+
+
+def test_candidates_alone_come_without_a_prefix(benchmark_store) -> None:
+    item = benchmark_store.selection("test")[0]
+    assert observed(item, 12, "candidate_only") == []
+    assert observed(item, 12, None) == shown_frames(item.prefix_start, item.prefix_stop, 12)

@@ -1,0 +1,363 @@
+"""Laws of a built benchmark: what an item or a query says is what the oracle says."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from data.records import FPS, FrameRef, SelectionItem
+from data.render.frame_cache import FrameCache, Frames, load_frames, save_frames
+from data.store import Store
+from data.tracks.retrieval.counterfactual import consequence
+from data.tracks.retrieval.database import Album
+from data.tracks.selection import window
+from data.tracks.selection.distractors import observed, unobserved
+from data.world.events import window_group
+from data.world.geometry import displacement_across, displacements, object_match
+
+
+@pytest.fixture(scope="module")
+def items(benchmark_store: Store) -> list[SelectionItem]:
+    return benchmark_store.selection()
+
+
+def test_every_cell_has_items_and_letters_are_balanced(benchmark_store, items) -> None:
+    track = benchmark_store.manifest["config"]["selection"]
+    asked = {(f, cell) for f in ("event", "time", "window") for cell in track[f]}
+    assert {(i.family, i.subtype) for i in items} == asked
+    for cell in {(i.subtype, i.split) for i in items}:
+        letters = Counter(i.answer for i in items if (i.subtype, i.split) == cell)
+        assert max(letters.values()) - min(letters[k] for k in range(4)) <= 1
+    assert len({i.item_id for i in items}) == len(items)
+
+
+def test_scenes_keep_to_their_split(benchmark_store, items) -> None:
+    train, test = set(benchmark_store.scene_ids("train")), set(benchmark_store.scene_ids("test"))
+    assert not train & test
+    assert len(test) * 4 == len(train)
+    for asked in (*items, *benchmark_store.retrieval()):
+        assert asked.scene_id in (train if asked.split == "train" else test)
+
+
+def test_candidates_can_be_told_apart(benchmark_store, items) -> None:
+    least = benchmark_store.manifest["config"]["selection"]["min_displacement"]
+    for item in items:
+        gaps = []
+        for a, b in combinations(item.candidates, 2):
+            scene, other = benchmark_store.scene(a.scene_id), benchmark_store.scene(b.scene_id)
+            gap = displacement_across(scene, a.frame, other, b.frame)
+            if a.scene_id == b.scene_id:
+                assert gap == pytest.approx(displacements(scene)[a.frame, b.frame])
+            gaps.append(gap)
+        assert item.min_displacement == pytest.approx(min(gaps), rel=1e-5)
+        assert min(gaps) >= least
+
+
+def test_event_items_stand_at_their_collision(benchmark_store, items) -> None:
+    for item in (i for i in items if i.family == "event"):
+        events = [c.frame for c in benchmark_store.scene(item.scene_id).collisions]
+        assert item.event_frame in events
+        assert item.prefix_stop - item.prefix_start == 20
+        assert item.gap == (5 if item.subtype == "future_match_gap5" else 10)
+        assert item.prefix_stop == item.event_frame - (item.gap if item.framing == "future" else 0)
+        assert item.target_frame == item.prefix_stop + item.gap
+        assert item.target_frame <= 127 - 10
+
+
+def test_event_distractors_are_of_their_source(benchmark_store, items) -> None:
+    split = {s: set(benchmark_store.scene_ids(s)) for s in ("train", "test")}
+    least = benchmark_store.manifest["config"]["selection"]["min_displacement"]
+    for item in (i for i in items if i.family == "event"):
+        scene = benchmark_store.scene(item.scene_id)
+        wrong = [c for c in item.candidates if c.source != "target"]
+        assert {c.source for c in wrong} == {item.distractors}
+        elsewhere = {c.scene_id for c in wrong} - {item.scene_id}
+        if item.distractors == "cross_scene":
+            assert len(elsewhere) == 3
+            assert elsewhere <= split[item.split]
+        else:
+            assert not elsewhere
+        if item.distractors == "same_offset":
+            assert {abs(c.frame - item.target_frame) for c in wrong} <= {16, 32, 48}
+        if item.distractors == "same_obj_match":
+            # No frame before or after the target that is more alike to it could stand here too.
+            prefix = (item.prefix_start, item.prefix_stop)
+            score = object_match(scene, item.target_frame)
+            apart = displacements(scene, observed(scene, prefix))
+            chosen = [c.frame for c in item.candidates]
+            for early in (True, False):
+                side = [c.frame for c in wrong if (c.frame < item.target_frame) == early]
+                closest = min((score[f] for f in side), default=0)
+                nearer = unobserved(np.flatnonzero(score < closest), prefix)
+                for frame in (f for f in nearer if (f < item.target_frame) == early):
+                    assert frame == item.target_frame or apart[frame, chosen].min() < least
+
+
+def test_time_items_count_26_frames_a_second(items) -> None:
+    for item in (i for i in items if i.family == "time"):
+        seconds = {"in_1s": 1, "in_2s": 2}[item.subtype]
+        assert (item.prefix_start, item.prefix_stop) == (0, 25)
+        assert item.target_frame == 26 + 26 * seconds
+        assert f"{seconds} second" in item.question
+
+
+def test_window_items_are_of_their_group_and_horizon(benchmark_store, items) -> None:
+    for item in (i for i in items if i.family == "window"):
+        assert item.prefix_stop - item.prefix_start + 1 == 16
+        assert item.target_frame - item.prefix_stop == item.horizon
+        scene = benchmark_store.scene(item.scene_id)
+        group = window_group(scene, item.prefix_start, item.prefix_stop, item.horizon)
+        family = item.window_family
+        assert item.subtype == f"{group}_{family}_h{item.horizon}_{item.difficulty}"
+
+
+def test_families_b_and_c_are_told_apart_by_what_they_are_built_around(
+    benchmark_store, items
+) -> None:
+    least = benchmark_store.manifest["config"]["selection"]["min_displacement"]
+    built = Counter()
+    for item in (i for i in items if i.window_family in ("B", "C")):
+        scene = benchmark_store.scene(item.scene_id)
+        cell = window.CELLS[item.subtype]
+        about = window.built_around(cell, scene, item.prefix_stop, item.target_frame)
+        shown = observed(scene, (item.prefix_start, item.prefix_stop))
+        if item.window_family == "B":
+            assert item.group in ("G2", "G4")
+            pairs = {c.objects for c in scene.collisions
+                     if item.prefix_stop < c.frame <= item.target_frame}  # fmt: skip
+            assert about in pairs
+            about = tuple(k for k in about if k in shown)
+        else:
+            assert item.group != "G4"
+            assert len(about) == 1
+        apart = displacements(scene, about)
+        for a, b in combinations(item.candidates, 2):
+            assert apart[a.frame, b.frame] >= least
+        built[item.window_family] += 1
+    assert min(built["B"], built["C"]) > 2
+
+
+def test_distractors_are_no_frames_of_the_prefix(items) -> None:
+    for item in items:
+        for c in item.candidates:
+            assert c.scene_id != item.scene_id or not (
+                item.prefix_start <= c.frame <= item.prefix_stop
+            )
+
+
+def test_candidates_differ_in_an_object_that_was_observed(benchmark_store, items) -> None:
+    least = benchmark_store.manifest["config"]["selection"]["min_displacement"]
+    for item in items:
+        scene = benchmark_store.scene(item.scene_id)
+        seen = observed(scene, (item.prefix_start, item.prefix_stop))
+        apart = displacements(scene, seen)
+        same = [c.frame for c in item.candidates if c.scene_id == item.scene_id]
+        assert all(apart[a, b] >= least for a, b in combinations(same, 2))
+
+
+def test_the_targets_place_in_time_tells_nothing(items) -> None:
+    ranks = Counter(
+        sum(c.frame < i.target_frame for c in i.candidates)
+        for i in items
+        if i.family == "window" or i.family == "time"
+    )
+    assert all(0.12 < ranks[k] / ranks.total() < 0.4 for k in range(4))
+
+
+def test_hard_is_more_alike_than_easy(benchmark_store, items) -> None:
+    """Of the frames that could stand in for a distractor, hard takes from one end and easy from the
+    other."""
+    score = {"easy": [], "hard": []}
+    for item in (i for i in items if i.window_family == "A"):
+        match = object_match(benchmark_store.scene(item.scene_id), item.target_frame)
+        score[item.difficulty] += [match[c.frame] for c in item.candidates if c.source != "target"]
+    assert np.median(score["hard"]) < np.median(score["easy"])
+
+
+def test_scenes_are_as_far_apart_as_their_objects(benchmark_store) -> None:
+    one, two = (benchmark_store.scene(s) for s in benchmark_store.scene_ids("train")[:2])
+    assert one.objects != two.objects
+    assert displacement_across(one, 60, two, 60) == pytest.approx(336 * 2**0.5)
+    assert displacement_across(one, 60, one, 60) == 0
+
+
+def test_each_builder_asks_what_it_may_of_a_scene(benchmark_store) -> None:
+    queries = benchmark_store.retrieval()
+    assert {q.builder for q in queries} == set(range(1, 7))
+    for builder in range(1, 7):
+        asked = [q for q in queries if q.builder == builder]
+        moments = {(q.scene_id, q.prefix_start, q.prefix_stop, q.target) for q in asked}
+        assert len(moments) == len(asked)
+        targets = Counter(q.scene_id for q in asked)
+        if builder == 3:
+            events = {(q.scene_id, q.target.frame) for q in asked}
+            assert max(Counter(s for s, _ in events).values()) <= 3
+        if builder in (4, 5, 6):
+            assert max(targets.values()) == 1
+
+
+def test_a_question_says_how_far_ahead_it_asks(benchmark_store) -> None:
+    for q in benchmark_store.retrieval():
+        seconds = (q.target.frame - q.prefix_stop + (q.builder == 1)) // FPS
+        told = "1 second" if seconds == 1 else f"{seconds} seconds"
+        if q.anchor == "time":
+            assert f"{told} after the observation" in q.question
+        if q.builder == 4:
+            assert f"{told} after that collision" in q.question
+        if q.builder == 6:
+            assert "half a second after the next collision" in q.question
+
+
+def test_builders_keep_the_papers_clock(benchmark_store) -> None:
+    for q in benchmark_store.retrieval():
+        events = {c.frame for c in benchmark_store.scene(q.scene_id).collisions}
+        ahead, length = q.target.frame - q.prefix_stop, q.prefix_stop - q.prefix_start
+        assert q.prefix_stop < q.target.frame
+        if q.builder == 1:
+            assert q.target.frame == 127
+            assert q.prefix_stop in (2 * FPS, 3 * FPS, 4 * FPS)
+        elif q.builder == 2:
+            assert (q.prefix_stop, ahead % FPS) == (2 * FPS, 0)
+        elif q.builder == 3:
+            assert q.target.frame in events
+            assert 0 <= ahead - 1 <= 5
+            assert length == FPS
+        elif q.builder == 4:
+            assert q.prefix_stop in events
+            assert (length, ahead) == (FPS, FPS)
+        elif q.builder == 5:
+            assert q.target.frame in events
+            assert (length, ahead) == (FPS, FPS)
+        else:
+            assert q.prefix_stop + FPS // 2 in events
+            assert (length, ahead) == (FPS, FPS)
+
+
+def test_hard_negatives_are_other_moments_of_the_scene(benchmark_store) -> None:
+    for q in benchmark_store.retrieval():
+        apart = displacements(benchmark_store.scene(q.scene_id))
+        frames = [q.target.frame, *(n.frame for n in q.hard_negatives)]
+        assert len(frames) == 1 + benchmark_store.manifest["config"]["retrieval"]["hard_negatives"]
+        assert {n.scene_id for n in q.hard_negatives} == {q.scene_id}
+        assert min(apart[a, b] for a, b in combinations(frames, 2)) >= 12
+
+
+def test_counterfactuals_ask_for_what_the_absence_changes(benchmark_store) -> None:
+    queries = benchmark_store.retrieval(pool="counterfactual")
+    least = benchmark_store.manifest["config"]["selection"]["min_displacement"]
+    assert {q.split for q in queries} == {"train", "test"}
+    for q in queries:
+        scene, absent = benchmark_store.scene(q.scene_id), benchmark_store.scene(q.target.scene_id)
+        k = [o.phrase for o in scene.objects].index(q.removed_object)
+        assert q.target.scene_id == f"{q.scene_id}-without-{k}"
+        assert absent.objects == scene.objects[:k] + scene.objects[k + 1 :]
+        assert absent.split == scene.split == q.split
+        assert q.removed_object in q.question
+        # The object shows at the observation's end, and has met nothing by then.
+        assert scene.in_view[q.prefix_stop, k]
+        first = min(c.frame for c in scene.collisions if k in c.objects)
+        assert q.prefix_stop < first
+        kept = [i for i in range(len(scene.objects)) if i != k]
+        before = slice(0, first)
+        np.testing.assert_array_equal(scene.positions[before, kept], absent.positions[before])
+        assert consequence(scene, absent, k)[q.target.frame] >= least
+        assert consequence(scene, absent, k)[: q.prefix_stop].max() == 0
+        assert (q.target.frame - q.prefix_stop) % FPS == 0
+        factual, *others = q.hard_negatives
+        assert factual == FrameRef(q.scene_id, q.target.frame)
+        assert {n.scene_id for n in others} == {absent.scene_id}
+        for one, two in combinations([q.target, *q.hard_negatives], 2):
+            ends = [(benchmark_store.scene(f.scene_id), f.frame) for f in (one, two)]
+            assert displacement_across(*ends[0], *ends[1]) >= least
+
+
+def test_databases_hold_targets_and_no_twins(benchmark_store) -> None:
+    frames = Frames(benchmark_store)
+    for name, pool in (
+        ("test", "standard"), ("future", "future"), ("counterfactual", "counterfactual")
+    ):  # fmt: skip
+        queries = (
+            benchmark_store.standard_test()
+            if pool == "standard"
+            else benchmark_store.retrieval(pool=pool)
+        )
+        database = benchmark_store.database(name)
+        assert {q.target for q in queries} <= set(database)
+        pixels = {frames.array(f.scene_id, f.frame).tobytes() for f in database}
+        assert len(pixels) == len(database) == len(set(database))
+
+
+def test_the_standard_test_is_of_test_scenes_alone(benchmark_store) -> None:
+    queries, database = benchmark_store.standard_test(), benchmark_store.database("test")
+    many = Counter(q.builder for q in queries).values()
+    assert max(many) - min(many) <= 1
+    assert {f.scene_id for f in database} <= set(benchmark_store.scene_ids("test"))
+    assert set(database) <= set(benchmark_store.database("future"))
+
+
+def test_the_counterfactual_database_shows_what_happened_instead(benchmark_store) -> None:
+    database = benchmark_store.database("counterfactual")
+    album = Album(benchmark_store.scene)
+    assert all(album.add(frame) for frame in database)
+    queries = benchmark_store.retrieval(pool="counterfactual")
+    test = [q.hard_negatives[0] for q in queries if q.split == "test"]
+    train = [q.hard_negatives[0] for q in queries if q.split == "train"]
+    assert test
+    assert not any(album.add(frame) for frame in test)
+    if any(album.add(frame) for frame in train):
+        others = set(database) - {q.target for q in queries}
+        assert others <= {*test, *train}, "there was room for what happened instead"
+
+
+def test_twins_are_those_that_do_not_move(benchmark_store) -> None:
+    scene = benchmark_store.scene(benchmark_store.scene_ids("test")[0])
+    still = replace(
+        scene,
+        **{
+            name: np.repeat(getattr(scene, name)[:1], scene.frames, axis=0) for name in scene.ARRAYS
+        },
+    )
+    album = Album({"moving": scene, "still": still}.get)
+    for frame in range(scene.frames):
+        album.add(FrameRef("still", frame))
+    assert list(album.frames) == [FrameRef("still", 0)]
+    assert album.left_out == scene.frames - 1
+    # The other scene begins as this one stands.
+    assert not album.add(FrameRef("moving", 0))
+    taken = [f.frame for f in album.fill(["moving"], 200, seed=0)]
+    apart = displacements(scene)[np.ix_(taken, taken)]
+    assert len(taken) > 20
+    assert apart[~np.eye(len(taken), dtype=bool)].min() > 0.9
+
+
+def test_a_stored_frame_is_the_frame_drawn_anew(benchmark_store) -> None:
+    item = benchmark_store.selection("train")[0]
+    drawn = FrameCache.of(benchmark_store).draw(item.scene_id, [item.target_frame])
+    stored = Frames(benchmark_store).array(item.scene_id, item.target_frame)
+    np.testing.assert_array_equal(drawn[item.target_frame], stored)
+
+
+def test_frames_come_back_as_they_were_kept(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    frames = {k: rng.integers(0, 256, (6, 9, 3), dtype=np.uint8) for k in (7, 3, 120)}
+    save_frames(frames, tmp_path / "a.zip")
+    back = load_frames(tmp_path / "a.zip")
+    assert list(back) == [3, 7, 120]
+    for frame, pixels in frames.items():
+        np.testing.assert_array_equal(back[frame], pixels)
+        np.testing.assert_array_equal(load_frames(tmp_path / "a.zip", [frame])[frame], pixels)
+    assert load_frames(tmp_path / "a.zip", [4]) == {}
+    assert load_frames(tmp_path / "none.zip") == {}
+
+
+@pytest.mark.parametrize("damage", [lambda w: w[:40], lambda w: w[:60] + b"x" + w[61:]])
+def test_a_damaged_archive_is_told_and_drawn_again(tmp_path, caplog, damage) -> None:
+    path = tmp_path / "a.zip"
+    save_frames({5: np.full((8, 8, 3), 9, np.uint8)}, path)
+    path.write_bytes(damage(path.read_bytes()))
+    assert load_frames(path) == {}
+    assert "a.zip is damaged" in caplog.text

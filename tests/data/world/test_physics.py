@@ -1,0 +1,116 @@
+"""Laws of the simulation: reproducible, physical, and local."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from conf.schema import BenchmarkConfig
+from data.records import FPS, Collision, Scene, SceneObject
+from data.world.physics import FRICTION_DECELERATION, Body, _debounce, world
+from data.world.sampling import record, sample_bodies, simulate_scene, without
+
+LIMITS = BenchmarkConfig(name="laws")
+CUBE = SceneObject("cube", "rubber", "red")
+
+
+def fingerprint(scene: Scene) -> str:
+    import hashlib
+
+    arrays = b"".join(getattr(scene, name).tobytes() for name in Scene.ARRAYS)
+    return hashlib.sha256(arrays + repr((scene.objects, scene.collisions)).encode()).hexdigest()
+
+
+def test_a_scene_is_the_same_bits_in_another_process_and_order() -> None:
+    here = [fingerprint(simulate_scene(3, k, "train", LIMITS)) for k in (2, 0, 1)]
+    code = (
+        "from tests.data.world.test_physics import *\n"
+        "for k in (0, 1, 2): print(fingerprint(simulate_scene(3, k, 'train', LIMITS)))"
+    )
+    there = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert [here[1], here[2], here[0]] == there[-3:]
+
+
+def test_a_sliding_cube_slows_down_by_friction_alone() -> None:
+    motion = world().simulate([Body(CUBE, (0.0, 0.0), 0.0, (-2.0, 0.0))], frames=26)
+    seconds = 25 / FPS
+    lost = 2.0 - np.linalg.norm(motion.velocities[25, 0])
+    travelled = np.linalg.norm(motion.positions[25, 0] - motion.positions[0, 0])
+    assert lost == pytest.approx(FRICTION_DECELERATION * seconds, rel=0.05)
+    assert travelled == pytest.approx(2 * seconds - FRICTION_DECELERATION / 2, rel=0.02)
+
+
+def test_two_balls_on_a_line_swap_their_motion_when_they_meet() -> None:
+    ball = [SceneObject("sphere", "metal", color) for color in ("red", "blue")]
+    bodies = [Body(ball[0], (0.0, -1.0), 0, (0.0, 2.0)), Body(ball[1], (0.0, 0.0), 0, (0.0, 0.0))]
+    motion = world().simulate(bodies, frames=40)
+    (hit,) = motion.collisions
+    # The gap is 1 unit less two radii, travelled at about 2 units a second.
+    assert hit.frame / FPS == pytest.approx(0.6 / 2, abs=0.06)
+    before = motion.velocities[hit.frame - 1].sum(axis=0)
+    after = motion.velocities[hit.frame].sum(axis=0)
+    np.testing.assert_allclose(before[:2], after[:2], atol=0.08)
+
+
+def test_contacts_closer_than_the_gap_are_one_event() -> None:
+    assert _debounce({(0, 1): [10, 11, 16]}) == ((Collision(10, (0, 1)),), False)
+    assert _debounce({(0, 1): [10, 17]})[1]
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_scenes_keep_the_limits(index: int) -> None:
+    scene = simulate_scene(1, index, "train", LIMITS)
+    assert LIMITS.min_objects <= len(scene.objects) <= LIMITS.max_objects
+    assert 1 <= len(scene.collisions) <= LIMITS.max_collisions
+    pairs = [c.objects for c in scene.collisions]
+    assert len(set(pairs)) == len(pairs)
+    assert all(c.frame > 0 for c in scene.collisions)
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_removing_an_object_moves_nothing_it_never_touched(index: int) -> None:
+    bodies, motion = sample_bodies(1, index, LIMITS)
+    factual = record("factual", "train", bodies, motion)
+    for removed in range(len(factual.objects)):
+        other = without("other", "train", bodies, removed)
+        kept = [k for k in range(len(factual.objects)) if k != removed]
+        reached = touched_by(factual, removed)
+        for now, before in enumerate(kept):
+            until = min(reached.get(before, factual.frames), reached_in(other, now, reached, kept))
+            same = factual.positions[:until, before] == other.positions[:until, now]
+            assert same.all(), (removed, before)
+
+
+def touched_by(scene: Scene, start: int) -> dict[int, int]:
+    """The frame from which each object has been touched by `start`, directly or through others."""
+    reached = {start: 0}
+    for collision in scene.collisions:
+        for one, two in (collision.objects, collision.objects[::-1]):
+            if one in reached and two not in reached:
+                reached[two] = collision.frame
+    return reached
+
+
+def reached_in(scene: Scene, index: int, reached: dict[int, int], kept: list[int]) -> int:
+    """The frame at which an object first meets, in the counterfactual, one whose path changed."""
+    changed = {kept.index(k) for k in reached if k in kept}
+    for collision in scene.collisions:
+        if changed & set(collision.objects):
+            changed |= set(collision.objects)
+            if index in collision.objects:
+                return collision.frame
+    return scene.frames
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_a_motion_put_together_is_that_of_all_at_once(index: int) -> None:
+    """What is sampled body by body, some of them simulated alone, is what Bullet does with all."""
+    bodies, motion = sample_bodies(11, index, LIMITS)
+    together = world().simulate(bodies)
+    assert np.array_equal(together.states, motion.states)
+    assert together.collisions == motion.collisions

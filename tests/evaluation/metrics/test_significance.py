@@ -1,0 +1,147 @@
+"""What two runs over the same items are apart, held against definitions and an independent
+library."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from conf.errors import UserError
+from data.records import FAMILIES, Candidate, SelectionItem
+from data.tracks.controls import MATCHED
+from evaluation.metrics.accuracy import accuracy_table
+from evaluation.metrics.significance import Paired, anchors, compare
+from evaluation.reporting.tables import paired_table
+
+NAMES = ("one", "two")
+
+
+def made(number: int, family: str, scene: str) -> SelectionItem:
+    moments = tuple(Candidate(scene, frame, "x") for frame in (40, 50, 60, 70))
+    return SelectionItem(
+        f"{family}-{number}", "test", "dynapix", family, "any", "Which?", scene, 0, 20, 40,
+        moments, 0, 12.0,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def items() -> list[SelectionItem]:
+    return [made(k, FAMILIES[k % 3], f"scene-{k // 4}") for k in range(120)]
+
+
+def drawn(items, seed: int, share: float = 0.5) -> dict[str, float]:
+    rng = np.random.default_rng(seed)
+    return {item.item_id: float(rng.random() < share) for item in items}
+
+
+def test_differences_are_those_of_the_accuracies(items) -> None:
+    left, right = drawn(items, 0, 0.7), drawn(items, 1, 0.4)
+    found = {p.of: p for p in compare(items, left, right, NAMES, seed=0)}
+    assert list(found) == [*FAMILIES, "macro", "all"]
+    one, two = (
+        accuracy_table([i.family for i in items], [of[i.item_id] for i in items])
+        for of in (left, right)
+    )
+    for name, p in found.items():
+        if name == "macro":
+            expected = (one.macro, two.macro)
+        else:
+            expected = tuple((a.families | {"all": a.micro})[name].value for a in (one, two))
+        assert (p.left_accuracy, p.right_accuracy) == pytest.approx(expected)
+        assert p.difference == pytest.approx(expected[0] - expected[1])
+        assert p.low < p.difference < p.high
+    assert found["all"].n == sum(found[f].n for f in FAMILIES) == len(items)
+    assert found["all"].only_left == sum(found[f].only_left for f in FAMILIES)
+    assert found["macro"].p is None
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_test_is_a_fair_coins(items, seed) -> None:
+    left, right = drawn(items, seed), drawn(items, seed + 100, 0.3 + 0.1 * seed)
+    for p in compare(items, left, right, NAMES, seed=0):
+        if p.of == "macro":
+            continue
+        of = [i.item_id for i in items if p.of in (i.family, "all")]
+        assert p.only_left == sum(left[i] > right[i] for i in of)
+        assert p.only_right == sum(left[i] < right[i] for i in of)
+        coin = binomtest(p.only_left, p.only_left + p.only_right)
+        assert p.p == pytest.approx(coin.pvalue)
+
+
+def test_sides_are_alike(items) -> None:
+    left, right = drawn(items, 0, 0.7), drawn(items, 1)
+    there = compare(items, left, right, NAMES, seed=3)
+    back = compare(items, right, left, NAMES[::-1], seed=3)
+    for p, q in zip(there, back, strict=True):
+        assert (p.left, p.only_left, p.p) == (q.right, q.only_right, q.p)
+        assert (p.difference, p.low, p.high) == pytest.approx((-q.difference, -q.high, -q.low))
+
+
+def test_a_run_is_not_apart_from_itself(items) -> None:
+    credits = drawn(items, 0)
+    for p in compare(items, credits, credits, NAMES, seed=0):
+        assert (p.difference, p.low, p.high) == (0, 0, 0)
+        assert p.of == "macro" or (p.only_left, p.only_right, p.p) == (0, 0, 1)
+
+
+def test_items_of_a_scene_say_no_more_than_the_scene(items) -> None:
+    left, right = drawn(items, 0), drawn(items, 1)
+    alone = [replace(item, scene_id=f"scene-{k}", candidates=made(k, "x", f"scene-{k}").candidates)
+             for k, item in enumerate(items)]  # fmt: skip
+    widths = []
+    for scenes in (1, 4):
+        copies = [
+            replace(item, item_id=f"{item.item_id}-{copy}")
+            for item in alone
+            for copy in range(scenes)
+        ]
+        sides = [
+            {f"{i.item_id}-{copy}": of[i.item_id] for i in alone for copy in range(scenes)}
+            for of in (left, right)
+        ]
+        p = compare(copies, *sides, NAMES, seed=0)[-1]
+        widths.append(p.high - p.low)
+    assert widths[1] == pytest.approx(widths[0])
+    apart = np.array([left[i.item_id] - right[i.item_id] for i in items])
+    assert widths[0] == pytest.approx(2 * 1.96 * apart.std() / len(items) ** 0.5, rel=0.1)
+
+
+def test_ties_count_for_the_side_with_more_credit(items) -> None:
+    few = [item for item in items if item.family == "time"][:3]
+    left = dict(zip([i.item_id for i in few], (0.5, 1.0, 0.25), strict=True))
+    right = dict(zip([i.item_id for i in few], (0.0, 0.5, 1.0), strict=True))
+    [p] = compare(few, left, right, NAMES, seed=0)
+    assert (p.of, p.only_left, p.only_right, p.n) == ("all", 2, 1, 3)
+    assert p.difference == pytest.approx((0.5 + 0.5 - 0.75) / 3)
+
+
+def test_runs_over_other_items_are_refused_with_the_difference(items) -> None:
+    left, right = drawn(items[:40], 0), drawn(items[2:41], 0)
+    with pytest.raises(UserError) as told:
+        compare(items[:40], left, right, ("select/a", "select/b"), seed=0)
+    assert str(told.value) == (
+        "select/a and select/b answered different items, 2 only in select/a (such as event-0, "
+        "time-1) and 1 only in select/b (such as time-40): compare runs of the same benchmark, "
+        "suite, limit and seed"
+    )
+
+
+def test_anchors_hold_the_questions_of_a_pair_against_each_other(benchmark_store) -> None:
+    matched = benchmark_store.selection(suite=MATCHED)
+    by_family = {i.item_id: float(i.family == "event") for i in matched}
+    [p] = anchors(matched[::-1], by_family, seed=0)
+    assert (p.left, p.right, p.n) == ("event", "time", len(matched) // 2)
+    assert (p.left_accuracy, p.right_accuracy, p.difference) == (1, 0, 1)
+    assert (p.only_left, p.only_right) == (p.n, 0)
+    assert p.p == pytest.approx(0.5 ** (p.n - 1))
+
+
+def test_what_is_apart_is_json_and_fits_a_page(items) -> None:
+    found = compare(items, drawn(items, 0), drawn(items, 1), ("as they are", "shuffled_prefix"), 0)
+    assert [Paired(**asdict(p)) for p in found] == found
+    table = str(paired_table([("reasoning", found), ("answer, candidate_only", found)]))
+    assert max(map(len, table.splitlines())) <= 100
+    assert table.count("\nmacro ") == 2

@@ -1,0 +1,189 @@
+"""Finished runs as the commands leave them, of models that say what a test wants."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from conf.entry import Run
+from conf.schema import (
+    ContrastiveCommand,
+    ReportCommand,
+    RetrieveCommand,
+    RetrieverConfig,
+    SelectCommand,
+    SftCommand,
+    SimilarityCommand,
+    StudentConfig,
+    TeacherConfig,
+)
+from conf.schema.training import SftTrainConfig
+from data.records import SelectionItem
+from data.store import Store
+from evaluation import report
+from evaluation.metrics.accuracy import accuracy_by, accuracy_table
+from evaluation.metrics.breakdown import ranks_apart, recall_curves, retrieval_rows
+from evaluation.metrics.calibration import positions
+from evaluation.reporting.rows import SIMILARITY, SelectionRow
+from evaluation.retrieval import nearest_candidate
+from evaluation.retrieval.exact_search import Ranks
+from evaluation.select import spread
+from models.student.answer_parser import parse
+
+STUDENT = StudentConfig(name="small")
+Say = Callable[[SelectionItem], str]
+
+
+def right(item: SelectionItem) -> str:
+    return f"Answer: {item.letter}"
+
+
+def always_a(item: SelectionItem) -> str:
+    return "Answer: A"
+
+
+def finish(
+    folder: Path, settings: object, report: dict | None, metrics: dict | None = None
+) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
+    if report is not None:
+        (folder / "report.json").write_text(json.dumps(report))
+    (folder / "metrics.json").write_text(json.dumps(metrics or {}))
+    started = {"started": datetime.now(UTC).isoformat(), "earlier_starts": []}
+    (folder / "run.json").write_text(json.dumps(started))
+
+
+def trained_student(root: Path, benchmark, name: str, regime: str) -> None:
+    """A run of train.sft, without its weights."""
+    folder = root / "sft" / name
+    train = SftTrainConfig(regime=regime)
+    settings = SftCommand(
+        benchmark=benchmark, teacher=TeacherConfig(name="template"), student=STUDENT, train=train
+    )
+    finish(folder, settings, None, {"answer_loss_at_start": 2.0, "answer_loss": 1.0})
+    journal = [{"step": k, "loss": 2 - k / 9, "eval_answer_loss": 2 - k / 8} for k in range(5)]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in journal))
+
+
+def select_run(
+    root: Path,
+    store: Store,
+    benchmark,
+    name: str,
+    say: Say,
+    items: Sequence[SelectionItem] | None = None,
+    model: str | None = None,
+    mode: str = "answer",
+    suite: str | None = None,
+) -> Path:
+    """A run of evaluation.select over `items` (null takes the test's); `model` is a run of
+    train.sft."""
+    items = store.selection("test") if items is None else items
+    folder = root / "select" / name
+    settings = SelectCommand(
+        benchmark=benchmark, student=STUDENT, store=str(store.folder.parent),
+        model=None if model is None else f"{root}/sft/{model}", suite=suite,
+    )  # fmt: skip
+    chosen = [parse(say(item)).letter for item in items]
+    credits = [float(c == item.letter) for c, item in zip(chosen, items, strict=True)]
+    accuracy = accuracy_table([i.family for i in items], credits)
+    parsed = sum(c is not None for c in chosen)
+    name = model or "small base"
+    row = SelectionRow.of(store.name, name, mode, accuracy, parsed / len(items), suite=suite)
+    cells = accuracy_by([f"{i.family}/{i.subtype}" for i in items], credits)
+    letters = positions(chosen, [i.letter for i in items])
+    report = {
+        "build": store.identity,
+        "asked": [[mode, None, "k1"]],
+        "rows": [row.to_dict()],
+        "subtypes": {mode: {cell: vars(found) for cell, found in cells.items()}},
+        "readings": {mode: {"with a letter": parsed}},
+        "positions": {mode: asdict(letters)},
+        "calibration": {},
+    }
+    finish(folder, settings, report)
+    told = {"key": "k1", "mode": mode}
+    lines = [{**told, "asked": {"control": None, "seed": 0}}]
+    lines += [{**told, "item_id": i.item_id, "text": say(i), "cut": False} for i in items]
+    (folder / "answers.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder
+
+
+def similarity_run(
+    root: Path,
+    store: Store,
+    benchmark,
+    name: str,
+    limit: int | None = None,
+    model: str | None = None,
+    untrained: Sequence[float] = (0.5, 0.25, 0.125, 0),
+) -> Path:
+    """A run of evaluation.similarity in which what is `untrained` gives every item's candidates
+    these scores; `model` is a run of train.contrastive, which always chooses the right one."""
+    items = spread(store.selection("test"), limit, 0)
+    settings = SimilarityCommand(
+        benchmark=benchmark, retriever=RetrieverConfig(name=name), limit=limit,
+        model=None if model is None else f"{root}/contrastive/{model}",
+    )  # fmt: skip
+    answers = np.array([item.answer for item in items])
+    scores = {f"untrained {name}": np.tile(np.float32(untrained), (len(items), 1))}
+    if model is not None:
+        scores = {model: np.eye(4, dtype=np.float32)[answers], **scores}
+    rows, told, lines = [], {}, []
+    for title, of in scores.items():
+        credits = nearest_candidate.credits(of, answers)
+        accuracy = accuracy_table([i.family for i in items], credits)
+        rows.append(SelectionRow.of(store.name, title, SIMILARITY, accuracy, None))
+        cells = accuracy_by([f"{i.family}/{i.subtype}" for i in items], credits)
+        told[title] = {cell: vars(found) for cell, found in cells.items()}
+        lines += nearest_candidate.told(title, items, of)
+    report = {"build": store.identity, "rows": [r.to_dict() for r in rows], "subtypes": told}
+    folder = root / "similarity" / (model or name)
+    finish(folder, settings, report)
+    (folder / "scores.jsonl").write_text("".join(f"{line}\n" for line in lines))
+    return folder
+
+
+def retrieve_run(
+    root: Path, store: Store, benchmark, name: str, frames: int = 60, kind: str = "retrieve"
+) -> Path:
+    """A run of evaluation.retrieve of a trained retriever and of what it began from."""
+    trained = ContrastiveCommand(benchmark=benchmark, retriever=RetrieverConfig(name="small"))
+    finish(root / "contrastive" / name, trained, None)
+    queries = store.standard_test()
+    rng = np.random.default_rng(0)
+    rows, curves, found = [], [], {}
+    for title in (name, "untrained small"):
+        greater = rng.integers(frames, size=(2, len(queries)))
+        every = np.ones(greater.shape, bool)
+        sizes = ((frames * 256, frames * 128), (0.5, 0.5))
+        ranks = Ranks((64, 32), greater, np.zeros_like(greater), every, frames, *sizes)
+        found[title] = ranks
+        rows += retrieval_rows(store.name, title, ranks, queries, 0)
+        curves += recall_curves(title, ranks, queries)
+    told = {"build": store.identity, "curves": curves, "indexes": []}
+    report = {"rows": [r.to_dict() for r in rows], **told}
+    if kind == "retrieve":
+        report["apart"] = ranks_apart(found, queries, 0)
+    settings = RetrieveCommand(
+        benchmark=benchmark, retriever=RetrieverConfig(name="small"),
+        model=f"{root}/contrastive/{name}",
+    )  # fmt: skip
+    finish(root / kind / name, settings, report)
+    return root / kind / name
+
+
+def reported(root: Path, store: Path, **settings) -> Path:
+    """The folder of a report over what is below `root`."""
+    folder = root / "report" / "default"
+    folder.mkdir(parents=True, exist_ok=True)
+    cfg = ReportCommand(checkpoints=str(root), store=str(store), **settings)
+    report.main.__wrapped__(cfg, Run("default", folder))
+    return folder

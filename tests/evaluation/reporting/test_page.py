@@ -1,0 +1,169 @@
+"""The page in a real Chromium, from its file alone: on a phone and a desk, light and dark, by its
+filters and by keyboard."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import Select
+
+from conf.entry import Run
+from conf.schema import ReportCommand
+from evaluation import report
+from tests.evaluation.chromium import OVERFLOW, chromium_in
+from tests.evaluation.reporting.conftest import HOSTILE
+
+pytestmark = pytest.mark.slow
+
+LUMINANCE = """
+const [r, g, b] = getComputedStyle(arguments[0])[arguments[1]].match(/[\\d.]+/g).map(Number);
+return (0.2126 * r + 0.7152 * g + 0.0722 * b) / 255
+"""
+REQUESTED = """
+const found = performance.getEntriesByType("resource").map((entry) => entry.name);
+return found.filter((name) => !name.startsWith("data:"));
+"""
+SHOWN = "return [...document.querySelectorAll('article')].map(a => a.dataset.id)"
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory) -> Iterator[webdriver.Chrome]:
+    yield from chromium_in(tmp_path_factory.mktemp("chromium"))
+
+
+@pytest.fixture(scope="module")
+def page(measured, micro_store, tmp_path_factory) -> Path:
+    """The report's page alone, moved away from all that it was made of."""
+    folder = tmp_path_factory.mktemp("report")
+    cfg = ReportCommand(checkpoints=str(measured), store=str(micro_store.folder.parent), items=60)
+    report.main.__wrapped__(cfg, Run("default", folder))
+    moved = tmp_path_factory.mktemp("elsewhere") / "page.html"
+    shutil.move(folder / "report.html", moved)
+    return moved
+
+
+def look(browser: webdriver.Chrome, page: Path, width: int, light: str = "light") -> None:
+    screen = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 600}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    scheme = [{"name": "prefers-color-scheme", "value": light}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+    browser.get(page.as_uri())
+
+
+def choose(browser: webdriver.Chrome, **values: str) -> list[str]:
+    """Set filters, and tell the ids of what is then shown, all of it."""
+    for name, value in values.items():
+        Select(browser.find_element(By.NAME, name)).select_by_value(value)
+    more = browser.find_element(By.ID, "more")
+    while more.is_displayed():
+        more.send_keys(Keys.ENTER)
+    return browser.execute_script(SHOWN)
+
+
+def items_of(browser: webdriver.Chrome) -> list[dict]:
+    return json.loads(browser.execute_script("return document.getElementById('data').textContent"))[
+        "items"
+    ]
+
+
+@pytest.mark.parametrize("width", [360, 1280])
+@pytest.mark.parametrize("light", ["light", "dark"])
+def test_it_fits_and_can_be_read(chromium, page, width, light):
+    look(chromium, page, width, light)
+    for fold in chromium.find_elements(By.TAG_NAME, "summary"):
+        fold.click()
+    # A run may have a long name.
+    chromium.execute_script("document.getElementsByName('by')[0].add(new Option('run'.repeat(30)))")
+    assert not chromium.execute_script(OVERFLOW)
+    for name in ("body", "td", "svg text"):
+        part = chromium.find_element(By.CSS_SELECTOR, name)
+        ink = chromium.execute_script(LUMINANCE, part, "fill" if name == "svg text" else "color")
+        assert ink > 0.7 if light == "dark" else ink < 0.3
+    card = chromium.find_element(By.CSS_SELECTOR, ".scroll")
+    behind = chromium.execute_script(LUMINANCE, card, "backgroundColor")
+    assert behind < 0.2 if light == "dark" else behind > 0.9
+
+
+def test_it_asks_nobody_for_anything_and_complains_of_nothing(chromium, page):
+    chromium.get_log("browser")
+    look(chromium, page, 1280)
+    choose(chromium)
+    assert chromium.execute_script(REQUESTED) == []
+    # What the page forbids itself would be told here, too.
+    assert chromium.get_log("browser") == []
+    chromium.execute_script("new Image().src = 'http://127.0.0.1:9/x.png'")
+    [refused] = chromium.get_log("browser")
+    assert "Content Security Policy" in refused["message"]
+
+
+def test_what_a_model_said_is_text(chromium, page):
+    look(chromium, page, 1280)
+    choose(chromium)
+    assert chromium.title == "DynaPix report"
+    said = "return [...document.querySelectorAll('pre')].map((pre) => pre.textContent)"
+    assert HOSTILE in chromium.execute_script(said)
+    assert chromium.find_elements(By.CSS_SELECTOR, "pre *") == []
+
+
+def test_an_item_shows_its_frames_and_which_is_right(chromium, page):
+    look(chromium, page, 1280)
+    item = next(i for i in items_of(chromium) if i["id"] == choose(chromium)[0])
+    article = chromium.find_element(By.TAG_NAME, "article")
+    images = article.find_elements(By.TAG_NAME, "img")
+    assert len(images) == len(item["prefix"]) + 4
+    assert all(chromium.execute_script("return arguments[0].naturalWidth", i) for i in images)
+    [target] = article.find_elements(By.CLASS_NAME, "target")
+    assert target.text.startswith(f"{item['answer']}: target")
+    assert item["question"] in article.text
+
+
+def test_filters_show_what_they_say(chromium, page):
+    look(chromium, page, 1280)
+    items = items_of(chromium)
+    assert len(choose(chromium)) == len(items) == 60
+    for family in ("event", "time", "window"):
+        assert choose(chromium, family=family) == [i["id"] for i in items if i["family"] == family]
+    options = Select(chromium.find_element(By.NAME, "subtype")).options
+    subtypes = {i["subtype"] for i in items if i["family"] == "window"}
+    assert {o.text for o in options} == {"any", *subtypes}
+    subtype = sorted(subtypes)[0]
+    assert choose(chromium, subtype=subtype) == [
+        i["id"] for i in items if i["family"] == "window" and i["subtype"] == subtype
+    ]
+    # Another family has other subtypes, so the choice of one is given up.
+    assert choose(chromium, family="time") == [i["id"] for i in items if i["family"] == "time"]
+    label = "small base (record)"
+    of_base = {i["id"]: s["verdict"] for i in items for s in i["said"] if s["by"] == label}
+    for verdict in ("right", "wrong"):
+        wanted = [name for name, given in of_base.items() if given == verdict]
+        assert choose(chromium, family="any", by=label, verdict=verdict) == wanted
+    assert choose(chromium, by="cot (reasoning)", verdict="wrong") == []
+    assert chromium.find_element(By.ID, "count").text == "0 of 60 items"
+
+
+def test_it_can_be_used_by_keyboard_alone(chromium, page):
+    look(chromium, page, 1280)
+    reached = []
+    body = chromium.find_element(By.TAG_NAME, "body")
+    body.click()
+    for _ in range(200):
+        chromium.switch_to.active_element.send_keys(Keys.TAB)
+        focused = chromium.switch_to.active_element
+        reached.append(focused.get_attribute("name") or focused.get_attribute("id"))
+        if reached[-1] == "more":
+            break
+    assert {"benchmark", "family", "subtype", "by", "verdict", "more"} <= set(reached)
+    before = len(chromium.execute_script(SHOWN))
+    chromium.switch_to.active_element.send_keys(Keys.ENTER)
+    assert len(chromium.execute_script(SHOWN)) == 2 * before
+    assert (
+        chromium.switch_to.active_element.get_attribute("data-id")
+        == (chromium.execute_script(SHOWN)[before])
+    )

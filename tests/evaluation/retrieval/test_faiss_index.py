@@ -1,0 +1,116 @@
+"""The approximate index: what it gives, how it is held against exact ranks, and when it is refused.
+
+Needs faiss, which the extra `test` brings.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conf.errors import UserError
+from evaluation.embedders.cache import Embeddings
+from evaluation.retrieval import faiss_index
+from evaluation.retrieval.exact_search import exact_ranks
+from evaluation.retrieval.faiss_index import Found, approximate_ranks, ranks_of_found
+
+WIDTHS = [32, 8]
+NAMES = [f"scene/{k}" for k in range(900)]
+VECTORS = np.random.default_rng(0).standard_normal((900, 32), np.float32)
+ASKED = VECTORS[:40] + 0.3 * np.random.default_rng(1).standard_normal((40, 32), np.float32)
+EVERY = 10**6
+
+
+def embeddings(folder: Path, model: str = "one") -> Embeddings:
+    kept = Embeddings(folder, "frame", {"weights": model})
+    kept.complete(dict(zip(NAMES, range(900), strict=True)), lambda some: VECTORS[some], 64)
+    return kept
+
+
+def ranks(folder: Path, probes: int, model: str = "one"):
+    return approximate_ranks(ASKED, NAMES[:40], embeddings(folder, model), NAMES, WIDTHS, probes, 0)
+
+
+def test_through_all_lists_it_ranks_nearly_as_exactly(tmp_path) -> None:
+    found, told = ranks(tmp_path, EVERY)
+    exact = exact_ranks(ASKED, VECTORS[:40], [VECTORS], WIDTHS)
+    assert found.found.all()
+    # A byte an entry moves a score by less than a hundredth.
+    assert np.abs(found.greater[0] - exact.greater[0]).max() <= 3
+    assert [t["width"] for t in told] == WIDTHS
+    for of_width in told:
+        assert all(of_width[f"recall@{k}"] > 0.9 for k in (1, 10, 50))
+
+
+def test_fewer_lists_lose_more(tmp_path) -> None:
+    found, told = ranks(tmp_path, 1)
+    _, every = ranks(tmp_path, EVERY)
+    assert not found.found.all()
+    assert told[0]["recall@50"] < 0.5 < every[0]["recall@50"]
+
+
+def test_an_index_is_kept(tmp_path, monkeypatch) -> None:
+    _, first = ranks(tmp_path, 4)
+    monkeypatch.setattr(faiss_index, "_build", None)
+    _, again = ranks(tmp_path, 4)
+    without_time = [[{**t, "seconds": 0} for t in told] for told in (first, again)]
+    assert without_time[0] == without_time[1]
+
+
+def test_an_index_of_another_model_is_refused(tmp_path) -> None:
+    ranks(tmp_path, 4)
+    here, there = embeddings(tmp_path).folder, embeddings(tmp_path, "another").folder
+    shutil.copytree(here / "index", there / "index")
+    with pytest.raises(
+        UserError, match=r"was built for another model or database \(weights is one"
+    ):
+        ranks(tmp_path, 4, "another")
+
+
+def test_an_index_of_an_earlier_faiss_is_built_anew(tmp_path) -> None:
+    ranks(tmp_path, 4)
+    notes = sorted((embeddings(tmp_path).folder / "index").glob("*.json"))
+    before = [note.read_text() for note in notes]
+    for note in notes:
+        note.write_text(json.dumps(json.loads(note.read_text()) | {"faiss": "1.0"}))
+    ranks(tmp_path, 4)
+    assert [note.read_text() for note in notes] == before
+
+
+def test_what_a_kill_left_of_an_index_is_built_again(tmp_path) -> None:
+    _, first = ranks(tmp_path, 4)
+    for path in (embeddings(tmp_path).folder / "index").iterdir():
+        if path.suffix == ".json":
+            path.unlink()
+        else:
+            path.write_bytes(b"torn")
+    _, again = ranks(tmp_path, 4)
+    assert [t["recall@10"] for t in again] == [t["recall@10"] for t in first]
+
+
+def test_a_damaged_index_is_named(tmp_path) -> None:
+    ranks(tmp_path, 4)
+    for path in (embeddings(tmp_path).folder / "index").glob("*.faiss"):
+        path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(UserError, match=r"\.faiss is damaged .* delete it"):
+        ranks(tmp_path, 4)
+
+
+def test_ranks_are_counted_among_what_was_found() -> None:
+    frames = np.array([[7, 3, 5, -1], [7, 3, 5, 2], [7, 3, -1, -1]])
+    scores = np.array([[0.9, 0.8, 0.8, -9], [0.9, 0.8, 0.8, 0.1], [0.9, 0.8, -9, -9]])
+    found = ranks_of_found([Found(frames, scores, 0, 0)], np.array([5, 7, 4]), [8], 900)
+    assert found.greater.tolist() == [[1, 0, 0]]
+    assert found.tied.tolist() == [[1, 0, 0]]
+    assert found.found.tolist() == [[True, True, False]]
+
+
+def test_without_faiss_it_says_what_to_install(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "faiss", None)
+    with pytest.raises(UserError, match=r"pip install -e '\.\[index\]'"):
+        faiss_index.import_faiss()

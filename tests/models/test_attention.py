@@ -1,0 +1,193 @@
+"""The attention that is chosen gives the numbers of the library's own."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+from transformers import PreTrainedModel
+from transformers.models.qwen3_vl.modeling_qwen3_vl import eager_attention_forward
+
+from models.attention import (
+    BY_FRAME,
+    PRODUCTS,
+    SHORT,
+    attend_by_frame,
+    attend_by_products,
+    choose_attention,
+)
+from models.student.collator import Collator
+from models.student.prompts import Sample, selection_sample
+from train.student.trainer import token_mean
+
+LENGTH = 1500
+
+
+@pytest.fixture(scope="module")
+def samples(micro_store, frames, student_cfg) -> list[Sample]:
+    items = micro_store.selection("train")[:2]
+    texts = ("Answer: A", "Scene parse: stationary. " * 6 + "\nAnswer: B")
+    return [
+        selection_sample(i, "reasoning", "cot", frames, student_cfg, t)
+        for i, t in zip(items, texts, strict=True)
+    ]
+
+
+def heads(*shape: int, dtype: torch.dtype = torch.float32) -> list[torch.Tensor]:
+    """A query, a key and a value with gradients."""
+    generator = torch.Generator().manual_seed(0)
+    made = (torch.randn(shape, generator=generator).to(dtype) for _ in range(3))
+    return [one.requires_grad_() for one in made]
+
+
+class Layer(nn.Module):
+    num_key_value_groups = 1
+
+
+def grid(lengths: list[int]) -> torch.Tensor:
+    return torch.tensor([0, *lengths]).cumsum(0)
+
+
+@pytest.mark.parametrize("lengths", [[7] * 5, [7, 7, 3, 7], [9]])
+def test_frames_at_once_are_frames_one_by_one(lengths) -> None:
+    query, key, value = heads(1, 2, sum(lengths), 8)
+    found, _ = attend_by_frame(
+        Layer(), query, key, value, None, 0.3, grid(lengths), max(lengths), is_causal=False
+    )
+    expected = torch.cat(
+        [
+            eager_attention_forward(Layer(), q, k, v, None, 0.3)[0]
+            for q, k, v in zip(*(t.split(lengths, dim=2) for t in (query, key, value)), strict=True)
+        ],
+        dim=1,
+    )
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-5)
+    weight = torch.linspace(-1, 1, found.numel()).view_as(found)
+    ours = torch.autograd.grad((found * weight).sum(), (query, key, value))
+    theirs = torch.autograd.grad((expected * weight).sum(), (query, key, value))
+    for one, two in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(one, two, atol=1e-6, rtol=1e-5)
+
+
+def causal(length: int, dtype: torch.dtype) -> torch.Tensor:
+    return torch.full((length, length), torch.finfo(dtype).min, dtype=dtype).triu(1)[None, None]
+
+
+def test_products_are_the_librarys_eager_attention() -> None:
+    query, key, value = heads(2, 4, 33, 16)
+    key, value = key[:, :2].detach().requires_grad_(), value[:, :2].detach().requires_grad_()
+    layer = Layer()
+    layer.num_key_value_groups = 2
+    layer.eval()
+    inputs, mask = (query, key, value), causal(33, torch.float32)
+    ours, theirs = (
+        attend(layer, *inputs, mask, scaling=0.25)[0]
+        for attend in (attend_by_products, eager_attention_forward)
+    )
+    torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-5)
+    weight = torch.linspace(-1, 1, ours.numel()).view_as(ours)
+    for one, two in zip(
+        *(torch.autograd.grad((found * weight).sum(), inputs) for found in (ours, theirs)),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, two, atol=1e-5, rtol=1e-5)
+
+
+def test_products_in_bf16_err_no_more_than_fused_attention() -> None:
+    exact = heads(2, 4, 129, 32, dtype=torch.bfloat16)
+    wide = [t.detach().double().requires_grad_() for t in exact]
+    weight = torch.linspace(-1, 1, exact[0].numel()).view_as(exact[0])
+
+    def passes(attend, inputs) -> list[torch.Tensor]:
+        out = attend(*inputs).transpose(1, 2)
+        found = torch.autograd.grad((out * weight.transpose(1, 2).to(out.dtype)).sum(), inputs)
+        return [t.double() for t in (out, *found)]
+
+    def fused(query, key, value) -> torch.Tensor:
+        return nn.functional.scaled_dot_product_attention(query, key, value, is_causal=True)
+
+    def products(query, key, value) -> torch.Tensor:
+        mask = causal(129, torch.bfloat16)
+        found, _ = attend_by_products(Layer(), query, key, value, mask, scaling=32**-0.5)
+        return found.transpose(1, 2)
+
+    true, library, ours = passes(fused, wide), passes(fused, exact), passes(products, exact)
+    for t, a, b in zip(true, library, ours, strict=True):
+        assert (b - t).norm() < 2 * (a - t).norm()
+
+
+def loss_of(model: PreTrainedModel, batch: dict) -> torch.Tensor:
+    batch = dict(batch)
+    return token_mean(model(**batch, use_cache=False), batch.pop("labels"))
+
+
+def test_a_model_with_frames_at_once_has_the_same_loss_and_gradients(
+    samples, processor, model
+) -> None:
+    batch = Collator(processor, LENGTH)(samples)
+    found = []
+    for vision in ("sdpa", BY_FRAME):
+        model.set_attn_implementation({"text_config": "sdpa", "vision_config": vision})
+        assert model.model.visual.config._attn_implementation == vision
+        loss = loss_of(model, batch)
+        found.append([loss, *torch.autograd.grad(loss, list(model.parameters()))])
+    for one, two in zip(*found, strict=True):
+        torch.testing.assert_close(one, two, atol=1e-6, rtol=1e-4)
+
+
+def test_every_pass_over_the_frames_is_one_call(samples, processor, model, monkeypatch) -> None:
+    choose_attention(model, "bf16", LENGTH)
+    seen = []
+    from models import attention
+
+    def counted(module, query, *args, **settings):
+        seen.append(query.shape)
+        return attend_by_products(module, query, *args, **settings)
+
+    monkeypatch.setattr(attention, "attend_by_products", counted)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        loss_of(model, Collator(processor, LENGTH)(samples))
+    layers = len(model.model.visual.blocks)
+    # The images of two samples, and then the frames of their clips.
+    assert [shape[0] for shape in seen] == [2 * 4] * layers + [2 * 6] * layers
+
+
+def test_the_choice_goes_by_precision_and_length(model) -> None:
+    text, vision = model.config.text_config, model.config.vision_config
+    for precision, length, expected in (
+        ("bf16", SHORT, PRODUCTS),
+        ("bf16", SHORT + 1, "sdpa"),
+        ("fp32", SHORT, "sdpa"),
+    ):
+        choose_attention(model, precision, length)
+        assert (text._attn_implementation, vision._attn_implementation) == (expected, BY_FRAME)
+
+
+@pytest.mark.parametrize("precision", ["bf16", "fp32"])
+def test_padding_and_a_cache_change_nothing(samples, processor, model, precision) -> None:
+    """Rows of padding alone have a softmax too, and a model writes what it would write without a
+    cache."""
+    choose_attention(model, precision, LENGTH)
+    collate, reduced = Collator(processor, LENGTH), precision == "bf16"
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=reduced):
+        batch = collate(samples)
+        counts = [int((collate([s])["labels"] != -100).sum()) for s in samples]
+        alone = sum(loss_of(model, collate([s])) * n for s, n in zip(samples, counts, strict=True))
+        together = loss_of(model, batch)
+        torch.testing.assert_close(
+            together, alone / sum(counts), atol=5e-3 if reduced else 1e-5, rtol=0
+        )
+        del batch["labels"], batch["logits_to_keep"]
+        with_cache, without = (
+            model.generate(**batch, max_new_tokens=5, do_sample=False, use_cache=cache,
+                           output_logits=True, return_dict_in_generate=True).logits
+            for cache in (True, False)
+        )  # fmt: skip
+    tolerance = 0.1 if reduced else 1e-4
+    torch.testing.assert_close(with_cache[0], without[0], atol=tolerance, rtol=0)
+
+
+def test_a_saved_model_does_not_ask_for_it(model, tmp_path) -> None:
+    choose_attention(model, "bf16", LENGTH)
+    model.save_pretrained(tmp_path)
+    assert "dynapix" not in (tmp_path / "config.json").read_text()

@@ -1,0 +1,42 @@
+"""What tells one model's weights from another's."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from models.checks import weights_digest
+
+SHAPES = {"first": (300, 200), "middle": (7,), "visual": (2000, 300)}
+
+
+@pytest.mark.parametrize("changed", SHAPES)
+def test_weights_are_known_by_each_of_their_tensors(tmp_path, changed) -> None:
+    """A merged student differs from its base in some of the tensors, which may stand anywhere."""
+    one, other = tmp_path / "one", tmp_path / "other"
+    one.mkdir()
+    save_file({n: torch.randn(s) for n, s in SHAPES.items()}, one / "model.safetensors")
+    shutil.copytree(one, other)
+    assert weights_digest(one) == weights_digest(other)
+    tensors = load_file(one / "model.safetensors")
+    tensors[changed] = tensors[changed] * 1.01
+    save_file(tensors, other / "model.safetensors")
+    assert weights_digest(one) != weights_digest(other)
+
+
+def headed(offsets: object) -> bytes:
+    """A file of safetensors with one tensor at such a place."""
+    head = json.dumps({"weight": {"dtype": "F32", "shape": [1], "data_offsets": offsets}}).encode()
+    return len(head).to_bytes(8, "little") + head
+
+
+def test_a_damaged_file_has_a_digest_too(tmp_path) -> None:
+    for k, content in enumerate(
+        (b"", b"\xff" * 100, b"\x02" + bytes(7) + b"[]", headed("x"), headed([-9, 2]))
+    ):
+        (tmp_path / "model.safetensors").write_bytes(content)
+        assert len(weights_digest(tmp_path)) == 16, k

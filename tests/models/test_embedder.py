@@ -1,0 +1,182 @@
+"""The retriever's inputs, and that what is saved is a plain SentenceTransformer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sentence_transformers import SentenceTransformer
+
+from conf.errors import UserError
+from conf.schema import LateConfig, LoraConfig
+from data.records import FPS, FRAMES, FrameRef, shown_frames
+from data.tracks.retrieval.database import Album
+from models.loading import keep_differentiable
+from models.parameter_counts import count_towers
+from models.retriever import embedder
+from models.retriever.embedder import frame_input, query_input
+from train.common.audit import audit_retriever
+from train.retriever.evaluator import STEP, HeldOutRanking, LateHeldOutRanking, slice_database
+
+
+def load(micro_store, cfg, folder) -> SentenceTransformer:
+    texts = embedder.corpus(micro_store.retrieval("train"), cfg)
+    return embedder.load_retriever(cfg, "fp32", texts, folder)
+
+
+def test_a_query_is_instruction_then_video_then_text_and_a_generation_prompt(
+    micro_store, frames, retriever_cfg, tmp_path
+) -> None:
+    model = load(micro_store, retriever_cfg, tmp_path)
+    query = micro_store.retrieval("train")[0]
+    features = model.preprocess(
+        [query_input(query, frames, retriever_cfg)], prompt=retriever_cfg.query_instruction
+    )
+    text = model[0].processor.tokenizer.decode(features["input_ids"][0])
+    assert text.startswith(f"<|im_start|>system\n{retriever_cfg.query_instruction}<|im_end|>")
+    assert text.index("<|video_pad|>") < text.index(query.question)
+    assert text.endswith("<|im_start|>assistant\n")
+    assert features["video_grid_thw"].tolist() == [[6, 6, 6]]
+    shown = shown_frames(query.prefix_start, query.prefix_stop, 12)
+    assert f"<{(shown[0] + shown[1]) / 2 / FPS:.1f} seconds>" in text
+    assert "of 6 x 3 x 3 tokens" in audit_retriever(model, retriever_cfg, query, frames)
+
+
+def test_a_clip_is_told_at_its_own_rate(
+    micro_store, frames, retriever_cfg, tmp_path, monkeypatch
+) -> None:
+    """As in the suites of other simulators, whose clips have 12 or 30 frames a second."""
+    query = micro_store.retrieval("train")[0]
+    slow = replace(frames.scene(query.scene_id), fps=12)
+    monkeypatch.setattr(frames, "scene", lambda _: slow)
+    model = load(micro_store, retriever_cfg, tmp_path)
+    features = model.preprocess([query_input(query, frames, retriever_cfg)])
+    text = model[0].processor.tokenizer.decode(features["input_ids"][0])
+    shown = shown_frames(query.prefix_start, query.prefix_stop, 12)
+    assert f"<{(shown[0] + shown[1]) / 2 / 12:.1f} seconds>" in text
+
+
+def test_a_long_query_is_refused_and_never_cut(
+    micro_store, frames, retriever_cfg, tmp_path
+) -> None:
+    model = load(micro_store, retriever_cfg, tmp_path)
+    short = micro_store.retrieval("train")[0]
+    long = replace(short, question="Which frame? " * 2000)
+    assert embedder.longest_query([short, long, short], model.tokenizer) is long
+    with pytest.raises(UserError, match=rf"query {long.query_id} has \d{{4,}} tokens, more than"):
+        audit_retriever(model, retriever_cfg, long, frames)
+
+
+def test_the_embedding_is_the_last_tokens_state_normalised(
+    micro_store, frames, retriever_cfg, tmp_path
+) -> None:
+    model = load(micro_store, retriever_cfg, tmp_path)
+    images = [frame_input(f, frames) for f in micro_store.database()[:2]]
+    features = model.preprocess(images, prompt=retriever_cfg.frame_instruction)
+    with torch.no_grad():
+        states = model[0](dict(features))["token_embeddings"]
+    last = states[:, -1] / states[:, -1].norm(dim=-1, keepdim=True)
+    encoded = model.encode(images, prompt=retriever_cfg.frame_instruction)
+    np.testing.assert_allclose(encoded, last.numpy(), atol=1e-5)
+
+
+def test_a_saved_retriever_encodes_the_same_without_this_project(
+    micro_store, frames, retriever_cfg, tmp_path
+) -> None:
+    model = load(micro_store, retriever_cfg, tmp_path / "base")
+    model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
+    again = SentenceTransformer(str(tmp_path / "saved"), device="cpu")
+    query = micro_store.retrieval("train")[0]
+    for inputs in (
+        [query_input(query, frames, retriever_cfg)],
+        [frame_input(query.target, frames)],
+    ):
+        np.testing.assert_allclose(
+            model.encode(inputs, prompt_name="query"),
+            again.encode(inputs, prompt_name="query"),
+            atol=1e-6,
+        )
+
+
+def test_adapters_are_read_back_over_the_4_bit_weights_they_were_trained_on(
+    micro_store, frames, retriever_cfg, saved_base, tmp_path
+) -> None:
+    cfg = replace(
+        retriever_cfg, architecture=None, model=saved_base, quantization="nf4", lora=LoraConfig()
+    )
+    model = load(micro_store, cfg, tmp_path)
+    with torch.no_grad():
+        for name, weight in model.named_parameters():
+            if "lora_B" in name:
+                weight.normal_(std=0.1, generator=torch.Generator().manual_seed(0))
+    model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
+    again = embedder.load_trained(cfg, "fp32", tmp_path / "saved")
+    assert count_towers(again)["language"].four_bit > 0
+    keep_differentiable(again)
+    query = [query_input(micro_store.retrieval("train")[0], frames, cfg)]
+    one, two = (m.encode(query, prompt_name="query") for m in (model, again))
+    np.testing.assert_allclose(one, two, atol=1e-5)
+
+
+@pytest.mark.parametrize("quantization", ["none", "nf4"])
+def test_adapters_are_trained_in_fp32_over_a_bf16_base(
+    micro_store, frames, retriever_cfg, saved_base, tmp_path, quantization
+) -> None:
+    cfg = replace(
+        retriever_cfg, architecture=None, model=saved_base, quantization=quantization,
+        lora=LoraConfig(),
+    )  # fmt: skip
+    model = embedder.load_retriever(cfg, "bf16", [], tmp_path)
+    assert {p.dtype for p in model.parameters() if p.requires_grad} == {torch.float32}
+    assert next(model[0].parameters()).dtype == torch.bfloat16
+    query = [query_input(micro_store.retrieval("train")[0], frames, cfg)]
+    assert np.isfinite(model.encode(query, prompt_name="query")).all()
+
+
+def test_no_frame_of_a_slice_shows_what_another_shows(micro_store) -> None:
+    """But for targets, which are all in it."""
+    queries = micro_store.retrieval("train")
+    targets = {q.target for q in queries}
+    database = slice_database(queries, micro_store)
+    assert targets < set(database)
+    album = Album(micro_store.scene)
+    for target in targets:
+        album.add(target)
+    assert all(album.add(frame) for frame in database if frame not in targets)
+    shown = {(f.scene_id, f.frame) for f in database}
+    for scene_id in {f.scene_id for f in database}:
+        left_out = {f for f in range(0, FRAMES, STEP) if (scene_id, f) not in shown}
+        assert not any(album.add(FrameRef(scene_id, frame)) for frame in left_out)
+
+
+@pytest.mark.parametrize("late", [None, LateConfig(width=24)])
+def test_a_held_out_ranking_is_that_of_all_pixels_at_once(
+    micro_store, frames, retriever_cfg, tmp_path, monkeypatch, late
+) -> None:
+    """It reads them a mini-batch at a time, and a frame that is no number has its name."""
+    cfg = replace(retriever_cfg, late=late)
+    model = load(micro_store, cfg, tmp_path).eval()
+    queries = micro_store.retrieval("train")[:7]
+    kind = LateHeldOutRanking if late else HeldOutRanking
+    evaluator = kind(queries, slice_database(queries, micro_store), frames, cfg, 2)
+    assert all(isinstance(one, FrameRef) for one in evaluator.corpus)
+    asked = model.encode_query([query_input(q, frames, cfg) for q in queries])
+    shown = model.encode_document([frame_input(f, frames) for f in evaluator.corpus])
+    scores = model.similarity(asked, shown).cpu().numpy()
+    gold = np.array([evaluator.corpus.index(q.target) for q in queries])
+    found = evaluator(model)
+    own = scores[np.arange(len(queries)), gold][:, None]
+    assert found["mrr"] == pytest.approx((1 / (1 + (scores > own).sum(1))).mean(), abs=0.02)
+    assert found["recall@10"] == pytest.approx(((scores > own).sum(1) < 10).mean(), abs=0.2)
+
+    embed, first = model.encode_document, evaluator.corpus[0]
+
+    def torn(*inputs, **settings):
+        made = list(embed(*inputs, **settings))
+        return [made[0] * float("nan"), *made[1:]]
+
+    monkeypatch.setattr(model, "encode_document", torn)
+    with pytest.raises(UserError, match=f"frame {first.frame} of {first.scene_id} is no number"):
+        evaluator(model)

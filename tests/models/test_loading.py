@@ -1,0 +1,116 @@
+"""What is loaded is what the preset says, or a sentence says why not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from transformers import AutoModelForImageTextToText, AutoProcessor
+
+from conf.compose import compose
+from conf.errors import UserError
+from conf.schema import LoraConfig, SftCommand
+from models import loading
+from models.parameter_counts import check_towers, count_towers
+from models.student.collator import Collator
+from models.student.prompts import selection_sample
+from train.student.trainer import token_mean
+
+
+def test_a_built_model_is_read_back_bit_for_bit(model, processor, tmp_path) -> None:
+    model.save_pretrained(tmp_path)
+    processor.save_pretrained(tmp_path)
+    again = AutoModelForImageTextToText.from_pretrained(tmp_path)
+    for name, weight in model.state_dict().items():
+        assert torch.equal(weight, again.state_dict()[name]), name
+    reader = AutoProcessor.from_pretrained(tmp_path)
+    text = "<|im_start|>Answer: B, near the top-left <0.4 seconds>"
+    assert reader.tokenizer.encode(text) == processor.tokenizer.encode(text)
+
+
+def test_nf4_spares_tower_and_head_and_lora_is_in_the_language_tower(nf4_cfg) -> None:
+    model, _ = loading.load_student(nf4_cfg, "fp32", list)
+    counts = count_towers(model)
+    check_towers(counts, nf4_cfg)
+    hidden, forward, rank = 64, 128, 4
+    layer = 4 * hidden * hidden + 3 * hidden * forward
+    lora = rank * (4 * 2 * hidden + 3 * (hidden + forward))
+    assert counts["language"].four_bit == 2 * layer
+    assert counts["language"].lora == counts["language"].trainable == 2 * lora
+    assert counts["vision"].four_bit == counts["vision"].trainable == 0
+    trained = [p for p in model.parameters() if p.requires_grad]
+    assert {p.dtype for p in trained} == {torch.float32}
+
+
+def test_an_evaluation_leaves_the_gradients_as_they_were(nf4_cfg, micro_store, frames) -> None:
+    """On some CPUs bitsandbytes repacks 4-bit weights when it evaluates, and then passes no
+    gradient on."""
+    model, processor = loading.load_student(nf4_cfg, "bf16", list)
+    item = micro_store.selection("train")[0]
+    batch = Collator(processor, 1500)(
+        [selection_sample(item, "answer", "cot", frames, nf4_cfg, "Answer: A")]
+    )
+    labels = batch.pop("labels")
+
+    def gradients() -> list[torch.Tensor]:
+        model.zero_grad()
+        with torch.autocast("cpu", torch.bfloat16):
+            token_mean(model.train()(**batch), labels).backward()
+        return [p.grad.clone() for p in model.parameters() if p.requires_grad]
+
+    before = gradients()
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        model.eval()(**batch)
+    for one, two in zip(before, gradients(), strict=True):
+        torch.testing.assert_close(one, two)
+
+
+def test_adapters_stay_fp32_over_a_bf16_base(nf4_cfg) -> None:
+    model, _ = loading.load_student(nf4_cfg, "bf16", list)
+    assert {p.dtype for p in model.parameters() if p.requires_grad} == {torch.float32}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"lora": LoraConfig(rank=4, targets="all-linear")}, "vision"),
+        ({"quantization": "none"}, "language has some 4-bit"),
+    ],
+)
+def test_the_audit_stops_a_model_that_is_not_what_the_preset_says(nf4_cfg, change, message) -> None:
+    loaded = nf4_cfg if "quantization" in change else replace(nf4_cfg, **change)
+    model, _ = loading.load_student(loaded, "fp32", list)
+    with pytest.raises(UserError, match=message):
+        check_towers(count_towers(model), replace(nf4_cfg, **change))
+
+
+def test_a_trained_student_answers_as_it_did_when_it_was_saved(
+    nf4_cfg, micro_store, frames, tmp_path
+) -> None:
+    model, processor = loading.load_student(nf4_cfg, "fp32", list)
+    with torch.no_grad():
+        for name, weight in model.named_parameters():
+            if "lora_B" in name:
+                weight.normal_(std=0.1)
+    loading.save(model, processor, tmp_path / "student", "fp32")
+    again, reader = loading.load_trained(nf4_cfg, "fp32", tmp_path / "student")
+    item = micro_store.selection("train")[0]
+    batch = Collator(reader, 1500)([selection_sample(item, "answer", "cot", frames, nf4_cfg)])
+    # Packed for inference, some CPUs round 4-bit products another way.
+    loading.keep_differentiable(again)
+    with torch.no_grad():
+        one, two = model.eval()(**batch).logits, again(**batch).logits
+    torch.testing.assert_close(one, two, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("preset", ["qwen3_vl_8b", "qwen3_vl_2b"])
+def test_a_model_that_is_not_here_is_named_with_the_way_out(preset, monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    cfg = compose("train.sft", SftCommand, [f"student={preset}"]).student
+    with pytest.raises(UserError, match=r"Qwen/Qwen3-VL-.* student\.model=FOLDER"):
+        loading.load_student(cfg, "bf16", list)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="cannot be loaded from that folder"):
+        loading.load_student(replace(cfg, model=str(tmp_path / "empty")), "bf16", list)

@@ -1,0 +1,347 @@
+"""The paper's presets on the released models' module trees: names and shapes from their own
+config.json, on the meta device, so that no weight and no GPU is needed."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import bitsandbytes as bnb
+import numpy as np
+import pytest
+import torch
+from peft.tuners.lora import LoraLayer
+from torch import nn
+from transformers import (
+    AutoModel,
+    AutoModelForImageTextToText,
+    BitsAndBytesConfig,
+    PreTrainedModel,
+    ProcessorMixin,
+    Qwen2VLImageProcessor,
+    Qwen3VLConfig,
+    Qwen3VLProcessor,
+    Qwen3VLVideoProcessor,
+)
+from transformers.quantizers.auto import AutoHfQuantizer
+
+from conf.compose import compose
+from conf.errors import UserError
+from conf.schema import LoraConfig, SftCommand, StudentConfig, TeacherConfig
+from data.records import FPS, shown_frames
+from data.render.frame_cache import Frames
+from models import loading
+from models.parameter_counts import Tower, check_towers, count_towers
+from models.student.collator import Collator, encode
+from models.student.prompts import Clip, Sample, conversation, response, selection_sample
+from teacher.narrate import ensure_rationales
+from teacher.validation.claims import LONGEST
+from train.common.audit import audit
+from train.student.dataset import supervised_items
+
+RELEASED = {"qwen3_vl_8b": 8_767_123_696, "qwen3_vl_2b": 2_127_532_032}
+"""Parameters in the safetensors of Qwen/Qwen3-VL-8B-Instruct and Qwen/Qwen3-VL-2B-Instruct."""
+RANK = 16
+# Sizes in the released processors' own files, and those of the classes.
+RELEASED_PIXELS = {
+    "image": {"shortest_edge": 65536, "longest_edge": 16777216},
+    "video": {"shortest_edge": 4096, "longest_edge": 25165824},
+}
+
+presets = pytest.mark.parametrize("preset", RELEASED)
+
+
+def student(preset: str) -> StudentConfig:
+    return compose("train.sft", SftCommand, [f"student={preset}"]).student
+
+
+def config_of(preset: str) -> dict[str, Any]:
+    return json.loads((Path(__file__).parent / "configs" / f"{preset}.json").read_text())
+
+
+def base_of(
+    preset: str, quantization: BitsAndBytesConfig | None, kind: Any = AutoModelForImageTextToText
+) -> PreTrainedModel:
+    """A preset's base as `from_pretrained` has it before the weights come: in bf16, its linear
+    layers replaced by the library's own quantizer."""
+    # Reading marks the dictionary, so each base gets one of its own.
+    config = Qwen3VLConfig.from_dict(config_of(preset))
+    with torch.device("meta"):
+        model = kind.from_config(config, dtype=torch.bfloat16)
+    if quantization is not None:
+        quantizer = AutoHfQuantizer.from_config(quantization, pre_quantized=False)
+        quantizer.preprocess_model(model, device_map={"": "cpu"})
+        quantizer.postprocess_model(model)
+    return model
+
+
+def nf4() -> BitsAndBytesConfig:
+    return loading.nf4_config(torch.bfloat16)
+
+
+@cache
+def adapted(preset: str) -> nn.Module:
+    """A preset's student as it is trained; no test changes it."""
+    return loading.add_adapters(base_of(preset, nf4()), student(preset).lora)
+
+
+def projections(text: dict[str, Any]) -> dict[str, tuple[int, int]]:
+    """What goes into and comes out of each projection of a language layer."""
+    hidden, forward = text["hidden_size"], text["intermediate_size"]
+    queries = text["num_attention_heads"] * text["head_dim"]
+    keys = text["num_key_value_heads"] * text["head_dim"]
+    return {
+        "self_attn.q_proj": (hidden, queries),
+        "self_attn.k_proj": (hidden, keys),
+        "self_attn.v_proj": (hidden, keys),
+        "self_attn.o_proj": (queries, hidden),
+        "mlp.gate_proj": (hidden, forward),
+        "mlp.up_proj": (hidden, forward),
+        "mlp.down_proj": (forward, hidden),
+    }
+
+
+def vision_parameters(vision: dict[str, Any]) -> int:
+    hidden, forward = vision["hidden_size"], vision["intermediate_size"]
+    merged = hidden * vision["spatial_merge_size"] ** 2
+    patch = vision["in_channels"] * vision["temporal_patch_size"] * vision["patch_size"] ** 2
+
+    def linear(inputs: int, outputs: int) -> int:
+        return inputs * outputs + outputs
+
+    norms = 2 * 2 * hidden
+    attention = linear(hidden, 3 * hidden) + linear(hidden, hidden)
+    block = attention + linear(hidden, forward) + linear(forward, hidden) + norms
+    merger = linear(merged, merged) + linear(merged, vision["out_hidden_size"])
+    # The last merger norms each patch, those of the deepstack what is already merged.
+    mergers = merger + 2 * hidden
+    mergers += len(vision["deepstack_visual_indexes"]) * (merger + 2 * merged)
+    positions = vision["num_position_embeddings"] * hidden
+    return linear(patch, hidden) + positions + vision["depth"] * block + mergers
+
+
+def towers_of(config: dict[str, Any], rank: int) -> dict[str, Tower]:
+    """What an audit must count, from the sizes alone."""
+    text = config["text_config"]
+    hidden, layers = text["hidden_size"], text["num_hidden_layers"]
+    sides = projections(text).values()
+    four_bit = layers * sum(inputs * outputs for inputs, outputs in sides)
+    lora = layers * sum(rank * (inputs + outputs) for inputs, outputs in sides)
+    norms = layers * 2 * (hidden + text["head_dim"])
+    tables = 1 if config["tie_word_embeddings"] else 2
+    return {
+        "vision": Tower(vision_parameters(config["vision_config"])),
+        "language": Tower(four_bit + norms + lora, four_bit, lora, lora),
+        "embeddings and head": Tower(tables * text["vocab_size"] * hidden + hidden),
+    }
+
+
+def projection_names(preset: str, prefix: str) -> set[str]:
+    text = config_of(preset)["text_config"]
+    return {
+        f"{prefix}layers.{layer}.{name}"
+        for layer in range(text["num_hidden_layers"])
+        for name in projections(text)
+    }
+
+
+def names_of(model: nn.Module, kind: type) -> set[str]:
+    return {name for name, module in model.named_modules() if isinstance(module, kind)}
+
+
+@presets
+def test_the_recipe_is_the_papers(preset) -> None:
+    cfg = compose("train.sft", SftCommand, [f"student={preset}"])
+    asked, train = cfg.student, cfg.train
+    assert (asked.quantization, asked.lora.rank, asked.lora.alpha) == ("nf4", RANK, 32)
+    assert (asked.frames, asked.image_size, asked.max_length) == (12, 336, 3072)
+    assert (train.lr, train.epochs, train.batch, train.micro_batch) == (2e-5, 3, 16, 1)
+    assert train.precision == "bf16"
+
+
+@presets
+def test_the_tree_has_the_size_of_the_released_model(preset) -> None:
+    base = base_of(preset, None)
+    assert sum(p.numel() for p in base.parameters()) == RELEASED[preset]
+    assert sum(t.parameters for t in towers_of(config_of(preset), 0).values()) == RELEASED[preset]
+
+
+@presets
+def test_the_audit_counts_what_the_sizes_say(preset) -> None:
+    towers = count_towers(adapted(preset))
+    assert towers == towers_of(config_of(preset), RANK)
+    check_towers(towers, student(preset))
+
+
+@presets
+def test_the_language_towers_projections_alone_are_quantised_and_adapted(preset) -> None:
+    model = adapted(preset)
+    wanted = projection_names(preset, "base_model.model.model.language_model.")
+    assert names_of(model, LoraLayer) == wanted
+    assert names_of(model, bnb.nn.Linear4bit) == {f"{name}.base_layer" for name in wanted}
+
+
+@presets
+def test_the_head_is_spared_and_tied_where_the_release_ties_it(preset) -> None:
+    base = base_of(preset, nf4())
+    assert type(base.lm_head) is nn.Linear
+    tied = base.lm_head.weight is base.model.language_model.embed_tokens.weight
+    assert tied == config_of(preset)["tie_word_embeddings"]
+
+
+@presets
+def test_a_bare_model_is_quantised_alike(preset) -> None:
+    """A retriever has no head, and its names start one level further down."""
+    base = base_of(preset, nf4(), AutoModel)
+    assert names_of(base, bnb.nn.Linear4bit) == projection_names(preset, "language_model.")
+
+
+@presets
+@pytest.mark.parametrize("quantized", [True, False], ids=["nf4", "none"])
+def test_adapters_are_fp32_over_a_base_that_stays_bf16(preset, quantized) -> None:
+    lora = student(preset).lora
+    model = adapted(preset) if quantized else loading.add_adapters(base_of(preset, None), lora)
+    parameters = dict(model.named_parameters())
+    adapters = {name for name in parameters if "lora_" in name}
+    assert {parameters[name].dtype for name in adapters} == {torch.float32}
+    assert {name for name, p in parameters.items() if p.requires_grad} == adapters
+    kept = [p for n, p in parameters.items() if n not in adapters]
+    assert {p.dtype for p in kept if not isinstance(p, bnb.nn.Params4bit)} == {torch.bfloat16}
+
+
+@pytest.mark.parametrize(
+    ("spared", "message"),
+    [
+        (["visual", "lm_head"], "vision has some 4-bit parameters"),
+        (["model.visual"], "embeddings and head has some 4-bit parameters"),
+        (["model.visual", "model.language_model", "lm_head"], "language has no 4-bit parameters"),
+    ],
+)
+def test_a_wrong_skip_list_is_stopped(spared, message) -> None:
+    quantization = nf4()
+    quantization.llm_int8_skip_modules = spared
+    cfg = student("qwen3_vl_2b")
+    model = loading.add_adapters(base_of(cfg.name, quantization), cfg.lora)
+    with pytest.raises(UserError, match=f"preset qwen3_vl_2b says: {message}"):
+        check_towers(count_towers(model), cfg)
+
+
+@pytest.mark.parametrize(
+    ("targets", "message"),
+    [
+        ("all-linear", "vision has some LoRA parameters"),
+        (r".*\.(qkv|q_proj)", "vision has some LoRA parameters"),
+        (r".*\.embed_tokens", "embeddings and head has some LoRA parameters"),
+    ],
+)
+def test_adapters_outside_the_language_tower_are_stopped(targets, message) -> None:
+    cfg = student("qwen3_vl_2b")
+    model = loading.add_adapters(base_of(cfg.name, nf4()), replace(cfg.lora, targets=targets))
+    with pytest.raises(UserError, match=message):
+        check_towers(count_towers(model), cfg)
+
+
+@pytest.mark.parametrize("targets", ["q_proj", "model.(language_model", r".*\.input_layernorm"])
+def test_a_pattern_that_adapts_nothing_is_named(targets) -> None:
+    with pytest.raises(UserError, match=re.escape(f"student.lora.targets={targets} adapts")):
+        loading.add_adapters(base_of("qwen3_vl_2b", nf4()), LoraConfig(targets=targets))
+
+
+def released_processor(
+    source: ProcessorMixin, pixels: dict[str, dict[str, int]]
+) -> Qwen3VLProcessor:
+    """The released models' processor with sizes of `pixels`, but for its tokenizer: that of
+    `source`, which never saw a rationale and needs more tokens for one."""
+
+    def sized(name: str) -> dict[str, Any]:
+        return {"size": pixels[name]} if name in pixels else {}
+
+    return Qwen3VLProcessor(
+        image_processor=Qwen2VLImageProcessor(patch_size=16, **sized("image")),
+        tokenizer=source.tokenizer,
+        video_processor=Qwen3VLVideoProcessor(**sized("video")),
+        chat_template=source.chat_template,
+    )
+
+
+@pytest.mark.parametrize("pixels", [RELEASED_PIXELS, {}], ids=["released", "class defaults"])
+@presets
+def test_frames_come_at_320_px_and_at_their_true_times(
+    preset, pixels, micro_store, processor
+) -> None:
+    cfg = student(preset)
+    released = released_processor(processor, pixels)
+    loading.pin_sizes(released, cfg.image_size, cfg.frames)
+    item = next(
+        i for i in micro_store.selection("train") if i.prefix_stop - i.prefix_start >= cfg.frames
+    )
+    frames = Frames(micro_store, cfg.image_size)
+    sample = selection_sample(item, "reasoning", "cot", frames, cfg)
+    encoded = encode(sample, released, cfg.max_length)
+    # 336 px are ten and a half cells of 32 px.
+    assert encoded.media["video_grid_thw"].tolist() == [[6, 20, 20]]
+    assert encoded.media["image_grid_thw"].tolist() == [[1, 20, 20]] * 4
+    assert encoded.input_ids.count(released.video_token_id) == 6 * 100
+    assert encoded.input_ids.count(released.image_token_id) == 4 * 100
+    shown = shown_frames(item.prefix_start, item.prefix_stop, cfg.frames)
+    assert len(shown) == cfg.frames
+    # Two frames share a patch in time, which stands at the mean of their times.
+    times = [(a + b) / 2 / FPS for a, b in zip(shown[::2], shown[1::2], strict=True)]
+    told = re.findall(r"<(\d+\.\d) seconds>", released.tokenizer.decode(encoded.input_ids))
+    assert told == [f"{time:.1f}" for time in times]
+
+
+def media(size: int, count: int) -> Sample:
+    """A video of `count` black frames and one image of them."""
+    video = np.zeros((count, size, size, 3), np.uint8)
+    return conversation("black", [video[0]], None, Clip(video, list(range(count))))
+
+
+def test_a_video_of_default_size_is_shrunk_where_an_image_is_not(processor) -> None:
+    """What pinning is for: the library's default, should it change, needs another look."""
+    encoded = encode(media(336, 12), released_processor(processor, {}), 3072)
+    assert encoded.media["video_grid_thw"].tolist() == [[6, 16, 16]]
+    assert encoded.media["image_grid_thw"].tolist() == [[1, 20, 20]]
+
+
+@pytest.mark.parametrize("count", [2, 5, 9, 11, 12])
+@pytest.mark.parametrize("size", [32, 96, 112, 240, 336, 350])
+def test_a_frame_has_one_size_in_every_video_and_image(size, count, processor) -> None:
+    released = released_processor(processor, RELEASED_PIXELS)
+    loading.pin_sizes(released, size, 12)
+    encoded = encode(media(size, count), released, 3072)
+    edge = 2 * round(size / 32)
+    assert encoded.media["image_grid_thw"].tolist() == [[1, edge, edge]]
+    assert encoded.media["video_grid_thw"].tolist() == [[(count + 1) // 2, edge, edge]]
+
+
+@presets
+def test_the_longest_rationale_fits_and_the_whole_audit_needs_no_weights(
+    preset, micro_store, processor
+) -> None:
+    cfg = student(preset)
+    released = released_processor(processor, RELEASED_PIXELS)
+    loading.pin_sizes(released, cfg.image_size, cfg.frames)
+    rationales = {
+        r.item_id: r for r in ensure_rationales(micro_store, TeacherConfig(name="template"))
+    }
+    train = compose("train.sft", SftCommand, [f"student={preset}"]).train
+    asked = supervised_items(micro_store, micro_store.selection("train"), rationales, train, None)[
+        "reasoning"
+    ]
+    longest = max(asked, key=lambda s: len(s.text()))
+    words = longest.rationale.split()
+    more = " ".join((words * LONGEST)[: LONGEST - len(words)])
+    text = f"{more}\n{longest.rationale}"
+    assert len(text.split()) == LONGEST
+    told = response(text, longest.matches, longest.item.letter, "reasoning", train.regime)
+    frames = Frames(micro_store, cfg.image_size)
+    sample = selection_sample(longest.item, "reasoning", train.regime, frames, cfg, told)
+    seen = audit(adapted(preset), released, cfg, sample, Collator(released, cfg.max_length))
+    assert "336 x 336 px become a video of 6 x 10 x 10 tokens and an image of 1 x 10 x 10" in seen
+    for tower in towers_of(config_of(preset), RANK).values():
+        assert f"{tower.parameters:,}" in seen

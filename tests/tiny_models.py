@@ -1,0 +1,151 @@
+"""A student and a retriever of a few thousand weights, built by the project's own means."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+from transformers import PreTrainedModel, ProcessorMixin
+
+from conf.schema import (
+    ArchitectureConfig,
+    BenchmarkConfig,
+    ContrastiveCommand,
+    ContrastiveTrainConfig,
+    LoraConfig,
+    RetrieverConfig,
+    SftCommand,
+    SftTrainConfig,
+    StudentConfig,
+    TeacherConfig,
+)
+from data.records import RetrievalQuery
+from data.render.frame_cache import Frames
+from data.store import Store
+from models.tiny_qwen3_vl import build_model, build_processor
+from train.student import dataset
+
+SMALL = ArchitectureConfig(
+    hidden=64,
+    layers=2,
+    heads=2,
+    kv_heads=2,
+    feed_forward=128,
+    vision_hidden=64,
+    vision_layers=2,
+    vision_heads=2,
+    vision_feed_forward=128,
+)
+
+
+@pytest.fixture(scope="session")
+def student_cfg() -> StudentConfig:
+    return StudentConfig(
+        name="small", architecture=SMALL, quantization="none", lora=LoraConfig(rank=0),
+        image_size=96,
+        max_length=1500,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def retriever_cfg() -> RetrieverConfig:
+    return RetrieverConfig(
+        name="small", architecture=SMALL, quantization="none", lora=LoraConfig(rank=0),
+        image_size=96,
+        widths=[64, 32],
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def processor(micro_store: Store) -> ProcessorMixin:
+    return build_processor(dataset.corpus(micro_store, []), 1024, 96)
+
+
+@pytest.fixture
+def model(processor: ProcessorMixin) -> PreTrainedModel:
+    return build_model(SMALL, len(processor.tokenizer))
+
+
+@pytest.fixture(scope="session")
+def saved_base(tmp_path_factory: pytest.TempPathFactory, processor: ProcessorMixin) -> str:
+    """A base on disk, as a preset's `model` names one."""
+    folder = tmp_path_factory.mktemp("base")
+    build_model(SMALL, len(processor.tokenizer)).save_pretrained(folder)
+    processor.save_pretrained(folder)
+    return str(folder)
+
+
+@pytest.fixture(scope="session")
+def nf4_cfg(saved_base: str) -> StudentConfig:
+    return StudentConfig(
+        name="nf4",
+        model=saved_base,
+        image_size=96,
+        max_length=1500,
+        max_new_tokens=24,
+        lora=LoraConfig(rank=4),
+    )
+
+
+@pytest.fixture(scope="session")
+def frames(micro_store: Store) -> Frames:
+    return Frames(micro_store, 96)
+
+
+@pytest.fixture(scope="session")
+def few_steps(
+    micro: BenchmarkConfig, micro_store: Store, nf4_cfg: StudentConfig
+) -> Callable[..., SftCommand]:
+    """Settings of `train.sft` for a few steps over the small base, some of train's others."""
+
+    def settings(**train: object) -> SftCommand:
+        few = SftTrainConfig(
+            lr=1e-3, max_steps=4, batch=2, micro_batch=2, precision="fp32", evaluations=2,
+            gradient_checkpointing=False, validation_items=2, generated_items=0,
+        )  # fmt: skip
+        return SftCommand(
+            benchmark=micro,
+            store=str(micro_store.folder.parent),
+            workers=1,
+            teacher=TeacherConfig(name="template"),
+            student=nf4_cfg,
+            train=replace(few, **train),
+        )
+
+    return settings
+
+
+@pytest.fixture(scope="session")
+def contrastive_settings(
+    micro: BenchmarkConfig, micro_store: Store, retriever_cfg: RetrieverConfig
+) -> ContrastiveCommand:
+    """Settings of `train.contrastive` for a few steps of a small retriever."""
+    train = ContrastiveTrainConfig(
+        lr=1e-3, max_steps=4, batch=4, mini_batch=2, precision="fp32",
+        gradient_checkpointing=False, evaluations=2, validation_queries=4,
+    )  # fmt: skip
+    return ContrastiveCommand(
+        benchmark=micro,
+        store=str(micro_store.folder.parent),
+        workers=1,
+        retriever=retriever_cfg,
+        train=train,
+    )
+
+
+@pytest.fixture(scope="session")
+def queries(micro_store: Store) -> list[RetrievalQuery]:
+    """Ten of several lengths, some of one prefix and some that name one frame."""
+    asked = micro_store.retrieval("train")[:6]
+    again = [
+        replace(
+            q,
+            query_id=f"{q.query_id} again",
+            question=f"{q.question} Or else, which frame comes before that?",
+            target=q.hard_negatives[0],
+            hard_negatives=(q.target, asked[0].target),
+        )
+        for q in asked[1:5]
+    ]
+    return [*asked, *again]

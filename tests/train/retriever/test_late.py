@@ -1,0 +1,313 @@
+"""The multi-vector retriever: what is scored, its loss held against the library's, and that what
+is saved is a plain MultiVectorEncoder."""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from sentence_transformers import MultiVectorEncoder
+from sentence_transformers.multi_vector_encoder.losses import (
+    CachedMultiVectorMultipleNegativesRankingLoss,
+)
+from sentence_transformers.util.similarity import maxsim
+from torch.nn.functional import cross_entropy
+from transformers import dynamic_module_utils
+
+from conf.compose import compose, register
+from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
+from models.loading import keep_differentiable
+from models.retriever.embedder import corpus, frame_input, load_retriever, load_trained, query_input
+from models.retriever.multi_vector import scored_tokens
+from models.retriever.scored_tokens import ScoredTokens
+from train.common.audit import audit_retriever
+from train.retriever.batches import batch_of
+from train.retriever.inputs import Inputs
+from train.retriever.late_loss import LateRankingLoss
+from train.retriever.negatives import Weighing
+
+SCALE = 0.5
+NEGATIVES = 2
+FRAME = 9
+"""Tokens of a frame of 96 px; a clip has as many for each of its six pairs of frames."""
+
+
+def load(cfg, micro_store, folder, noise: float = 0.0) -> MultiVectorEncoder:
+    """In which adapters, if any, already do something."""
+    torch.manual_seed(0)
+    model = load_retriever(cfg, "fp32", corpus(micro_store.retrieval("train"), cfg), folder)
+    with torch.no_grad():
+        for name, weight in model.named_parameters():
+            if "lora_B" in name:
+                weight.normal_(std=noise)
+    return model
+
+
+@pytest.fixture(scope="module")
+def late_cfg(retriever_cfg):
+    return replace(retriever_cfg, late=LateConfig(width=24))
+
+
+@pytest.fixture(scope="module", params=["whole", "adapters", "pooled"])
+def trained(request, micro_store, late_cfg, saved_base, tmp_path_factory):
+    cfg = late_cfg
+    if request.param == "adapters":
+        cfg = replace(cfg, architecture=None, model=saved_base, lora=LoraConfig(rank=4))
+    if request.param == "pooled":
+        cfg = replace(cfg, late=LateConfig(width=24, pool=2))
+    return load(cfg, micro_store, tmp_path_factory.mktemp("base"), noise=0.05).train(), cfg
+
+
+def columns_of(model, cfg, queries, frames) -> list[dict]:
+    """As a data collator of the library's makes them of a batch."""
+    shown = [[q.target, *q.hard_negatives[:NEGATIVES]] for q in queries]
+    asked = [query_input(q, frames, cfg) for q in queries]
+    return [
+        model.preprocess(asked, prompt=cfg.query_instruction, task="query"),
+        *(
+            model.preprocess(
+                [frame_input(f, frames) for f in column],
+                prompt=cfg.frame_instruction,
+                task="document",
+            )
+            for column in zip(*shown, strict=True)
+        ),
+    ]
+
+
+@pytest.fixture(scope="module")
+def library(trained, queries, frames) -> tuple[float, dict[str, torch.Tensor]]:
+    model, cfg = trained
+    loss = CachedMultiVectorMultipleNegativesRankingLoss(model, scale=SCALE, mini_batch_size=4)
+    return gradients(model, loss, columns_of(model, cfg, queries, frames))
+
+
+def gradients(model, loss, features) -> tuple[float, dict[str, torch.Tensor]]:
+    model.zero_grad()
+    found = loss(features, None)
+    found.backward()
+    trained = {n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None}
+    return found.item(), trained
+
+
+def ours(trained, queries, frames, store, distinct=True, shared=True, **settings):
+    model, cfg = trained
+    settings = {"mini_batch": 4, "weighing": Weighing(store), "scale": SCALE, **settings}
+    loss = LateRankingLoss(model, Inputs(model, frames, cfg, "fp32"), **settings)
+    return gradients(model, loss, [batch_of(queries, NEGATIVES, distinct, shared)])
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"distinct": False, "shared": False},
+        {"distinct": True, "shared": False},
+        {"mini_batch": 1},
+        {"mini_batch": 12, "ahead": 2},
+        {"mini_batch_tokens": 400},
+    ],
+    ids=str,
+)
+def test_gradients_are_the_librarys(
+    trained, queries, frames, micro_store, library, settings
+) -> None:
+    loss, found = ours(trained, queries, frames, micro_store, **settings)
+    assert loss == pytest.approx(library[0], rel=1e-5)
+    assert found.keys() == library[1].keys()
+    for name, gradient in library[1].items():
+        apart = (found[name] - gradient).norm() / gradient.norm().clamp(min=1e-9)
+        assert apart < 1e-4, (name, apart)
+
+
+@pytest.mark.parametrize("trained", ["whole", "pooled"], indirect=True)
+@pytest.mark.parametrize("columns", ["all", "last"])
+def test_the_loss_is_its_formula_over_what_anyone_gets(
+    trained, queries, frames, micro_store, columns
+) -> None:
+    """Also where queries and frames make several mini-batches of several lengths."""
+    model, cfg = trained
+    some = queries if columns == "all" else queries[-3:]
+    loss, _ = ours(trained, some, frames, micro_store, distinct=False)
+    batch = batch_of(some, NEGATIVES, False, True)
+    shown = [frame_input(f, frames) for row in batch.documents() for f in row]
+    asked = model.encode_query([query_input(q, frames, cfg) for q in batch.queries])
+    scores = maxsim(asked, model.encode_document(shown)) * SCALE
+    own = torch.arange(len(some)) * (1 + NEGATIVES)
+    assert loss == pytest.approx(cross_entropy(scores, own).item(), rel=1e-4)
+    model.train()
+
+
+@pytest.fixture(scope="module")
+def model(late_cfg, micro_store, tmp_path_factory) -> MultiVectorEncoder:
+    return load(late_cfg, micro_store, tmp_path_factory.mktemp("base"))
+
+
+def test_scored_are_the_question_and_what_is_shown_alone(model, late_cfg, queries, frames) -> None:
+    """Of rows that are padded too, and where the question has a timestamp's and the instruction's
+    own words."""
+    asked = replace(queries[0], question="<0.1 seconds> Retrieve images: user's query, 0.5 seconds")
+    features = model.preprocess(
+        [query_input(q, frames, late_cfg) for q in (asked, queries[-1])],
+        prompt=late_cfg.query_instruction,
+    )
+    ids = features["input_ids"]
+    scored = scored_tokens(model).scored(ids, features["attention_mask"])
+    video = model.tokenizer.convert_tokens_to_ids("<|video_pad|>")
+    for query, row, kept in zip((asked, queries[-1]), ids, scored, strict=True):
+        assert (row[kept] == video).sum() == (row == video).sum() == 6 * FRAME
+        assert model.tokenizer.decode(row[kept & (row != video)]) == query.question
+    shown = model.preprocess([frame_input(asked.target, frames)], prompt=late_cfg.frame_instruction)
+    kept = scored_tokens(model).scored(shown["input_ids"], shown["attention_mask"])[0]
+    image = model.tokenizer.convert_tokens_to_ids("<|image_pad|>")
+    assert shown["input_ids"][0][kept].tolist() == [image] * FRAME
+
+
+def test_an_input_that_shows_nothing_is_refused(model) -> None:
+    with pytest.raises(ValueError, match="neither an image nor a clip"):
+        model.encode_query(["Which frame?"])
+
+
+def test_vectors_are_the_scored_tokens_projected_and_normalised(
+    model, late_cfg, queries, frames
+) -> None:
+    """Beside longer queries as alone, and whatever the states of other tokens are."""
+    inputs = [query_input(q, frames, late_cfg) for q in (queries[0], queries[-1])]
+    together = model.encode_query(inputs)
+    assert len(together[0]) != len(together[1])
+    for one, vectors in zip(inputs, together, strict=True):
+        features = model.preprocess([one], prompt=late_cfg.query_instruction, task="query")
+        kept = scored_tokens(model).scored(features["input_ids"], features["attention_mask"])[0]
+        with torch.no_grad():
+            states = model[0](dict(features))["token_embeddings"][0]
+            made = torch.nn.functional.normalize(states[kept] @ model[1].linear.weight.T, dim=1)
+        torch.testing.assert_close(vectors, made, atol=1e-5, rtol=0)
+
+        def spoil(module, given, made, kept=kept):
+            made["token_embeddings"][:, ~kept] = 7.0
+
+        hook = model[0].register_forward_hook(spoil)
+        spoilt = model.encode_query([one])[0]
+        hook.remove()
+        torch.testing.assert_close(spoilt, vectors, atol=1e-5, rtol=0)
+
+
+def test_a_pooled_frame_keeps_one_of_so_many_vectors_and_a_query_all(
+    micro_store, late_cfg, queries, frames, tmp_path
+) -> None:
+    pooled = replace(late_cfg, late=LateConfig(width=24, pool=3))
+    counts = []
+    for cfg in (late_cfg, pooled):
+        model = load(cfg, micro_store, tmp_path)
+        frame = model.encode_document([frame_input(queries[0].target, frames)])[0]
+        torch.testing.assert_close(frame.norm(dim=1), torch.ones(len(frame)))
+        counts.append(
+            (len(frame), len(model.encode_query([query_input(queries[0], frames, cfg)])[0]))
+        )
+    assert counts[0][0] == FRAME
+    assert counts[1] == (FRAME // 3, counts[0][1])
+
+
+def test_a_saved_retriever_encodes_the_same_without_this_project(
+    micro_store, late_cfg, queries, frames, tmp_path, monkeypatch
+) -> None:
+    cfg = replace(late_cfg, late=LateConfig(width=24, pool=2))
+    model = load(cfg, micro_store, tmp_path / "base")
+    saved = tmp_path / "saved"
+    model.save_pretrained(str(saved), create_model_card=False)
+    again = load_trained(cfg, "fp32", saved)
+    monkeypatch.setattr(dynamic_module_utils, "HF_MODULES_CACHE", str(tmp_path / "modules"))
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("train", "conf")]:
+        monkeypatch.setitem(sys.modules, name, None)
+    alone = MultiVectorEncoder(str(saved), device="cpu", trust_remote_code=True)
+    assert ScoredTokens not in map(type, alone)
+    inputs = [query_input(queries[0], frames, cfg), frame_input(queries[0].target, frames)]
+    for one in (alone, again):
+        for vectors, there in zip(vectors_by(model, inputs), vectors_by(one, inputs), strict=True):
+            torch.testing.assert_close(vectors, there, atol=1e-6, rtol=0)
+
+
+def vectors_by(model, inputs) -> list[torch.Tensor]:
+    return [model.encode_query(inputs[:1])[0], model.encode_document(inputs[1:])[0]]
+
+
+def test_no_code_of_a_saved_folder_runs_here(micro_store, late_cfg, tmp_path) -> None:
+    model = load(late_cfg, micro_store, tmp_path / "base")
+    model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
+    (tmp_path / "saved" / "scored_tokens.py").write_text("raise RuntimeError('this ran')")
+    assert scored_tokens(load_trained(late_cfg, "fp32", tmp_path / "saved")).shown
+
+
+def test_adapters_and_projection_are_read_back_over_4_bit_weights(
+    micro_store, late_cfg, queries, frames, saved_base, tmp_path
+) -> None:
+    over = {"architecture": None, "model": saved_base, "quantization": "nf4"}
+    cfg = replace(late_cfg, **over, lora=LoraConfig())
+    model = load(cfg, micro_store, tmp_path, noise=0.1)
+    audit = audit_retriever(model, cfg, queries[0], frames)
+    assert re.search(r"projection +1,536 +0 +0 +1,536", audit)
+    model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
+    again = load_trained(cfg, "fp32", tmp_path / "saved")
+    keep_differentiable(again)
+    inputs = [query_input(queries[0], frames, cfg), frame_input(queries[0].target, frames)]
+    for one, two in zip(vectors_by(model, inputs), vectors_by(again, inputs), strict=True):
+        torch.testing.assert_close(one, two, atol=1e-5, rtol=0)
+
+
+def test_the_projection_is_trained_in_fp32_over_a_bf16_base(
+    micro_store, late_cfg, queries, frames, saved_base, tmp_path
+) -> None:
+    cfg = replace(late_cfg, architecture=None, model=saved_base, lora=LoraConfig())
+    model = load_retriever(cfg, "bf16", [], tmp_path)
+    trained = {n: p for n, p in model.named_parameters() if p.requires_grad}
+    assert "1.linear.weight" in trained
+    assert {p.dtype for p in trained.values()} == {torch.float32}
+    assert next(model[0].parameters()).dtype == torch.bfloat16
+    (vectors,) = model.encode_document([frame_input(queries[0].target, frames)])
+    torch.testing.assert_close(vectors.norm(dim=1), torch.ones(FRAME))
+
+
+@pytest.mark.parametrize("pool", [1, 2, 4])
+def test_tokens_are_pooled_in_bf16_as_in_fp32(
+    micro_store, late_cfg, queries, frames, tmp_path, pool
+) -> None:
+    cfg = replace(late_cfg, late=LateConfig(width=24, pool=pool))
+    model = load(cfg, micro_store, tmp_path)
+    shown = [frame_input(queries[0].target, frames)]
+    (exact,) = model.encode_document(shown)
+    with torch.autocast("cpu", torch.bfloat16):
+        (vectors,) = model.encode_document(shown)
+    assert vectors.shape == exact.shape == (FRAME // pool, 24)
+    assert vectors.isfinite().all()
+
+
+def test_the_audit_shows_what_is_scored(model, late_cfg, queries, frames) -> None:
+    told = audit_retriever(model, late_cfg, queries[0], frames)
+    length = len(model.tokenizer(queries[0].question, add_special_tokens=False).input_ids)
+    assert f"{6 * FRAME + length} of them scored" in told
+    assert f"{FRAME} of them scored" in told
+    assert f">>>{queries[0].question}<<<<|im_end|>" in told
+    assert told.count(">>><|video_pad|>...<<<") == 6
+    assert ">>><|image_pad|>...<<<" in told
+
+
+def test_weights_of_widths_go_with_one_vector_alone(contrastive_settings, late_cfg) -> None:
+    weighed = replace(contrastive_settings.train, width_weights=[1.0, 1.0])
+    settings = replace(contrastive_settings, train=weighed)
+    assert not settings.check()
+    (problem,) = replace(settings, retriever=late_cfg).check()
+    assert "vectors have one width" in problem
+
+
+@pytest.mark.parametrize("retriever", ["tiny", "qwen3_vl_emb_8b"])
+def test_any_retriever_becomes_one_of_many_vectors(retriever) -> None:
+    register("train.contrastive", ContrastiveCommand)
+    one, many = (
+        compose("train.contrastive", ContrastiveCommand, [f"retriever={retriever}", *overlay])
+        for overlay in ([], ["+exp=late_interaction"])
+    )
+    assert one.retriever.late is None
+    assert many.retriever == replace(one.retriever, late=LateConfig())
+    assert many.train == replace(one.train, scale=1.0)

@@ -1,0 +1,241 @@
+"""What a trainer is given by mistake ends in a sentence that names it, and nothing is trained."""
+
+from __future__ import annotations
+
+import json
+import logging
+import resource
+import shutil
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from transformers import (
+    AutoProcessor,
+    CLIPImageProcessor,
+    CLIPProcessor,
+    PreTrainedTokenizerFast,
+    Qwen3Config,
+    Qwen3ForCausalLM,
+)
+
+from conf.entry import Run
+from conf.errors import SettingsError, UserError
+from conf.runs import held, open_run
+from conf.schema import (
+    LoraConfig,
+    RetrieverConfig,
+    SelectCommand,
+    SftCommand,
+    StudentConfig,
+)
+from evaluation import select
+from models import checks, loading
+from models.retriever import embedder
+from models.tiny_qwen3_vl import build_model
+from teacher.narrate import JOURNAL, ensure_rationales
+from teacher.rationale_log import Journal
+from train import sft
+from train.common.checkpoints import newest_checkpoint
+from train.common.training_loop import is_unwritten
+
+
+@pytest.fixture(scope="module")
+def settings(few_steps) -> SftCommand:
+    return few_steps(regime="answer_only", max_steps=2)
+
+
+@pytest.fixture(scope="module")
+def trained(settings, tmp_path_factory) -> Path:
+    """The folder of a finished run with two checkpoints, as the command leaves it."""
+    run = Run("trained", tmp_path_factory.mktemp("trained"))
+    open_run(run, asdict(settings), "train.sft", [])
+    metrics = sft.main.__wrapped__(settings, run)
+    (run.folder / "metrics.json").write_text(json.dumps(metrics))
+    return run.folder
+
+
+def of_rank(settings: SftCommand, rank: int) -> SftCommand:
+    return replace(settings, student=replace(settings.student, lora=LoraConfig(rank=rank)))
+
+
+@pytest.mark.slow
+def test_adapters_of_another_rank_are_told(settings, trained, tmp_path) -> None:
+    other = of_rank(settings, 8)
+    with pytest.raises(SettingsError, match=r"student\.lora\.rank is 4 there and 8 now"):
+        open_run(Run("trained", trained), asdict(other), "train.sft", [])
+    with pytest.raises(UserError, match=r"student holds adapters of rank 4, and student\.lora"):
+        loading.load_trained(other.student, "fp32", trained / "student")
+    shutil.copytree(trained / "checkpoint-1", tmp_path / "checkpoint-1")
+    with pytest.raises(UserError, match=r"checkpoint-1 holds adapters of rank 4, .* is 8"):
+        sft.main.__wrapped__(other, Run("run", tmp_path))
+
+
+@pytest.fixture(scope="module")
+def wider(saved_base: str, student_cfg, processor, tmp_path_factory) -> str:
+    """A base of another width than the one that students are trained over here."""
+    folder = tmp_path_factory.mktemp("wider")
+    shutil.copytree(saved_base, folder, dirs_exist_ok=True)
+    sizes = replace(student_cfg.architecture, hidden=128)
+    build_model(sizes, len(processor.tokenizer)).save_pretrained(folder)
+    return str(folder)
+
+
+@pytest.mark.slow
+def test_adapters_of_another_base_are_told(settings, trained, wider, saved_base, tmp_path) -> None:
+    over = replace(settings.student, model=wider)
+    with pytest.raises(UserError, match=r"another base than .* 64 wide there and 128 here"):
+        loading.load_trained(over, "fp32", trained / "student")
+    with pytest.raises(UserError, match=r"are not those that .* is trained over"):
+        checks.check_base(trained, over)
+    shutil.copytree(trained / "checkpoint-1", tmp_path / "checkpoint-1")
+    with pytest.raises(UserError, match="checkpoint-1 holds adapters of another base than"):
+        sft.main.__wrapped__(replace(settings, student=over), Run("run", tmp_path))
+    # The same base elsewhere is the same base.
+    shutil.copytree(saved_base, tmp_path / "moved")
+    checks.check_base(trained, replace(over, model=str(tmp_path / "moved")))
+
+
+@pytest.mark.slow
+def test_a_checkpoint_cut_off_in_any_file_is_passed_over(trained, tmp_path, caplog) -> None:
+    for name in ("checkpoint-1", "checkpoint-2"):
+        shutil.copytree(trained / name, tmp_path / name)
+    last = tmp_path / "checkpoint-2"
+    assert newest_checkpoint(tmp_path) == last
+    names = {path.name for path in last.iterdir()} - {"README.md"}
+    assert {"adapter_model.safetensors", "optimizer.pt", "scheduler.pt", "rng_state.pth"} < names
+    for name in names:
+        whole = (last / name).read_bytes()
+        for left in (0, len(whole) // 2, len(whole) - 2):
+            (last / name).write_bytes(whole[:left])
+            caplog.clear()
+            assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-1"
+            assert f"cut off ({name} is not whole): going on from the one before" in caplog.text
+        (last / name).write_bytes(whole)
+    for name in names - {"adapter_config.json", "training_args.bin"}:
+        whole = (last / name).read_bytes()
+        (last / name).unlink()
+        caplog.clear()
+        assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-1"
+        assert "is missing): going on" in caplog.text
+        (last / name).write_bytes(whole)
+    assert newest_checkpoint(tmp_path) == last
+    shutil.rmtree(tmp_path / "checkpoint-1")
+    (last / "optimizer.pt").unlink()
+    assert newest_checkpoint(tmp_path) is None
+    assert "(its optimizer is missing): starting anew" in caplog.text
+
+
+def over(student: StudentConfig, folder: Path) -> StudentConfig:
+    return replace(student, model=str(folder))
+
+
+def retriever_over(folder: Path) -> RetrieverConfig:
+    return RetrieverConfig(name="small", model=str(folder), quantization="none", widths=[64])
+
+
+def test_a_base_that_sees_nothing_is_told(nf4_cfg, processor, tmp_path) -> None:
+    sizes = {"hidden_size": 64, "intermediate_size": 64, "num_hidden_layers": 1}
+    heads = {"num_attention_heads": 2, "num_key_value_heads": 2, "head_dim": 32}
+    config = Qwen3Config(vocab_size=len(processor.tokenizer), **sizes, **heads)
+    Qwen3ForCausalLM(config).save_pretrained(tmp_path)
+    processor.tokenizer.save_pretrained(tmp_path)
+    said = rf"student\.model={tmp_path} \(qwen3\) has no vision tower: give a vision-language model"
+    with pytest.raises(UserError, match=said):
+        loading.load_student(over(nf4_cfg, tmp_path), "fp32", list)
+    with pytest.raises(UserError, match=r"retriever\.model=.* has no vision tower"):
+        embedder.load_retriever(retriever_over(tmp_path), "fp32", [], tmp_path)
+
+
+def other_processor(folder: Path) -> None:
+    tokenizer = PreTrainedTokenizerFast.from_pretrained(folder)
+    (folder / "processor_config.json").unlink()
+    CLIPProcessor(CLIPImageProcessor(), tokenizer).save_pretrained(folder)
+
+
+def no_processor(folder: Path) -> None:
+    (folder / "processor_config.json").unlink()
+
+
+def other_grid(folder: Path) -> None:
+    processor = AutoProcessor.from_pretrained(folder)
+    processor.image_processor.patch_size = processor.video_processor.patch_size = 14
+    processor.save_pretrained(folder)
+
+
+def other_tokenizer(folder: Path) -> None:
+    processor = AutoProcessor.from_pretrained(folder)
+    processor.tokenizer.add_tokens([f"word{k}" for k in range(50)])
+    processor.save_pretrained(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (other_processor, r"CLIPProcessor \(it has no video processor\)"),
+        (no_processor, r"\(it has no tokenizer\)|cannot be loaded from that folder"),
+        (other_grid, r"\(its patch size is 14, that of the vision tower 16\)"),
+        (other_tokenizer, r"\(its tokenizer has \d+ tokens, the model \d+\)"),
+    ],
+)
+def test_a_processor_of_another_model_is_told(nf4_cfg, saved_base, tmp_path, change, said) -> None:
+    base = tmp_path / "base"
+    shutil.copytree(saved_base, base)
+    change(base)
+    with pytest.raises(UserError, match=said):
+        loading.load_student(over(nf4_cfg, base), "fp32", list)
+    with pytest.raises(UserError, match=said):
+        embedder.load_retriever(retriever_over(base), "fp32", [], tmp_path)
+
+
+def test_rationales_of_another_benchmark_are_told(settings, micro_store, tmp_path) -> None:
+    first, *_ = ensure_rationales(micro_store, settings.teacher)
+    store = tmp_path / "micro"
+    shutil.copytree(micro_store.folder, store, ignore=shutil.ignore_patterns("frames"))
+    journal = store / JOURNAL
+    stranger = micro_store.selection("test")[0].item_id
+    with Journal(journal) as opened:
+        opened.append([replace(first, item_id=stranger)])
+    before = journal.read_bytes()
+    told = replace(settings, store=str(tmp_path), train=replace(settings.train, regime="cot"))
+    said = rf"{journal} has rationales for 1 items that the training split there .*{stranger}"
+    with pytest.raises(UserError, match=said):
+        sft.main.__wrapped__(told, Run("run", tmp_path))
+    assert journal.read_bytes() == before
+
+
+@pytest.mark.slow
+def test_a_mode_that_was_not_trained_is_told(trained, micro, tmp_path) -> None:
+    cfg = SelectCommand(model=str(trained), benchmark=micro, modes=["reasoning"])
+    with pytest.raises(UserError, match=r"answer mode alone .* give modes=\[answer\]"):
+        select.main.__wrapped__(cfg, Run("run", tmp_path))
+    assert OmegaConf.load(trained / "config.yaml").train.regime == "answer_only"
+
+
+def test_a_folder_is_one_process_s_at_a_time(tmp_path) -> None:
+    with held(tmp_path, "first"), pytest.raises(UserError, match="second"), \
+            held(tmp_path, "second"):  # fmt: skip
+        pass
+    with held(tmp_path, "third"):
+        pass
+
+
+def test_a_checkpoint_that_the_disk_does_not_take_is_known(tmp_path) -> None:
+    """By what torch raises, which says nothing of a disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(RuntimeError) as raised:
+            torch.save({"first": torch.zeros(60_000)}, tmp_path / "optimizer.pt")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert is_unwritten(raised.value)
+    assert not is_unwritten(RuntimeError("shapes do not match"))
+
+
+def test_nothing_cut_off_is_nothing_said(tmp_path, caplog) -> None:
+    with caplog.at_level(logging.WARNING):
+        assert newest_checkpoint(tmp_path) is None
+    assert not caplog.records

@@ -1,0 +1,348 @@
+"""An exported student answers as the trained one does, wherever it is loaded."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import bitsandbytes
+import pytest
+import torch
+from huggingface_hub import ModelCard
+from safetensors.torch import load_file, save_file
+
+from conf.entry import Run
+from conf.errors import UserError
+from conf.runs import is_name, open_run, run_below
+from conf.schema import (
+    ExportModelCommand,
+    SelectCommand,
+    SftCommand,
+    SftTrainConfig,
+    StudentConfig,
+    TeacherConfig,
+)
+from evaluation import select
+from models import checks, loading
+from models.student.collator import encode
+from models.student.prompts import selection_sample
+from models.trained_runs import run_title, settings_of
+from train import export
+from train.student import merge
+
+METRICS = {"answer_loss_at_start": 2.5, "answer_loss": 0.375}
+
+
+@pytest.fixture(scope="module")
+def settings(micro, micro_store, nf4_cfg) -> SftCommand:
+    return SftCommand(
+        benchmark=micro,
+        teacher=TeacherConfig(name="template"),
+        student=replace(nf4_cfg, max_new_tokens=4),
+        train=SftTrainConfig(precision="fp32", validation_items=2),
+        store=str(micro_store.folder.parent),
+    )
+
+
+def finished_run(settings: SftCommand, root: Path) -> Path:
+    """A run of train.sft as it ends, with adapters that weigh as much as their base."""
+    folder = root / "sft" / "run"
+    open_run(Run("run", folder), asdict(settings), "train.sft", [])
+    checks.note_base(folder, settings.student)
+    torch.manual_seed(0)
+    model, processor = loading.load_student(settings.student, settings.train.precision, list)
+    with torch.no_grad():
+        for name, weight in model.named_parameters():
+            if "lora_B" in name:
+                weight.normal_(std=0.05)
+    loading.save(model, processor, folder / "student", settings.train.precision)
+    (folder / "metrics.json").write_text(json.dumps(METRICS))
+    return root
+
+
+@pytest.fixture(scope="module")
+def runs(settings, tmp_path_factory) -> Path:
+    return finished_run(settings, tmp_path_factory.mktemp("checkpoints"))
+
+
+def exported(settings: SftCommand, runs: Path, format: str, into: Path) -> tuple[dict, Path]:
+    cfg = ExportModelCommand(
+        run="run", format=format, store=settings.store, checkpoints=str(runs), workers=1
+    )
+    into.mkdir(parents=True, exist_ok=True)
+    return export.main.__wrapped__(cfg, Run(f"run/{format}", into)), into / "student"
+
+
+@pytest.fixture(scope="module")
+def forms(settings, runs, tmp_path_factory) -> dict[str, tuple[dict, Path]]:
+    """What the command says of each format, and its folder."""
+    root = tmp_path_factory.mktemp("exports")
+    return {f: exported(settings, runs, f, root / f) for f in ("bf16", "fp32", "adapter")}
+
+
+def test_a_merged_weight_is_the_dequantised_one_and_its_adapters_product(
+    settings, runs, forms
+) -> None:
+    merged = load_file(forms["fp32"][1] / "model.safetensors")
+    adapters = load_file(runs / "sft" / "run" / "student" / "adapter_model.safetensors")
+    scale = settings.student.lora.alpha / settings.student.lora.rank
+    base = load_file(Path(settings.student.model) / "model.safetensors")
+    assert merged.keys() == base.keys()
+    changed = 0
+    for name, weight in base.items():
+        place = f"base_model.model.{name.removesuffix('weight')}"
+        if f"{place}lora_A.weight" not in adapters:
+            assert torch.equal(merged[name], weight), name
+            continue
+        packed, state = bitsandbytes.functional.quantize_4bit(weight, quant_type="nf4")
+        dequantised = bitsandbytes.functional.dequantize_4bit(packed, state)
+        added = scale * adapters[f"{place}lora_B.weight"] @ adapters[f"{place}lora_A.weight"]
+        assert added.norm() > 0.1 * weight.norm()
+        torch.testing.assert_close(merged[name], dequantised + added, atol=1e-6, rtol=1e-5)
+        changed += 1
+    assert changed == 2 * 7
+
+
+def test_the_measured_difference_is_told_and_small(forms) -> None:
+    for format, most in (("fp32", 1e-5), ("bf16", 0.05)):
+        measured, folder = forms[format]
+        assert json.loads((folder / "export.json").read_text())["measured"] == measured
+        for mode in ("reasoning", "answer"):
+            assert 0 < measured[f"{mode}_logit_difference"] < most
+            assert 0 <= measured[f"{mode}_letter_agreement"] <= 1
+        weights = load_file(folder / "model.safetensors").values()
+        assert {w.dtype for w in weights} == {loading.DTYPES[format]}
+        assert "quantization" not in (folder / "config.json").read_text()
+    assert forms["fp32"][0]["answer_letter_agreement"] == 1
+    assert forms["adapter"][0] == {}
+
+
+ELSEWHERE = """
+import sys
+import torch
+from transformers import AutoModelForImageTextToText, AutoProcessor
+from transformers.video_utils import VideoMetadata
+
+folder, asked, said = sys.argv[1:]
+given = torch.load(asked, weights_only=False)
+processor = AutoProcessor.from_pretrained(folder)
+model = AutoModelForImageTextToText.from_pretrained(folder).eval()
+text = processor.apply_chat_template(
+    [{"role": "user", "content": given["content"]}], tokenize=False, add_generation_prompt=True
+)
+batch = processor(
+    text=[text], images=given["images"], videos=[given["video"]],
+    video_metadata=[VideoMetadata(**given["metadata"])], return_tensors="pt",
+)
+with torch.no_grad():
+    logits = model(**batch).logits
+assert not {"train", "conf", "peft", "bitsandbytes"} & set(sys.modules)
+torch.save((batch["input_ids"], logits), said)
+"""
+
+
+@pytest.mark.slow
+def test_it_says_the_same_where_only_transformers_is(
+    settings, runs, forms, micro_store, frames, tmp_path
+) -> None:
+    """Against the trained student itself, the adapters over their 4-bit base."""
+    item = micro_store.selection("test")[0]
+    sample = selection_sample(item, "answer", "cot", frames, settings.student)
+    given = {"content": sample.content, "images": sample.images}
+    given |= {"video": sample.clip.pixels, "metadata": sample.clip.metadata}
+    torch.save(given, tmp_path / "asked.pt")
+    arguments = [forms["fp32"][1], tmp_path / "asked.pt", tmp_path / "said.pt"]
+    subprocess.run(
+        [sys.executable, "-c", ELSEWHERE, *map(str, arguments)],
+        cwd=tmp_path, check=True, env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
+    )  # fmt: skip
+    ids, logits = torch.load(tmp_path / "said.pt")
+    student = runs / "sft" / "run" / "student"
+    model, processor = loading.load_trained(settings.student, "fp32", student)
+    # Packed for inference, some CPUs round 4-bit products another way.
+    loading.keep_differentiable(model)
+    asked = encode(sample, processor, 1500)
+    assert ids[0].tolist() == asked.input_ids
+    types = torch.tensor([asked.mm_token_type_ids])
+    with torch.no_grad():
+        wanted = model(input_ids=ids, mm_token_type_ids=types, **asked.media).logits
+    torch.testing.assert_close(logits, wanted, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_every_form_is_measured_like_the_run(settings, runs, forms, tmp_path) -> None:
+    unused = StudentConfig(name="unused", model="unused")
+    said = {}
+    models = {f: forms[f][1] for f in ("fp32", "adapter")} | {"run": runs / "sft" / "run"}
+    for name, model in models.items():
+        cfg = SelectCommand(
+            benchmark=settings.benchmark, student=unused, store=settings.store, model=str(model),
+            batch=2, limit=2,
+        )  # fmt: skip
+        folder = tmp_path / name
+        folder.mkdir()
+        metrics = select.main.__wrapped__(cfg, Run(name, folder))
+        assert {"reasoning_micro", "answer_micro"} <= metrics.keys()
+        lines = (folder / "answers.jsonl").read_text().splitlines()
+        said[name] = sorted(line for line in lines if "item_id" in json.loads(line))
+    assert said["adapter"] == said["run"]
+    assert len(said["fp32"]) == 4
+    assert run_title(models["fp32"]) == "run fp32"
+
+
+def test_an_export_is_written_once_and_of_these_weights(settings, runs, forms, tmp_path) -> None:
+    shutil.copytree(runs, tmp_path / "runs")
+    measured, folder = forms["fp32"]
+    before = (folder / "model.safetensors").stat()
+    again, _ = exported(settings, tmp_path / "runs", "fp32", folder.parent)
+    assert again == measured
+    assert (folder / "model.safetensors").stat() == before
+    path = tmp_path / "runs" / "sft" / "run" / "student" / "adapter_model.safetensors"
+    save_file({k: v + 1 for k, v in load_file(path).items()}, path, metadata={"format": "pt"})
+    with pytest.raises(UserError, match="is an export of other adapters"):
+        exported(settings, tmp_path / "runs", "fp32", folder.parent)
+
+
+@pytest.mark.slow
+def test_an_export_that_answers_otherwise_is_not_kept(
+    settings, runs, tmp_path, monkeypatch
+) -> None:
+    """The adapters left out stand for anything that goes wrong in merging."""
+    monkeypatch.setattr(
+        merge, "merge", lambda *_: loading.load_base(replace_nf4(settings), "fp32", list)
+    )
+    with pytest.raises(UserError, match=r"differ by .* of their size .* nothing was exported"):
+        exported(settings, runs, "fp32", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def replace_nf4(settings: SftCommand) -> StudentConfig:
+    return replace(settings.student, quantization="none")
+
+
+def test_what_a_kill_left_does_not_stay(settings, runs, forms, tmp_path) -> None:
+    (tmp_path / ".student.partial").mkdir()
+    (tmp_path / ".student.partial" / "model.safetensors").write_bytes(b"half")
+    _, folder = exported(settings, runs, "adapter", tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["student"]
+    names = {p.name for p in folder.iterdir()}
+    assert "model.safetensors" not in names
+    assert names == {p.name for p in forms["adapter"][1].iterdir()}
+    for name in ("adapter_model.safetensors", "adapter_config.json", "processor_config.json"):
+        trained = runs / "sft" / "run" / "student" / name
+        assert (folder / name).read_bytes() == trained.read_bytes()
+
+
+def test_a_disk_that_takes_no_more_is_told(model, processor, tmp_path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(UserError, match=r"cannot be written to .* \(os error 27\)"):
+            loading.write(model, processor, tmp_path / "student")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def test_a_card_says_what_the_run_says(settings, runs, forms) -> None:
+    card = ModelCard.load(forms["adapter"][1] / "README.md")
+    assert card.data.library_name == "peft"
+    assert card.data.tags == ["dynapix", "cot"]
+    record = json.loads((runs / "sft" / "run" / "run.json").read_text())
+    for told in (
+        f"| base | {settings.student.model} |",
+        "| adapters | LoRA of rank 4, alpha 32, dropout 0.0 |",
+        "| quantisation of the base | nf4 |",
+        "| benchmark | micro, 10 scenes by bullet, seed 0 |",
+        "| teacher | template |",
+        "| seed | 0 |",
+        f"| started | {record['started']} |",
+        "| answer loss | 2.5 | 0.375 |",
+    ):
+        assert told in card.text
+    # A server lays adapters over the base as it was released.
+    assert "The adapters go with the base in NF4" in card.text
+    hub = replace(settings, student=replace(settings.student, model="Qwen/Qwen3-VL-2B-Instruct"))
+    folder = runs / "sft" / "run"
+    from train.common.model_card import text
+
+    named = ModelCard(text("run", hub, folder, "bf16", {"answer_logit_difference": 0.0125}))
+    assert named.data.base_model == "Qwen/Qwen3-VL-2B-Instruct"
+    assert "| answer logit difference | 0.0125 |" in named.text
+    assert "NF4" not in named.text
+
+
+def test_differences_are_shares_of_the_logits_size() -> None:
+    def outputs(*values: float, letter: int | None = 0) -> merge.Outputs:
+        return merge.Outputs(torch.tensor([values]), letter)
+
+    before = {"answer": [outputs(3.0, 0.0), outputs(0.0, 4.0)]}
+    after = {"answer": [outputs(3.0, 1.0), outputs(0.0, 4.0, letter=2)]}
+    assert merge.compare(before, after) == pytest.approx(
+        {"answer_logit_difference": 0.2, "answer_letter_agreement": 0.5}
+    )
+    assert set(merge.compare(before, before).values()) == {0.0, 1.0}
+    silent = {"describe": [outputs(3.0, letter=None)]}
+    assert merge.compare(silent, silent) == {"describe_logit_difference": 0.0}
+    broken = {"answer": [outputs(math.nan, 0.0), outputs(0.0, 4.0)]}
+    assert math.isnan(merge.compare(before, broken)["answer_logit_difference"])
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda run: (run / "metrics.json").unlink(), r"run=.*sft/run is not finished"),
+        (lambda run: shutil.rmtree(run), r"run=.*sft/run is no run folder"),
+        (lambda run: whole(run / "config.yaml"), r"trained the whole model .*lora\.rank=0"),
+        (lambda run: (run / "student" / "adapter_model.safetensors").unlink(), "no adapters"),
+        (lambda run: (run / "base.json").write_text('"other"'), "are not those that"),
+    ],
+)
+def test_what_cannot_be_exported_is_told(settings, runs, tmp_path, damage, said) -> None:
+    shutil.copytree(runs, tmp_path / "runs")
+    damage(tmp_path / "runs" / "sft" / "run")
+    with pytest.raises(UserError, match=said):
+        exported(settings, tmp_path / "runs", "adapter", tmp_path / "into")
+    assert list((tmp_path / "into").iterdir()) == []
+
+
+def whole(config: Path) -> None:
+    told = config.read_text()
+    assert "rank: 4" in told
+    config.write_text(told.replace("rank: 4", "rank: 0").replace("nf4", "none"))
+
+
+def test_a_torn_export_is_told(settings, forms, tmp_path) -> None:
+    shutil.copytree(forms["bf16"][1], tmp_path / "export")
+    weights = tmp_path / "export" / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:5000])
+    trained = settings_of(tmp_path / "export", SftCommand, "student")
+    assert asdict(trained) == asdict(settings)
+    with pytest.raises(UserError, match=r"is damaged .* export again"):
+        loading.load_trained(trained.student, "fp32", tmp_path / "export")
+    (tmp_path / "config.yaml").write_text("format: bf16")
+    (tmp_path / "export").rename(tmp_path / "student")
+    with pytest.raises(UserError, match=r"holds an export: give model=.*/student"):
+        settings_of(tmp_path, SftCommand, "student")
+    (tmp_path / "student" / "export.json").write_text("{")
+    with pytest.raises(UserError, match="is missing or damaged"):
+        run_title(tmp_path / "student")
+
+
+def test_a_run_goes_by_its_name_or_its_folder(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for given in ("exp-cot", "exp-cot/", "checkpoints/sft/exp-cot", "./checkpoints/sft/exp-cot/",
+                  str(tmp_path / "checkpoints" / "sft" / "exp-cot")):  # fmt: skip
+        assert run_below(given, "checkpoints/sft") == "exp-cot"
+    assert run_below("checkpoints/sft/lrs/0", "checkpoints/sft") == run_below("lrs/0", "x")
+    assert is_name("exp-cot")
+    assert is_name("lrs/0")
+    for given in ("/elsewhere/sft/exp-cot", "../sft/exp-cot", "checkpoints/sft", "."):
+        assert not is_name(run_below(given, "checkpoints/sft"))
+        assert ExportModelCommand(run=given).check()

@@ -1,0 +1,66 @@
+"""Visual tokens are told the words of what they show, and the loss of that is what it says."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from models.student.collator import Collator
+from train.tiny_base import questions
+from train.tiny_base.object_tokens import NONE, WORDS, SightCollator, first_token, unnamed
+
+
+def test_words_stand_at_the_tokens_that_show_them(
+    micro_store, frames, student_cfg, processor
+) -> None:
+    """Each picture's, a clip's among them: an object's words in the object's cell."""
+    items = micro_store.selection("train")
+    kinds = questions.kinds(micro_store, items, student_cfg, frames, 0)
+    samples = [made[0].make(0) for made in kinds.values()]
+    batch = SightCollator(processor, 1500)(samples)
+    plain = Collator(processor, 1500)(samples)
+    assert torch.equal(batch["input_ids"], plain["input_ids"])
+    kept = plain["labels"].shape[1]
+    assert torch.equal(batch["labels"][:, -kept:], plain["labels"])
+    side = student_cfg.image_size // 32
+    visual = (processor.image_token_id, processor.video_token_id)
+    wanted = []
+    for row, sample in enumerate(samples):
+        at = [k for k, t in enumerate(batch["input_ids"][row].tolist()) if t in visual]
+        cells = np.reshape(at, (sample.pictures, side, side))
+        for sight in sample.sights:
+            x, y = (min(math.floor(share * side), side - 1) for share in sight.place)
+            words = [first_token(processor, word) for word in sight.words]
+            filled = [*words, *[NONE] * (WORDS - len(words))]
+            wanted.append([row, int(cells[sight.picture, y, x]), *filled])
+            if len(words) == WORDS and sample.clip is None:
+                before = sample.content[2 * sight.picture]["text"]
+                assert before == f"\nCandidate {sight.words[-1]}: "
+    assert batch["sights"].tolist() == wanted
+    assert {row for row, *_ in wanted} == set(range(len(samples)))
+
+
+def test_sights_are_of_what_a_frame_shows(micro_store) -> None:
+    scene = micro_store.scene(micro_store.scene_ids("train")[0])
+    for frame in (0, scene.frames - 1):
+        words = {words for _, _, words in questions.sights(scene, frame)}
+        account = questions.account(scene, frame)
+        assert words
+        assert all(f"The {' '.join(w)} is near" in account for w in words)
+
+
+def test_the_best_answer_names_each_word_as_often() -> None:
+    """No answer is below the entropy of three words, which the even one alone reaches; a word that
+    is not given counts for nothing."""
+    sights = torch.tensor([[0, 1, 4, 5, 6, NONE]])
+    even = torch.full((1, 3, 10), -torch.inf)
+    even[0, 1, [4, 5, 6]] = 0.0
+    assert unnamed(even, sights).item() == pytest.approx(math.log(3))
+    tilted = even.clone()
+    tilted[0, 1, 4] = 1.0
+    assert unnamed(tilted, sights).item() > math.log(3)
+    elsewhere = torch.zeros(1, 3, 10)
+    assert unnamed(elsewhere, sights.repeat(2, 1)).item() == pytest.approx(2 * math.log(10))
