@@ -133,7 +133,7 @@ def _sentences(folder: str = ".") -> Iterator[None]:
     except UserError as error:
         _let_main_speak()
         for line in str(error).splitlines():
-            print(f"error: {line}", file=sys.stderr)
+            print(f"error: {line}  [{error.code}]", file=sys.stderr)
         _leave(2 if isinstance(error, SettingsError) else 1)
     except KeyboardInterrupt:
         _let_main_speak()

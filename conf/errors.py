@@ -1,9 +1,29 @@
-"""The exceptions that a command shows as a sentence in place of a traceback."""
+"""Exceptions that a command reports as one sentence instead of a traceback."""
+
+from __future__ import annotations
 
 
 class UserError(Exception):
-    """A mistake that a user can mend. Its text says what is wrong, where, and what to do."""
+    """A mistake that the user can correct.
+
+    Args:
+        message: What is wrong, where, and what to do about it.
+        code: A short, stable name of the mistake in kebab case, such as ``missing-run``. Scripts
+            and tests rely on the code, never on the wording of the message.
+    """
+
+    def __init__(self, message: str, code: str = "user-error") -> None:
+        # Both arguments are in `args`, so that the exception survives pickling between processes.
+        super().__init__(message, code)
+        self.message = message
+        self.code = code
+
+    def __str__(self) -> str:
+        return self.message
 
 
 class SettingsError(UserError):
-    """A mistake in a command's settings, found before it starts. One line a mistake."""
+    """A mistake in a command's settings, detected before the command starts; one line a mistake."""
+
+    def __init__(self, message: str, code: str = "invalid-setting") -> None:
+        super().__init__(message, code)

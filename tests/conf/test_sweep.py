@@ -249,7 +249,7 @@ def test_a_failed_trial_is_tried_again(room):
 @pytest.mark.slow
 def test_an_unknown_metric_is_told_and_may_be_mended(room):
     wrong = toy(room, *SEARCH, "hydra.sweeper.metric=los", "run=s")
-    said = "error: hydra.sweeper.metric=los: a job of toy measures accuracy, loss here\n"
+    said = "error: hydra.sweeper.metric=los: a job of toy measures accuracy, loss here  [invalid-setting]\n"
     assert (wrong.returncode, wrong.stderr.endswith(said)) == (1, True)
     right = toy(room, *SEARCH, "hydra.sweeper.metric=loss", "run=s")
     assert right.returncode == 0
@@ -400,4 +400,4 @@ def test_a_sweeps_table_and_plot_can_be_drawn_again(searched):
     assert done.stdout.encode() == before[0]
     none = report("checkpoints/toy")
     assert none.returncode == 1
-    assert none.stderr == "error: checkpoints/toy holds no sweep with a job that has ended\n"
+    assert none.stderr == "error: checkpoints/toy holds no sweep with a job that has ended  [user-error]\n"

@@ -191,7 +191,7 @@ def test_two_ranks_are_one(settings, contrastive_settings, saved_base, few, tmp_
     benchmark = asdict(settings.benchmark)
     file.write_text(json.dumps({"benchmark": benchmark, "runs": told}, default=str))
     ended = launch(*SHARDED, LAUNCHED, file)
-    assert said(ended) == ["error: this rank alone cannot go on"], ended.stderr
+    assert said(ended) == ["error: this rank alone cannot go on  [user-error]"], ended.stderr
     assert ended.returncode == 1
     for name in ("two", "parts"):
         same(one, runs / name)
