@@ -1,5 +1,8 @@
-"""The project's own commands as jobs: several at a time, each with its share of the cores. A
-command that was done is over at once, so a comparison may be stopped and started again."""
+"""Runs the project's own commands as subprocesses, several at a time.
+
+A command whose run is finished exits at once, so an interrupted experiment resumes when its script
+is started again.
+"""
 
 from __future__ import annotations
 
@@ -10,29 +13,27 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-Wanted = TypeVar("Wanted")
+Job = TypeVar("Job")
 
 
 def run(command: Sequence[str], threads: int | None = None) -> None:
-    """Run `python -m` with a command.
+    """Run `python -m` with a command and wait for it.
 
     Raises:
-        SystemExit: it fails; the end of what it said is told.
+        SystemExit: The command fails; the message holds the end of its standard error.
     """
     print("python -m", *command, flush=True)
+    environment = {**os.environ, **({"OMP_NUM_THREADS": str(threads)} if threads else {})}
     done = subprocess.run(
-        [sys.executable, "-m", *command],
-        env={**os.environ, **({} if threads is None else {"OMP_NUM_THREADS": str(threads)})},
-        capture_output=True,
-        text=True,
+        [sys.executable, "-m", *command], env=environment, capture_output=True, text=True
     )
     if done.returncode:
-        raise SystemExit(f"{' '.join(command)} has failed:\n{done.stderr[-2000:]}")
+        raise SystemExit(f"error: {' '.join(command)} failed:\n{done.stderr[-2000:]}")
 
 
-def run_all(make: Callable[[Wanted, int], None], wanted: Iterable[Wanted], at_once: int) -> None:
-    """Make all that is wanted, so many at once; each is told of its threads."""
-    threads = max(1, (os.cpu_count() or 1) // at_once)
-    with ThreadPoolExecutor(at_once) as pool:
-        for made in [pool.submit(make, one, threads) for one in wanted]:
-            made.result()
+def run_all(work: Callable[[Job, int], None], jobs: Iterable[Job], parallel: int) -> None:
+    """Call `work(job, threads)` for every job, `parallel` at a time, with the cores divided."""
+    threads = max(1, (os.cpu_count() or 1) // parallel)
+    with ThreadPoolExecutor(parallel) as pool:
+        for future in [pool.submit(work, job, threads) for job in jobs]:
+            future.result()

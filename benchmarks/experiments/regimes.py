@@ -1,41 +1,43 @@
-"""The paper's comparison at tiny scale: zero-shot, answer-only, CoT, and CoT without each of its
-parts, each over three seeds, on a test split of over a thousand items.
+"""The paper's comparison of training regimes at tiny scale: zero-shot, answer-only, CoT, and CoT
+without each of its parts, three seeds each, on more than a thousand test items.
 
-    python -m benchmarks.experiments.regimes
+    python -m benchmarks.experiments.regimes            # train and evaluate what is missing
+    python -m benchmarks.experiments.regimes --table    # print the recorded results
 
-Trains and measures what is missing, each by the project's own commands and in runs of their own, so
-that it may be stopped and started again, and prints one table. A figure is the mean over the seeds
-with its 95% interval when whole scenes are drawn again; so is a difference, of the same items.
-Runs are in checkpoints/, and the letters that each student gave are kept in benchmarks/letters/,
-both by the hash of the base that it was trained over: a run whose letters are kept is not made
-again, and `--table` reads no more than them.
+Every chosen letter is recorded in `letters.parquet`, one row per test item, run and mode, under the
+hash of the base's weights. A run that is recorded is not trained again. Accuracies are means over
+the seeds; intervals are 95% percentile intervals of a bootstrap that resamples scenes and seeds.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
+import pandas as pd
 
 from benchmarks.experiments.jobs import run, run_all
 from conf.compose import compose
-from conf.runs import write_text
 from conf.schema import SelectCommand, SftCommand
 from data.records import FAMILIES
 from data.store import open_store
-from evaluation.metrics.accuracy import macro_by_scene
 from models.checks import weights_digest
 
-REGIMES = ("answer_only", "cot", "cot_no_candidate_analysis", "cot_no_match_layout")
-MODES = {"answer_only": ["answer"]}
-BOTH = ["reasoning", "answer"]
-SEEDS = (0, 1, 2)
+LETTERS = Path(__file__).with_name("letters.parquet")
+MODES = {
+    "zero-shot": ("reasoning", "answer"),
+    "answer_only": ("answer",),
+    "cot": ("reasoning", "answer"),
+    "cot_no_candidate_analysis": ("reasoning", "answer"),
+    "cot_no_match_layout": ("reasoning", "answer"),
+}
+"""The modes in which each regime is evaluated. Zero-shot decoding is greedy and has one seed."""
 PAIRS = (
     (("cot", "reasoning"), ("answer_only", "answer")),
     (("cot", "answer"), ("answer_only", "answer")),
@@ -44,158 +46,185 @@ PAIRS = (
     (("cot", "reasoning"), ("cot_no_match_layout", "reasoning")),
     (("cot", "reasoning"), ("zero-shot", "reasoning")),
 )
-
-
-LETTERS = Path(__file__).parent / "letters"
-UNREAD = "-"
-"""Stands for an answer in which no letter could be read."""
+"""The differences in the second table: first minus second."""
+DRAWS = 4000
+WRITING = Lock()
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--benchmark", default="comparison")
     parser.add_argument("--student", default="tiny")
     parser.add_argument("--store", default="store")
     parser.add_argument("--checkpoints", default="checkpoints")
-    parser.add_argument("--letters", type=Path, default=LETTERS, help="where answers are kept")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at once, each with a thread")
-    parser.add_argument("--seeds", type=int, default=len(SEEDS))
-    parser.add_argument("--table", action="store_true", help="of the answers that are kept")
+    parser.add_argument("--letters", type=Path, default=LETTERS, help="table of recorded answers")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time; they share the cores")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--table", action="store_true", help="only print the recorded results")
     args = parser.parse_args()
-    base = compose("train.sft", SftCommand, [f"student={args.student}"]).student.model
-    known_by = weights_digest(base)
-    folders = Path(args.checkpoints) / known_by, args.letters / known_by
-    plan = Plan(args.benchmark, args.student, args.store, *folders)
-    seeds = SEEDS[: args.seeds]
+    preset = compose("train.sft", SftCommand, [f"student={args.student}"]).student
+    experiment = Experiment(
+        args.benchmark, args.student, args.store, Path(args.checkpoints), args.letters,
+        base=weights_digest(preset.model),
+    )  # fmt: skip
     if not args.table:
-        run(plan.built())
-        # Seed by seed, so that a comparison of fewer is there early.
-        wanted = [("zero-shot", 0), *((regime, seed) for seed in seeds for regime in REGIMES)]
-        run_all(partial(make, plan), [w for w in wanted if not plan.kept(*w).exists()], args.jobs)
-    print_table(plan, seeds)
+        run(["data.build", f"benchmark={args.benchmark}", f"store={args.store}"])
+        # Seed by seed: a comparison over fewer seeds is complete early.
+        jobs = [
+            ("zero-shot", 0),
+            *product(range(args.seeds), [m for m in MODES if m != "zero-shot"]),
+        ]
+        jobs = [job if job[0] == "zero-shot" else job[::-1] for job in jobs]
+        run_all(partial(train_and_evaluate, experiment), experiment.missing(jobs), args.jobs)
+    print_tables(experiment.recorded(args.seeds))
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What is compared, and where it lies."""
+class Experiment:
+    """The compared runs and the table that records their answers."""
 
     benchmark: str
     student: str
     store: str
     checkpoints: Path
     letters: Path
-
-    def built(self) -> list[str]:
-        return ["data.build", f"benchmark={self.benchmark}", f"store={self.store}"]
-
-    def trained(self, regime: str, seed: int) -> list[str]:
-        return ["train.sft", f"+exp={regime}", f"seed={seed}", *self._common(regime, seed)]
-
-    def measured(self, regime: str, seed: int) -> list[str]:
-        folder = self.checkpoints / "sft" / self.name(regime, seed)
-        # A base would be asked for the record, which it never saw.
-        base = regime == "zero-shot"
-        student = ["modes=[reasoning,answer]"] if base else [f"model={folder}"]
-        return ["evaluation.select", *student, "batch=64", *self._common(regime, seed)]
-
-    def kept(self, regime: str, seed: int) -> Path:
-        return self.letters / f"{self.name(regime, seed)}.csv"
+    base: str
 
     def name(self, regime: str, seed: int) -> str:
-        return f"{self.benchmark}-{regime}-{seed}"
+        return f"{self.benchmark}-{self.base[:8]}-{regime}-{seed}"
 
-    def _common(self, regime: str, seed: int) -> list[str]:
-        return [
-            f"student={self.student}", f"benchmark={self.benchmark}", f"store={self.store}",
-            f"checkpoints={self.checkpoints}", f"run={self.name(regime, seed)}",
-        ]  # fmt: skip
+    def missing(self, jobs: list[tuple[str, int]]) -> list[tuple[str, int]]:
+        """The jobs whose answers are not recorded."""
+        table = self.recorded()
+        done = set(zip(table.regime, table.seed, strict=True))
+        return [job for job in jobs if job not in done]
+
+    def recorded(self, seeds: int | None = None) -> pd.DataFrame:
+        """The recorded answers of this benchmark and base, of the first `seeds` seeds."""
+        table = pd.read_parquet(self.letters)
+        table = table[(table.base == self.base) & (table.benchmark == self.benchmark)]
+        return table if seeds is None else table[table.seed < seeds]
 
 
-def make(plan: Plan, wanted: tuple[str, int], threads: int) -> None:
-    """Train and measure one student, and keep its answers."""
-    regime, seed = wanted
+def train_and_evaluate(experiment: Experiment, job: tuple[str, int], threads: int) -> None:
+    """Train and evaluate one student, and record its letters."""
+    regime, seed = job
+    name = experiment.name(regime, seed)
+    shared = [
+        f"student={experiment.student}", f"benchmark={experiment.benchmark}",
+        f"store={experiment.store}", f"checkpoints={experiment.checkpoints}", f"run={name}",
+    ]  # fmt: skip
+    # By default a base is prompted for the structured record, which the tiny base never learned.
+    model = ["modes=[reasoning,answer]"]
     if regime != "zero-shot":
-        run(plan.trained(regime, seed), threads)
-    measured = plan.checkpoints / "select" / plan.name(regime, seed)
-    if not (measured / "metrics.json").exists():
-        run(plan.measured(regime, seed), threads)
-    keep(plan, regime, measured / "answers.jsonl", plan.kept(regime, seed))
+        run(["train.sft", f"+exp={regime}", f"seed={seed}", *shared], threads)
+        model = [f"model={experiment.checkpoints / 'sft' / name}"]
+    evaluated = experiment.checkpoints / "select" / name
+    if not (evaluated / "metrics.json").exists():
+        run(["evaluation.select", *model, "batch=64", *shared], threads)
+    record_letters(experiment, regime, seed, evaluated / "answers.jsonl")
 
 
-def keep(plan: Plan, regime: str, answers: Path, path: Path) -> None:
-    """Write what a student answered to every test item, in a column a mode."""
-    cfg = compose("evaluation.select", SelectCommand, [f"benchmark={plan.benchmark}"])
-    rows = [json.loads(line) for line in answers.read_text().splitlines()]
-    told = [row for row in rows if "item_id" in row]
-    letters = {(row["item_id"], row["mode"]): row["letter"] or UNREAD for row in told}
-    modes = MODES.get(regime, BOTH)
-    lines = [",".join(["item_id", "family", "scene_id", "right", *modes])]
-    for item in open_store(Path(plan.store) / cfg.benchmark.name).selection("test"):
-        given = [letters[item.item_id, mode] for mode in modes]
-        lines.append(",".join([item.item_id, item.family, item.scene_id, item.letter, *given]))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, "\n".join(lines) + "\n")
+def record_letters(experiment: Experiment, regime: str, seed: int, answers: Path) -> None:
+    """Append one run's letters to the table."""
+    benchmark = compose("evaluation.select", SelectCommand, [f"benchmark={experiment.benchmark}"])
+    items = open_store(Path(experiment.store) / benchmark.benchmark.name).selection("test")
+    lines = [json.loads(line) for line in answers.read_text().splitlines()]
+    letters = {(r["item_id"], r["mode"]): r["letter"] for r in lines if "item_id" in r}
+    rows = [
+        {
+            "base": experiment.base, "benchmark": experiment.benchmark, "regime": regime,
+            "seed": seed, "mode": mode, "item_id": item.item_id, "family": item.family,
+            "scene_id": item.scene_id, "answer": item.letter,
+            "letter": letters[item.item_id, mode],
+        }
+        for item in items
+        for mode in MODES[regime]
+    ]  # fmt: skip
+    with WRITING:
+        table = pd.concat([pd.read_parquet(experiment.letters), pd.DataFrame(rows)])
+        table.to_parquet(experiment.letters, index=False, compression="zstd")
 
 
-Row = dict[str, str]
-"""An item and what a student answered, by the names of the columns."""
-
-
-def kept_rows(plan: Plan, regime: str, seed: int) -> list[Row]:
-    """
-    Raises:
-        SystemExit: the run has not been made.
-    """
-    path = plan.kept(regime, seed)
-    if not path.exists():
-        raise SystemExit(f"error: {path} is not there: run without --table, or with fewer --seeds")
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-Group = tuple[str, str]
-"""A regime, and a mode in which its students are asked."""
-
-
-def print_table(plan: Plan, seeds: Sequence[int]) -> None:
-    items = kept_rows(plan, "zero-shot", 0)
-    right: dict[Group, np.ndarray] = {}
-    for regime, used in [("zero-shot", (0,)), *((regime, seeds) for regime in REGIMES)]:
-        runs = [kept_rows(plan, regime, seed) for seed in used]
-        for mode in MODES.get(regime, BOTH):
-            right[regime, mode] = np.stack([answered(rows, mode) for rows in runs], axis=1)
-    print(f"\n{len(items)} test items, {len(seeds)} seeds")
-    print("| | asked for | " + " | ".join([*FAMILIES, "macro", "parsed"]) + " |")
-    print("|---" * (len(FAMILIES) + 4) + "|")
-    for (regime, mode), values in right.items():
-        cells = [figure(values[..., 0], items, [family]) for family in FAMILIES]
-        cells += [figure(values[..., 0], items, FAMILIES), f"{100 * values[..., 1].mean():.1f}"]
+def print_tables(table: pd.DataFrame) -> None:
+    """Print accuracies by regime and mode, then differences between them, in percent."""
+    if table.empty:
+        raise SystemExit("error: no answers are recorded for this base: run without --table")
+    groups = [(regime, mode) for regime in MODES for mode in MODES[regime]]
+    correct = {g: credit_matrix(table, *g) for g in groups}
+    correct = {group: credits for group, credits in correct.items() if credits.shape[1]}
+    resampling = Resampling(next(iter(correct.values())).index)
+    print("| | mode | " + " | ".join(FAMILIES) + " | macro | by seed | parsed |")
+    print("|---" * (len(FAMILIES) + 5) + "|")
+    for (regime, mode), credits in correct.items():
+        rows = table[(table.regime == regime) & (table["mode"] == mode)]
+        seeds = [100 * resampling.point(credits[[seed]])[-1] for seed in credits]
+        cells = [
+            f"{m:.1f} [{low:.1f}, {high:.1f}]" for m, low, high in resampling.intervals(credits)
+        ]
+        cells += [" ".join(f"{s:.1f}" for s in seeds), f"{100 * rows.letter.notna().mean():.1f}"]
         print(f"| {regime} | {mode} | " + " | ".join(cells) + " |", flush=True)
-    print("\n| difference | " + " | ".join([*FAMILIES, "macro"]) + " |")
+    print("\n| difference | " + " | ".join(FAMILIES) + " | macro |")
     print("|---" * (len(FAMILIES) + 2) + "|")
-    for one, two in PAIRS:
-        apart = right[one][..., 0].mean(axis=1) - right[two][..., 0].mean(axis=1)
-        cells = [figure(apart[:, None], items, [f], "+") for f in FAMILIES]
-        cells.append(figure(apart[:, None], items, FAMILIES, "+"))
-        print(f"| {' '.join(one)} less {' '.join(two)} | " + " | ".join(cells) + " |", flush=True)
+    for first, second in PAIRS:
+        if first in correct and second in correct:
+            intervals = resampling.intervals(correct[first], correct[second])
+            cells = [f"{m:+.1f} [{low:+.1f}, {high:+.1f}]" for m, low, high in intervals]
+            title = f"{' '.join(first)} minus {' '.join(second)}"
+            print(f"| {title} | " + " | ".join(cells) + " |", flush=True)
 
 
-def answered(rows: Sequence[Row], mode: str) -> np.ndarray:
-    """(items, 2) whether a student's answers are right, and whether they can be read."""
-    return np.array([(row[mode] == row["right"], row[mode] != UNREAD) for row in rows], float)
+def credit_matrix(table: pd.DataFrame, regime: str, mode: str) -> pd.DataFrame:
+    """Whether each answer is right: a row per item, a column per seed."""
+    rows = table[(table.regime == regime) & (table["mode"] == mode)]
+    credits = (rows.letter == rows.answer).astype(float)
+    return credits.groupby([rows.family, rows.scene_id, rows.item_id, rows.seed]).sum().unstack()
 
 
-def figure(
-    values: np.ndarray, items: Sequence[Row], families: Sequence[str], sign: str = ""
-) -> str:
-    """The mean of families' means over items and seeds (items, seeds), with its interval, in
-    percent."""
-    kept = [k for k, item in enumerate(items) if item["family"] in families]
-    of = [(items[k]["family"], items[k]["scene_id"]) for k in kept]
-    found = macro_by_scene(values[kept].mean(axis=1), *zip(*of, strict=True), seed=0)
-    shares = (found.value, found.low, found.high)
-    mean, low, high = (f"{100 * share:{sign}.1f}" for share in shares)
-    return f"{mean} [{low}, {high}]"
+class Resampling:
+    """A bootstrap over scenes and seeds of the family means and of their plain mean, the macro.
+
+    Compared runs share the resampled scenes. Their seeds are resampled independently, since runs
+    of the same seed number have nothing else in common.
+    """
+
+    def __init__(self, items: pd.MultiIndex) -> None:
+        families = items.get_level_values("family")
+        self._scene, scenes = pd.factorize(items.get_level_values("scene_id"))
+        self._members = [families == family for family in FAMILIES]
+        self._rng = np.random.default_rng(0)
+        share = np.full(len(scenes), 1 / len(scenes))
+        # (draws, scenes): how often each draw holds each scene.
+        self._weights = self._rng.multinomial(len(scenes), share, size=DRAWS).astype(float)
+
+    def point(self, credits: pd.DataFrame) -> np.ndarray:
+        """(families + 1,) the means over all items and seeds, and their macro."""
+        means = [credits[members].to_numpy().mean() for members in self._members]
+        return np.array([*means, np.mean(means)])
+
+    def intervals(
+        self, first: pd.DataFrame, second: pd.DataFrame | None = None
+    ) -> list[tuple[float, float, float]]:
+        """Mean, low and high, in percent, of each family and the macro of `first`, or of the
+        difference `first` minus `second`."""
+        point, draws = self.point(first), self._draws(first)
+        if second is not None:
+            point, draws = point - self.point(second), draws - self._draws(second)
+        low, high = np.percentile(draws, [2.5, 97.5], axis=0)
+        return [tuple(100 * np.array(t)) for t in zip(point, low, high, strict=True)]
+
+    def _draws(self, credits: pd.DataFrame) -> np.ndarray:
+        """(draws, families + 1)."""
+        seeds = credits.shape[1]
+        seed_shares = self._rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=DRAWS) / seeds
+        means = []
+        for members in self._members:
+            sums = np.zeros((self._weights.shape[1], seeds))
+            np.add.at(sums, self._scene[members], credits[members].to_numpy())
+            counts = np.bincount(self._scene[members], minlength=len(sums))
+            totals = ((self._weights @ sums) * seed_shares).sum(axis=1)
+            means.append(totals / (self._weights @ counts))
+        return np.column_stack([*means, np.mean(means, axis=0)])
 
 
 if __name__ == "__main__":

@@ -1,134 +1,138 @@
-"""Retrievers of the tiny preset on the small benchmark, by how they are trained: untrained, with
-in-batch negatives alone, with same-scene hard negatives, with near frames masked, with mined
-negatives, and by late interaction; each over three seeds, at every width.
+"""The tiny retriever trained in several ways on the small benchmark: in-batch negatives, same-scene
+hard negatives, mined negatives and late interaction, three seeds each, at every width.
 
-    python -m benchmarks.experiments.retrievers
+    python -m benchmarks.experiments.retrievers            # train and evaluate what is missing
+    python -m benchmarks.experiments.retrievers --table    # print the recorded results
 
-Trains and measures what is missing, each by the project's own commands and in runs of their own, so
-that it may be stopped and started again, and prints one table: means over the seeds, and between
-which values they lie. What each measured is kept in benchmarks/ranks/: a run that is kept there is
-not made again, and `--table` reads no more than them.
+Results are recorded in `ranks.parquet`, one row per run and width. A run that is recorded is not
+trained again. The table holds means over the seeds with the least and the greatest value. It also
+holds variants whose settings no longer exist: `hard-scenes` composed batches scene by scene, and
+`masked` masked near-identical frames in such batches.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
+from threading import Lock
 
-import numpy as np
+import pandas as pd
 
 from benchmarks.experiments.jobs import run, run_all
-from conf.runs import write_text
 from evaluation.reporting.rows import RetrievalRow
 
-WAYS: dict[str, list[str]] = {
+RANKS = Path(__file__).with_name("ranks.parquet")
+VARIANTS: dict[str, list[str]] = {
     "in-batch": ["train.hard_negatives=0"],
     "hard": [],
-    "hard-scenes": ["train.batches=scenes"],
-    "masked": ["train.batches=scenes", "train.mask_near=24"],
     "mined": ["train.mine_every=40"],
     "late": ["+exp=late_interaction"],
 }
-MEASURES = ("recall@1", "recall@10", "recall@50", "mrr", "median_rank")
-
-
-KEPT = Path(__file__).parent / "ranks"
+"""Overrides of `train.contrastive`; without any it takes one same-scene hard negative a query."""
+MEASURES = {"recall@1": 1, "recall@10": 1, "recall@50": 1, "mrr": 3, "median_rank": 1}
+"""The printed measures and their decimals; recalls are in percent."""
+WRITING = Lock()
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--benchmark", default="small")
     parser.add_argument("--store", default="store")
     parser.add_argument("--checkpoints", default="checkpoints")
-    parser.add_argument("--kept", type=Path, default=KEPT, help="where what was measured is kept")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at once, sharing the cores")
+    parser.add_argument("--ranks", type=Path, default=RANKS, help="table of recorded results")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time; they share the cores")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--table", action="store_true", help="of what is kept")
+    parser.add_argument("--table", action="store_true", help="only print the recorded results")
     args = parser.parse_args()
-    plan = Plan(args.benchmark, args.store, Path(args.checkpoints), args.kept)
-    seeds = range(args.seeds)
+    experiment = Experiment(args.benchmark, args.store, Path(args.checkpoints), args.ranks)
     if not args.table:
-        run(["data.build", *plan.where[:2]])
-        # Seed by seed, so that a comparison of fewer is there early.
-        wanted = [(way, seed) for seed in seeds for way in WAYS]
-        run_all(partial(make, plan), [w for w in wanted if not plan.file(*w).exists()], args.jobs)
-    print_table(plan, seeds)
+        run(["data.build", *experiment.shared[:2]])
+        jobs = [(variant, seed) for seed, variant in product(range(args.seeds), VARIANTS)]
+        run_all(partial(train_and_evaluate, experiment), experiment.missing(jobs), args.jobs)
+    print_table(experiment.recorded(args.seeds))
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What is compared, and where it lies."""
+class Experiment:
+    """The compared runs and the table that records their results."""
 
     benchmark: str
     store: str
     checkpoints: Path
-    kept: Path
+    ranks: Path
 
     @property
-    def where(self) -> list[str]:
+    def shared(self) -> list[str]:
         return [
-            f"benchmark={self.benchmark}",
-            f"store={self.store}",
+            f"benchmark={self.benchmark}", f"store={self.store}",
             f"checkpoints={self.checkpoints}",
-        ]
+        ]  # fmt: skip
 
-    def name(self, way: str, seed: int) -> str:
-        return f"{self.benchmark}-{way}-{seed}"
+    def missing(self, jobs: list[tuple[str, int]]) -> list[tuple[str, int]]:
+        """The jobs whose results are not recorded."""
+        table = self.recorded()
+        done = set(zip(table.variant, table.seed, strict=True))
+        return [job for job in jobs if job not in done]
 
-    def file(self, way: str, seed: int) -> Path:
-        return self.kept / f"{self.name(way, seed)}.json"
-
-
-def make(plan: Plan, wanted: tuple[str, int], threads: int) -> None:
-    """Train and measure one retriever, and keep what was measured over all builders."""
-    way, seed = wanted
-    name = plan.name(way, seed)
-    run(["train.contrastive", *WAYS[way], f"seed={seed}", *plan.where, f"run={name}"], threads)
-    measured = plan.checkpoints / "retrieve" / name
-    if not (measured / "metrics.json").exists():
-        model = f"model={plan.checkpoints / 'contrastive' / name}"
-        run(["evaluation.retrieve", model, *plan.where, f"run={name}"], threads)
-    rows = json.loads((measured / "report.json").read_text())["rows"]
-    plan.kept.mkdir(parents=True, exist_ok=True)
-    lines = [json.dumps(row) for row in rows if row["builder"] is None]
-    write_text(plan.file(way, seed), "[\n" + ",\n".join(lines) + "\n]\n")
+    def recorded(self, seeds: int | None = None) -> pd.DataFrame:
+        """The recorded results of this benchmark, of the first `seeds` seeds."""
+        table = pd.read_parquet(self.ranks)
+        table = table[table.benchmark == self.benchmark]
+        return table if seeds is None else table[table.seed < seeds]
 
 
-def print_table(plan: Plan, seeds: Sequence[int]) -> None:
-    print("\n| negatives | width | " + " | ".join(MEASURES) + " |\n" + "|---" * 7 + "|")
-    for way in ("untrained", *WAYS):
-        # The preset untrained is measured beside each that is trained, and is the same for all.
-        source, used = ("in-batch", seeds[:1]) if way == "untrained" else (way, seeds)
-        files = [plan.file(source, seed) for seed in used]
-        for same in zip(*(rows_of(f, way == "untrained") for f in files), strict=True):
-            cells = [spread([row.measures[name].value for row in same], name) for name in MEASURES]
-            print(f"| {way} | {same[0].width} | " + " | ".join(cells) + " |", flush=True)
+def train_and_evaluate(experiment: Experiment, job: tuple[str, int], threads: int) -> None:
+    """Train and evaluate one retriever, and record its results over all builders."""
+    variant, seed = job
+    name = f"{experiment.benchmark}-{variant}-{seed}"
+    shared = [*experiment.shared, f"run={name}"]
+    run(["train.contrastive", *VARIANTS[variant], f"seed={seed}", *shared], threads)
+    evaluated = experiment.checkpoints / "retrieve" / name
+    if not (evaluated / "metrics.json").exists():
+        model = experiment.checkpoints / "contrastive" / name
+        run(["evaluation.retrieve", f"model={model}", *shared], threads)
+    report = json.loads((evaluated / "report.json").read_text())
+    results = [RetrievalRow.from_dict(row) for row in report["rows"] if row["builder"] is None]
+    rows = [
+        {
+            "benchmark": experiment.benchmark, "variant": variant, "seed": seed,
+            "untrained": result.untrained, "width": result.width,
+            **{name: result.measures[name].value for name in MEASURES},
+            "queries": result.queries, "frames": result.frames, "bytes": result.bytes,
+            "seconds": result.seconds,
+        }
+        for result in results
+    ]  # fmt: skip
+    with WRITING:
+        table = pd.concat([pd.read_parquet(experiment.ranks), pd.DataFrame(rows)])
+        table.to_parquet(experiment.ranks, index=False, compression="zstd")
 
 
-def rows_of(path: Path, untrained: bool) -> list[RetrievalRow]:
-    """A row a width.
+def print_table(table: pd.DataFrame) -> None:
+    if table.empty:
+        raise SystemExit("error: no results are recorded: run without --table")
+    # Every run also measures the untrained preset, which is the same in all of them.
+    untrained = table[table.untrained & (table.variant == "in-batch") & (table.seed == 0)]
+    trained = table[~table.untrained]
+    print("| negatives | width | " + " | ".join(MEASURES) + " |\n" + "|---" * 7 + "|")
+    for name, rows in [("untrained", untrained), *trained.groupby("variant", sort=False)]:
+        for width, same in rows.groupby("width", sort=False):
+            cells = [summarize(same[measure], measure) for measure in MEASURES]
+            print(f"| {name} | {width} | " + " | ".join(cells) + " |", flush=True)
 
-    Raises:
-        SystemExit: the run has not been made.
-    """
-    if not path.exists():
-        raise SystemExit(f"error: {path} is not there: run without --table, or with fewer --seeds")
-    found = [RetrievalRow.from_dict(row) for row in json.loads(path.read_text())]
-    return [row for row in found if row.untrained == untrained]
 
-
-def spread(values: Sequence[float], name: str) -> str:
-    """A mean with its least and greatest, shares in percent."""
-    scale = 100 if name.startswith("recall") else 1
-    shown = [scale * f(values) for f in (np.mean, min, max)]
-    digits = 3 if name == "mrr" else 1
-    if len(values) == 1:
-        return f"{shown[0]:.{digits}f}"
-    return "{:.{d}f} [{:.{d}f}, {:.{d}f}]".format(*shown, d=digits)
+def summarize(values: pd.Series, measure: str) -> str:
+    """The mean, with the least and the greatest of several."""
+    digits = MEASURES[measure]
+    scaled = 100 * values if measure.startswith("recall") else values
+    mean = f"{scaled.mean():.{digits}f}"
+    if len(scaled) == 1:
+        return mean
+    return f"{mean} [{scaled.min():.{digits}f}, {scaled.max():.{digits}f}]"
 
 
 if __name__ == "__main__":

@@ -62,7 +62,11 @@ def test_a_run_that_made_nothing_takes_other_settings(room):
         (["end=mistake"], 1, "error: this end is a mistake: set end=well  [user-error]\n"),
         (["end=disk"], 1, f"error: some/file: No space left on device; {GO_ON}"),
         (["end=interrupt"], 130, "interrupted; run the same command again to go on\n"),
-        (["+teacher.sed=1"], 2, "+teacher.sed: toy has no such key, did you mean teacher.seed?  [invalid-setting]\n"),
+        (
+            ["+teacher.sed=1"],
+            2,
+            "+teacher.sed: toy has no such key, did you mean teacher.seed?  [invalid-setting]\n",
+        ),
         (["checkpoints=toy.py"], 1, f"error: toy.py/toy/default: Not a directory; {GO_ON}"),
     ],
 )

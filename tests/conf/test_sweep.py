@@ -400,4 +400,7 @@ def test_a_sweeps_table_and_plot_can_be_drawn_again(searched):
     assert done.stdout.encode() == before[0]
     none = report("checkpoints/toy")
     assert none.returncode == 1
-    assert none.stderr == "error: checkpoints/toy holds no sweep with a job that has ended  [user-error]\n"
+    assert (
+        none.stderr
+        == "error: checkpoints/toy holds no sweep with a job that has ended  [user-error]\n"
+    )

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.speed.numbers import PIECES, hostile
 from teacher.narrator import describe, narrate
 from teacher.numbers import find_numbers
 from tests.teacher import synthetic
+from tests.teacher.hostile_text import PIECES, hostile
 from tests.teacher.test_predicates import cases
 
 FOLDER = Path(__file__).parent / "sentences"
