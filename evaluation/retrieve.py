@@ -14,9 +14,11 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.retrieve", RetrieveCommand)
 def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
-    from models.trained_runs import measured
+    from models.trained_runs import resolve_model
 
-    folder, trained = measured(cfg, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides)
+    folder, trained = resolve_model(
+        cfg, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides
+    )
     preset = trained.retriever
     if cfg.index == "faiss":
         from evaluation.retrieval.faiss_index import import_faiss
@@ -37,7 +39,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     from evaluation.metrics.accuracy import breakdown
     from evaluation.reporting import tables
     from evaluation.retrieval import faiss_index, standard_test
-    from models.precision import settled
+    from models.precision import resolve_precision
 
     queries, database = standard_test.standard_test(store)
     frames = Frames(store, preset.image_size)
@@ -45,7 +47,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     names = [f.name for f in database]
     targets = [q.target.name for q in queries]
     rows, curves, indexes, found = [], [], [], {}
-    precision = settled(trained.train.precision)
+    precision = resolve_precision(trained.train.precision)
     for embedder in embed.embedders(folder, preset, precision, store, run.folder):
         asked = embed.embed_queries(embedder, queries, store, frames, cfg.batch).rows(ids)
         shown = embed.embed_frames(embedder, database, store, frames, cfg.batch)

@@ -21,9 +21,9 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.select", SelectCommand)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
-    from models.trained_runs import check_modes, measured
+    from models.trained_runs import check_modes, resolve_model
 
-    folder, trained = measured(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
+    folder, trained = resolve_model(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
     student, regime = trained.student, trained.train.regime
     modes = cfg.modes or default_modes(cfg, regime)
     if folder is not None:

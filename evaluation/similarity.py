@@ -17,9 +17,11 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.similarity", SimilarityCommand)
 def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
-    from models.trained_runs import measured
+    from models.trained_runs import resolve_model
 
-    folder, trained = measured(cfg, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides)
+    folder, trained = resolve_model(
+        cfg, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides
+    )
     preset = trained.retriever
 
     from data.build import ensure_benchmark
@@ -37,12 +39,12 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from evaluation.reporting.rows import SIMILARITY
     from evaluation.retrieval import nearest_candidate
     from evaluation.select import chosen_items
-    from models.precision import settled
+    from models.precision import resolve_precision
 
     items = chosen_items(store, cfg.suite, cfg.limit, cfg.seed)
     candidates = {FrameRef(c.scene_id, c.frame) for item in items for c in item.candidates}
     frames = Frames(store, preset.image_size)
-    precision = settled(trained.train.precision)
+    precision = resolve_precision(trained.train.precision)
     rows, told, subtypes, letters, apart = [], [], {}, {}, []
     for embedder in embed.embedders(folder, preset, precision, store, run.folder):
         asked = embed.embed_queries(embedder, items, store, frames, cfg.batch)

@@ -19,10 +19,10 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.two_stage", TwoStageCommand)
 def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
-    from models.trained_runs import measured, modes_of
+    from models.trained_runs import modes_of, resolve_model
 
-    folder, trained = measured(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
-    matched_by, frozen = measured(
+    folder, trained = resolve_model(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
+    matched_by, frozen = resolve_model(
         cfg.matcher, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides, "matcher.model"
     )
     if frozen.retriever.late is not None:
@@ -50,14 +50,14 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from evaluation.reporting import paper, tables
     from evaluation.reporting.rows import UNTRAINED
     from evaluation.retrieval import predicted_texts, standard_test, text_matching
-    from models.precision import settled
-    from models.student.prompts import told_sample
+    from models.precision import resolve_precision
+    from models.student.prompts import text_sample
 
     queries, database = standard_test.standard_test(store)
-    precision = settled(frozen.train.precision)
+    precision = resolve_precision(frozen.train.precision)
     matcher = next(embedders(matched_by, frozen.retriever, precision, store, run.folder))
     student = trained.student
-    sample_of = partial(told_sample, Frames(store, student.image_size), student)
+    sample_of = partial(text_sample, Frames(store, student.image_size), student)
     model = asked_model(cfg, folder, trained)
     name = model.name
     log.info("asking %s", name)

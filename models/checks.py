@@ -141,7 +141,7 @@ def check_adapters(folder: Path, base: nn.Module, cfg: StudentConfig) -> None:
             )
 
 
-def file_of(model: str | Path, name: str, revision: str | None = None) -> Path:
+def model_file(model: str | Path, name: str, revision: str | None = None) -> Path:
     """Where a file of a model is: in its folder, or in the hub's cache, which it is fetched into.
 
     Raises:
@@ -161,7 +161,7 @@ def file_of(model: str | Path, name: str, revision: str | None = None) -> Path:
 def is_retriever(model: str | Path, revision: str | None = None) -> bool:
     """Whether a model, in a folder or of the hub, says what comes after its backbone."""
     try:
-        return file_of(model, MODULES, revision).exists()
+        return model_file(model, MODULES, revision).exists()
     except FileNotFoundError:
         return False
 
@@ -186,7 +186,7 @@ def check_pooling(saved: str | Path, revision: str | None = None) -> None:
     token."""
     try:
         parts = [m["path"] for m in _modules(saved, revision) if m["type"].endswith(".Pooling")]
-        files = [file_of(saved, f"{part}/config.json", revision) for part in parts]
+        files = [model_file(saved, f"{part}/config.json", revision) for part in parts]
         modes = [mode for file in files for mode in _pooling_modes(json.loads(file.read_text()))]
     except DAMAGED as error:
         raise _damaged(saved, error) from error
@@ -200,7 +200,7 @@ def check_pooling(saved: str | Path, revision: str | None = None) -> None:
 
 
 def _modules(saved: str | Path, revision: str | None) -> list[dict[str, Any]]:
-    return json.loads(file_of(saved, MODULES, revision).read_text())
+    return json.loads(model_file(saved, MODULES, revision).read_text())
 
 
 def _damaged(saved: str | Path, error: Exception) -> UserError:
@@ -274,13 +274,13 @@ def processor_digest(model: str | Path | None) -> str:
     return whole.hexdigest()[:16]
 
 
-def pinned(cfg: Preset) -> Preset:
+def pin_revisions(cfg: Preset) -> Preset:
     """A preset with the commits of its hub's models as their revisions: a name stands for other
     weights once its owner changes them. A commit in the cache comes first. Where none can be known
     the preset stays as it is, and what loads the model tells why it cannot be had."""
     commits = {}
     for model, revision in (("model", "revision"), ("image_model", "image_revision")):
-        if in_hub(name := getattr(cfg, model, None)):
+        if is_hub_model(name := getattr(cfg, model, None)):
             asked = getattr(cfg, revision)
             commits[revision] = _commit(name, asked) or asked
     return replace(cfg, **commits)
@@ -302,23 +302,23 @@ def _commit(model: str, revision: str | None) -> str | None:
         return None
 
 
-def in_hub(model: str | None) -> bool:
+def is_hub_model(model: str | None) -> bool:
     """Whether a preset's model is a hub's, and neither a folder here nor built from a seed."""
     return model is not None and not Path(model).is_dir()
 
 
-def named(cfg: Preset) -> str | None:
+def model_id(cfg: Preset) -> str | None:
     """A preset's model: its folder, or the hub's name with the revision."""
     return _named(cfg.model, cfg.revision)
 
 
-def image_named(cfg: RetrieverConfig) -> str | None:
+def image_model_id(cfg: RetrieverConfig) -> str | None:
     """The same of what embeds frames alone."""
     return _named(cfg.image_model, cfg.image_revision)
 
 
 def _named(model: str | None, revision: str | None) -> str | None:
-    at = f"@{revision}" if in_hub(model) and revision else ""
+    at = f"@{revision}" if is_hub_model(model) and revision else ""
     return model and f"{model}{at}"
 
 
@@ -335,10 +335,10 @@ def note_base(folder: Path, cfg: Preset) -> None:
     """Note in a run's folder which weights it is trained over, a hub's by name and commit, others
     by their hash, and hold these to an earlier note: a run that goes on goes on over the same."""
     check_base(folder, cfg)
-    if not in_hub(cfg.model):
+    if not is_hub_model(cfg.model):
         write_json(folder / BASE, weights_digest(cfg.model))
     elif cfg.revision:
-        write_json(folder / BASE, named(cfg))
+        write_json(folder / BASE, model_id(cfg))
 
 
 def note_data(folder: Path, store: Store, *told: Iterable[str]) -> None:
@@ -369,7 +369,7 @@ def check_base(folder: Path, cfg: Preset) -> None:
     """Raises UserError where a run's base is in a folder, and not the one that it was trained
     over."""
     note = folder / BASE
-    if in_hub(cfg.model) or not note.exists():
+    if is_hub_model(cfg.model) or not note.exists():
         return
     if json.loads(note.read_text()) != weights_digest(cfg.model):
         raise UserError(

@@ -34,7 +34,7 @@ def from_main(make: Callable[[], Made]) -> Made:
     return made[0]
 
 
-def accumulation(batch: int, micro_batch: int) -> int:
+def accumulation_steps(batch: int, micro_batch: int) -> int:
     """How many micro-batches a rank takes of a step of `batch` samples over all ranks.
 
     Raises:
@@ -51,7 +51,7 @@ def accumulation(batch: int, micro_batch: int) -> int:
     return batch // at_once
 
 
-def share(batch: int) -> int:
+def per_rank_batch(batch: int) -> int:
     """A rank's part of a batch over all ranks.
 
     Raises:
@@ -65,14 +65,14 @@ def share(batch: int) -> int:
     return batch // ranks()
 
 
-def sharded() -> bool:
+def is_sharded() -> bool:
     """Whether a launcher was told to give each rank a part of the model."""
     return os.environ.get("ACCELERATE_USE_FSDP") == "true"
 
 
 def check_unsharded() -> None:
     """Raises UserError where a launcher was told to shard what it cannot: a retriever."""
-    if sharded():
+    if is_sharded():
         raise UserError(
             "FSDP does not shard a retriever: sentence-transformers reads each checkpoint as a "
             "whole model; leave --use_fsdp away (and give --multi_gpu, on CPUs too)"

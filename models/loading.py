@@ -78,7 +78,7 @@ def load_base(
             **origin,
         )
     except UNREADABLE as error:
-        raise load_failure("student", cfg.model, error) from error
+        raise load_error("student", cfg.model, error) from error
     choose_attention(model, precision, cfg.max_length)
     pin_sizes(processor, cfg.image_size, cfg.frames)
     processor.tokenizer.padding_side = "left"
@@ -112,10 +112,10 @@ def check_reachable(group: str, model: str, key: str = "model") -> None:
             model_info(model, timeout=10)
     except Exception as error:
         # The hub's client raises errors of whichever HTTP library it has; all mean the same here.
-        raise load_failure(group, model, error, key) from error
+        raise load_error(group, model, error, key) from error
 
 
-def load_failure(group: str, model: str, error: Exception, key: str = "model") -> UserError:
+def load_error(group: str, model: str, error: Exception, key: str = "model") -> UserError:
     """What to tell a user whose model did not load."""
     first = next(iter(str(error).strip().splitlines()), type(error).__name__)
     if Path(model).is_dir():
@@ -130,7 +130,7 @@ def load_failure(group: str, model: str, error: Exception, key: str = "model") -
     )
 
 
-def damaged(
+def damaged_error(
     folder: Path, error: Exception, mend: str = "delete the run's folder and train again"
 ) -> UserError:
     """What to tell a user whose trained model cannot be read back."""
@@ -175,10 +175,10 @@ def add_adapters(model: PreTrainedModel, lora: LoraConfig) -> nn.Module:
     try:
         return peft.get_peft_model(model, config)
     except (ValueError, re.error) as error:
-        raise nothing_adapted("student", lora) from error
+        raise no_targets_error("student", lora) from error
 
 
-def nothing_adapted(group: str, lora: LoraConfig) -> UserError:
+def no_targets_error(group: str, lora: LoraConfig) -> UserError:
     """What to tell a user whose pattern matches nothing that can be adapted."""
     return UserError(
         f"{group}.lora.targets={lora.targets} adapts nothing in this model: give a pattern that "
@@ -226,19 +226,19 @@ def load_trained(
         base, processor = load_base(cfg, precision, list)
         try:
             check_adapters(folder, base, cfg)
-            return at_work(peft.PeftModel.from_pretrained(base, folder)), processor
+            return for_inference(peft.PeftModel.from_pretrained(base, folder)), processor
         except UNREADABLE as error:
-            raise damaged(folder, error) from error
+            raise damaged_error(folder, error) from error
     if (folder / EXPORT).exists():
         return load_merged(folder)
     whole = replace(
         cfg, model=str(folder), architecture=None, quantization="none", lora=LoraConfig(rank=0)
     )
     model, processor = load_base(whole, precision, list)
-    return at_work(model), processor
+    return for_inference(model), processor
 
 
-def merged(
+def merge_adapters(
     base: PreTrainedModel, adapters: Path, quantization: str, precision: str
 ) -> PreTrainedModel:
     """A base as its 4-bit weights say it, with the adapters in a folder added in `precision`.
@@ -268,18 +268,18 @@ def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
             folder, dtype="auto", use_safetensors=True
         )
     except UNREADABLE as error:
-        raise damaged(folder, error, "delete it and export again") from error
+        raise damaged_error(folder, error, "delete it and export again") from error
     processor.tokenizer.padding_side = "left"
-    return at_work(model), processor
+    return for_inference(model), processor
 
 
-def at_work(model: nn.Module) -> nn.Module:
+def for_inference(model: nn.Module) -> nn.Module:
     """A model ready to answer, on the GPU where there is one: unlike a 4-bit model, one that is not
     quantised is loaded beside the CPU."""
     return model.to("cuda" if torch.cuda.is_available() else "cpu").eval()
 
 
-def save(
+def save_student(
     model: nn.Module,
     processor: ProcessorMixin,
     folder: Path,
@@ -300,10 +300,10 @@ def save(
         model.config.use_cache = model.config.get_text_config().use_cache = True
         if weights is not None:
             weights = {name: weight.to(DTYPES[precision]) for name, weight in weights.items()}
-    write(model, processor, folder, weights)
+    write_model(model, processor, folder, weights)
 
 
-def write(
+def write_model(
     model: nn.Module,
     processor: ProcessorMixin,
     folder: Path,
@@ -318,11 +318,11 @@ def write(
     try:
         model.save_pretrained(folder, state_dict=weights)
     except SafetensorError as error:
-        raise unwritten(folder.parent, str(error)) from error
+        raise unwritable_error(folder.parent, str(error)) from error
     processor.save_pretrained(folder)
 
 
-def unwritten(folder: Path, why: str) -> UserError:
+def unwritable_error(folder: Path, why: str) -> UserError:
     """What to tell a user whose disk did not take the weights. Unlike a full disk's OSError, what
     the libraries raise names no file, and what filled the disk may be gone again."""
     return UserError(

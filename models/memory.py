@@ -30,7 +30,7 @@ TOO_LITTLE = ("can't allocate memory", "CUDA error: out of memory", "CUBLAS_STAT
 """What torch says of too little memory in errors of no kind of their own."""
 
 
-def start_peak(device: torch.device) -> int:
+def reset_peak(device: torch.device) -> int:
     """Bytes held now, from which on `peak` counts: of the card's tensors, else of the process."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
@@ -45,7 +45,7 @@ def start_peak(device: torch.device) -> int:
     return psutil.Process().memory_info().rss
 
 
-def peak(device: torch.device) -> int:
+def peak_bytes(device: torch.device) -> int:
     """The most bytes held since `start_peak`; where the system cannot count from there, since the
     process began."""
     if device.type == "cuda":
@@ -56,7 +56,7 @@ def peak(device: torch.device) -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def available(device: torch.device) -> int:
+def available_bytes(device: torch.device) -> int:
     """Bytes that may still be taken: of a card, else of the machine or the container on it."""
     if device.type == "cuda":
         reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
@@ -73,7 +73,7 @@ def available(device: torch.device) -> int:
     return free
 
 
-def keep_big_blocks() -> None:
+def keep_freed_memory() -> None:
     """Tell glibc to keep the memory of big tensors between steps. By default it gives every block
     back to the kernel at once, and on a CPU half of a training step goes into page faults."""
     if not sys.platform.startswith("linux"):
@@ -94,7 +94,7 @@ def is_out_of_memory(error: RuntimeError) -> bool:
 
 
 @contextmanager
-def within_memory(when: str, lower: str) -> Iterator[None]:
+def explain_out_of_memory(when: str, lower: str) -> Iterator[None]:
     """Turn a lack of memory into a sentence of when it was, and by which keys less is taken."""
     try:
         yield

@@ -60,7 +60,9 @@ def product_folder(folder: Path, product: str) -> Path:
     return folder if (folder / EXPORT).exists() else folder / product
 
 
-def settings_of(folder: Path, schema: type[Command], product: str, key: str = "model") -> Command:
+def trained_settings(
+    folder: Path, schema: type[Command], product: str, key: str = "model"
+) -> Command:
     """The settings of a finished training run or of an export's, as its command's dataclass.
 
     `key` is the one by which the user named the folder.
@@ -95,7 +97,7 @@ def settings_of(folder: Path, schema: type[Command], product: str, key: str = "m
     return settings
 
 
-def measured(
+def resolve_model(
     cfg: Any,
     benchmark: BenchmarkConfig,
     schema: type[Command],
@@ -114,7 +116,7 @@ def measured(
     if cfg.model is None:
         return None, cfg
     folder = Path(cfg.model)
-    settings = settings_of(folder, schema, product, key)
+    settings = trained_settings(folder, schema, product, key)
     check_unseen(f"{key}={folder}", settings.benchmark, benchmark)
     _lay_over(settings, cfg, product, overrides, key)
     return folder, settings

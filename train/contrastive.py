@@ -31,7 +31,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from models import distributed
 
     distributed.check_unsharded()
-    share = distributed.share(cfg.train.batch)
+    share = distributed.per_rank_batch(cfg.train.batch)
     store = distributed.from_main(partial(prepared, cfg))
 
     from train.retriever.run import train_retriever

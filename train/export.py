@@ -115,12 +115,12 @@ def find(cfg: ExportModelCommand) -> Trained:
     Raises:
         UserError: there is none of that name, it is not finished, or it trained the whole model.
     """
-    from models.trained_runs import settings_of
+    from models.trained_runs import trained_settings
 
     runs = runs_of(cfg.checkpoints, cfg.product)
     name = run_below(cfg.run, runs)
     folder = Path(runs) / name
-    settings = settings_of(folder, TRAINED_BY[cfg.product], cfg.product, "run")
+    settings = trained_settings(folder, TRAINED_BY[cfg.product], cfg.product, "run")
     trained = Trained(name, folder, cfg.product, settings)
     if trained.preset.lora.rank == 0:
         raise UserError(

@@ -32,7 +32,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from models import distributed
 
     smallest = 1 if cfg.train.micro_batch == "auto" else cfg.train.micro_batch
-    distributed.accumulation(cfg.train.batch, smallest)
+    distributed.accumulation_steps(cfg.train.batch, smallest)
     store, rationales = distributed.from_main(partial(prepared, cfg))
 
     from train.student.run import train_student

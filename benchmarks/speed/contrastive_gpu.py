@@ -72,7 +72,7 @@ def main() -> None:
     logging.disable(logging.WARNING)
     if torch.cuda.device_count() > 1:
         parser.error("one card is measured: set CUDA_VISIBLE_DEVICES=0")
-    memory.keep_big_blocks()
+    memory.keep_freed_memory()
     measure(args.retriever, args.base, args.batch, args.steps)
 
 

@@ -28,7 +28,7 @@ from data.render.frame_cache import Frames
 from data.store import Store
 from models import memory
 from models.lora_kernels import fuse, unfuse
-from models.precision import settled
+from models.precision import resolve_precision
 from models.retriever import embedder
 from train.retriever.batches import Batch, Composed, batch_of
 from train.retriever.inputs import Inputs
@@ -55,9 +55,9 @@ def train(
     `helped` it attends as transformers has it, and big blocks of memory are given back each time;
     with `one_clip` all queries of a scene are asked after the clip of its first."""
     if helped:
-        memory.keep_big_blocks()
+        memory.keep_freed_memory()
     set_seed(SEED)
-    cfg.train.precision = settled(cfg.train.precision)
+    cfg.train.precision = resolve_precision(cfg.train.precision)
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     queries = store.retrieval("train")
     if one_clip:

@@ -46,7 +46,7 @@ MALLOC = {
     "MALLOC_TRIM_THRESHOLD_": str((1 << 31) - 1),
     "MALLOC_TOP_PAD_": str(64 << 20),
 }
-"""What `models.memory.keep_big_blocks` sets, as a user can before a process starts."""
+"""What `models.memory.keep_freed_memory` sets, as a user can before a process starts."""
 OURS, DEFAULT = "ours", "TRL as it comes"
 PLAIN = {"trainer": "trl"}
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -249,23 +249,23 @@ def train_one(
     from data.build import ensure_benchmark
     from data.render.frame_cache import Frames
     from models import loading, memory
-    from models.precision import settled
+    from models.precision import resolve_precision
     from teacher.narrate import ensure_rationales
     from train.student import dataset
-    from train.student.lazy_samples import ByLength
+    from train.student.lazy_samples import LengthSampler
 
     variant = sft_runs.Variant(**switches)
     cfg = compose("train.sft", SftCommand, OVERRIDES)
-    cfg.train.precision, cfg.student.quantization = settled(precision), quantization
+    cfg.train.precision, cfg.student.quantization = resolve_precision(precision), quantization
     built = ensure_benchmark(cfg.benchmark, Path(store), cfg.workers)
     rationales = ensure_rationales(built, cfg.teacher)
     if variant.trainer == "ours":
-        memory.keep_big_blocks()
+        memory.keep_freed_memory()
     set_seed(sft_runs.SEED)
     model, processor = loading.load_student(cfg.student, cfg.train.precision, list)
     training, _ = dataset.splits(built, rationales, cfg, Frames(built, cfg.student.image_size))
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
-    order = islice(ByLength(lengths, cfg.train.batch, cfg.seed), steps * cfg.train.batch)
+    order = islice(LengthSampler(lengths, cfg.train.batch, cfg.seed), steps * cfg.train.batch)
     shown = sft_runs.AsImages(training) if images else training
     work = sft_runs.Work(
         model, processor, Subset(shown, list(order)), cfg.train, cfg.student.max_length

@@ -113,7 +113,7 @@ def main() -> None:
     logging.disable(logging.WARNING)
     if torch.cuda.device_count() > 1:
         parser.error("one card is measured: set CUDA_VISIBLE_DEVICES=0")
-    memory.keep_big_blocks()
+    memory.keep_freed_memory()
     for base in args.base or ["nf4", "bf16"]:
         measure(args.student, base, args.steps)
 

@@ -33,7 +33,7 @@ from transformers import (
 from conf.entry import Run
 from conf.schema import SftTrainConfig
 from models.lora_kernels import fuse, unfuse
-from models.memory import peak, start_peak
+from models.memory import peak_bytes, reset_peak
 from models.student.collator import Collator, encode, letter_ids, pad
 from models.student.prompts import Sample
 from train.common import training_loop
@@ -242,7 +242,7 @@ class Clock(TrainerCallback):
         self.peak = 0.0
 
     def on_train_begin(self, *_: Any, **__: Any) -> None:
-        start_peak(self._device)
+        reset_peak(self._device)
 
     def on_step_end(self, *_: Any, **__: Any) -> None:
         if self._device.type == "cuda":
@@ -254,7 +254,7 @@ class Clock(TrainerCallback):
             self.losses.append(logs["loss"])
 
     def on_train_end(self, *_: Any, **__: Any) -> None:
-        self.peak = peak(self._device) / 2**30
+        self.peak = peak_bytes(self._device) / 2**30
 
     def seconds(self) -> list[float]:
         return [end - start for start, end in pairwise(self.ends)]

@@ -12,7 +12,7 @@ from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery, SelectionItem
 from data.render.frame_cache import Frames
 from evaluation.retrieval.late_interaction import embedded_rows
-from models.memory import keep_big_blocks
+from models.memory import keep_freed_memory
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class JointEncoder:
 
 def trained_encoder(preset: RetrieverConfig, precision: str, saved: Path) -> Encoder:
     """What `train.contrastive` saved. Errors are those of `load_trained`."""
-    keep_big_blocks()
+    keep_freed_memory()
     return JointEncoder(load_trained(preset, precision, saved), preset)
 
 
@@ -91,7 +91,7 @@ def released_encoder(preset: RetrieverConfig, precision: str, folder: Path) -> E
         UserError: a model is not on this machine and cannot be fetched, is not whole, or is none of
             the preset's kind.
     """
-    keep_big_blocks()
+    keep_freed_memory()
     if preset.encoder == "vlm2vec":
         from evaluation.embedders.vlm2vec import load_vlm2vec
 

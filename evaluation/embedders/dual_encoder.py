@@ -20,7 +20,7 @@ from conf.schema import RetrieverConfig
 from data.records import FrameRef, shown_frames
 from data.render.frame_cache import Frames
 from evaluation.embedders.base import Query
-from models.loading import DTYPES, UNREADABLE, check_reachable, load_failure
+from models.loading import DTYPES, UNREADABLE, check_reachable, load_error
 
 Clips = Callable[[list[np.ndarray]], np.ndarray]
 
@@ -151,7 +151,7 @@ def load_dual(preset: RetrieverConfig, precision: str) -> DualEncoder:
         processor = AutoProcessor.from_pretrained(preset.model, **origin)
         model = whole(AutoModel, preset.model, precision, "model", **origin)
     except UNREADABLE as error:
-        raise load_failure("retriever", preset.model, error) from error
+        raise load_error("retriever", preset.model, error) from error
     for part in ("image_processor", "tokenizer"):
         if not hasattr(processor, part):
             raise UserError(

@@ -27,9 +27,9 @@ from models.checks import (
     check_base,
     check_pooling,
     check_widths,
-    image_named,
-    named,
-    pinned,
+    image_model_id,
+    model_id,
+    pin_revisions,
     processor_digest,
     weights_digest,
 )
@@ -114,7 +114,7 @@ def trained_embedder(folder: Path, preset: RetrieverConfig, precision: str) -> E
 
         return trained_encoder(preset, precision, saved)
 
-    digests = weights_digest(named(preset), saved), processor_digest(saved)
+    digests = weights_digest(model_id(preset), saved), processor_digest(saved)
     return Embedder(run_title(folder), preset, precision, *digests, load)
 
 
@@ -133,7 +133,7 @@ def built_base(
 
 def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Embedder:
     """The preset's base, or another model as it was released."""
-    preset = pinned(preset)
+    preset = pin_revisions(preset)
 
     @cache
     def load() -> Encoder:
@@ -141,10 +141,10 @@ def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Em
 
         return released_encoder(preset, precision, run / "untrained")
 
-    base = named(preset)
+    base = model_id(preset)
     name = f"{UNTRAINED} {preset.name}" if preset.encoder == "qwen3_vl" else preset.name
     name += ", late" if preset.late is not None else ""
-    digests = weights_digest(base, image_named(preset)), processor_digest(base)
+    digests = weights_digest(base, image_model_id(preset)), processor_digest(base)
     return Embedder(name, preset, precision, *digests, load)
 
 
@@ -222,10 +222,10 @@ def _embedded(
     def embed(some: list[Thing]) -> np.ndarray:
         encoder = embedder.load()
 
-        from models.memory import within_memory
+        from models.memory import explain_out_of_memory
 
         when = f"where {len(some)} are embedded at once"
-        with within_memory(when, "lower batch, in a run of its own (run=NAME)"):
+        with explain_out_of_memory(when, "lower batch, in a run of its own (run=NAME)"):
             rows = encode(encoder, some)
         if preset.late is None:
             check_widths(preset, rows.shape[1])

@@ -28,7 +28,7 @@ from evaluation.embedders.dual_encoder import (
     unit,
     whole,
 )
-from models.loading import UNREADABLE, check_reachable, load_failure
+from models.loading import UNREADABLE, check_reachable, load_error
 
 
 class TimedLayer(CLIPEncoderLayer):
@@ -101,14 +101,14 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
             LanguageBindVideo, preset.model, precision, "model", config=video_config, **origin
         )
     except UNREADABLE as error:
-        raise load_failure("retriever", preset.model, error) from error
+        raise load_error("retriever", preset.model, error) from error
     try:
         origin = {"revision": preset.image_revision}
         image = whole(
             CLIPModel, preset.image_model, precision, "image_model", config=image_config, **origin
         )
     except UNREADABLE as error:
-        raise load_failure("retriever", preset.image_model, error, "image_model") from error
+        raise load_error("retriever", preset.image_model, error, "image_model") from error
     check_words(preset, video_config, tokenizer)
     size = {"height": preset.image_size, "width": preset.image_size}
     # The released models have no file of this; their authors' transform is CLIP's.
@@ -143,6 +143,6 @@ def _config(source: str, revision: str | None, key: str) -> CLIPConfig:
     try:
         return CLIPConfig.from_pretrained(source, revision=revision)
     except UNREADABLE as error:
-        raise load_failure("retriever", source, error, key) from error
+        raise load_error("retriever", source, error, key) from error
     finally:
         transformers_logging.set_verbosity(before)

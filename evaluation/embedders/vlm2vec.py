@@ -11,7 +11,7 @@ from sentence_transformers.sentence_transformer.modules import Normalize, Poolin
 from conf.errors import UserError
 from conf.schema import RetrieverConfig
 from models.checks import check_processor
-from models.loading import DTYPES, UNREADABLE, check_reachable, load_failure, pin_sizes
+from models.loading import DTYPES, UNREADABLE, check_reachable, load_error, pin_sizes
 from models.retriever.embedder import PROCESSING
 
 TEMPLATE = (
@@ -46,7 +46,7 @@ def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer
             processing_kwargs=PROCESSING,
         )
     except UNREADABLE as error:
-        raise load_failure("retriever", preset.model, error) from error
+        raise load_error("retriever", preset.model, error) from error
     config = backbone.model.config
     if config.model_type != "qwen2_vl":
         raise UserError(

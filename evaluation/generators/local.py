@@ -12,11 +12,11 @@ from xgrammar.contrib.hf import LogitsProcessor
 from conf.schema import StudentConfig
 from evaluation.generators.constrained_decoding import record_grammar
 from evaluation.generators.response_log import Keep, Thing, seed_of
-from models.memory import within_memory
+from models.memory import explain_out_of_memory
 from models.student.collator import Collator
-from models.student.generation import THOUGHT, generate, new_tokens
+from models.student.generation import THOUGHT, generate, response_token_limit
 from models.student.prompts import Sample
-from models.student.token_sampling import sampler
+from models.student.token_sampling import sampling_processors
 
 
 def say(
@@ -38,17 +38,17 @@ def say(
         UserError: memory runs out.
     """
     collator = Collator(processor, cfg.max_length, cfg.thinking)
-    limit = new_tokens(mode, cfg)
+    limit = response_token_limit(mode, cfg)
     grammar = record_grammar(model, processor) if mode == "constrained" else None
     for start in range(0, len(things), batch):
         group = things[start : start + batch]
-        steps = sampler(cfg, [seed_of(seed, thing, mode) for thing in group])
+        steps = sampling_processors(cfg, [seed_of(seed, thing, mode) for thing in group])
         if grammar is not None:
             # Before tokens are drawn from what is left.
             steps.insert(0, LogitsProcessor(grammar))
         inputs = collator([sample_of(thing) for thing in group])
         when = f"where {len(group)} items are answered at once"
-        with within_memory(when, "lower batch, in a run of its own (run=NAME)"):
+        with explain_out_of_memory(when, "lower batch, in a run of its own (run=NAME)"):
             written = generate(model, processor, inputs, limit, precision, steps)
         if grammar is not None:
             # What is held to a record from its first token on has no thought.

@@ -19,9 +19,9 @@ from evaluation.generators.response_log import RECORDS, Keep, Say, Thing
 from evaluation.generators.response_schema import instruction as record_instruction
 from evaluation.generators.response_schema import schema
 from models import checks, loading, memory
-from models.precision import settled
-from models.student.generation import new_tokens
-from models.student.prompts import Sample, asked_sample, instruction
+from models.precision import resolve_precision
+from models.student.generation import response_token_limit
+from models.student.prompts import Sample, instructed_sample, instruction
 from models.trained_runs import product_folder, run_title
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def asked_model(
     """
     if cfg.server.url is not None:
         return model_served(cfg, folder, trained.student)
-    return model_here(cfg, folder, trained.student, settled(trained.train.precision))
+    return model_here(cfg, folder, trained.student, resolve_precision(trained.train.precision))
 
 
 def model_here(
@@ -77,17 +77,17 @@ def model_here(
     """
     weights = None
     if folder is None:
-        student = checks.pinned(student)
+        student = checks.pin_revisions(student)
     else:
         checks.check_base(folder, student)
         weights = product_folder(folder, "student")
 
     @cache
     def loaded() -> tuple[nn.Module, ProcessorMixin]:
-        memory.keep_big_blocks()
+        memory.keep_freed_memory()
         if weights is None:
             model, processor = loading.load_base(student, precision, list)
-            return loading.at_work(model), processor
+            return loading.for_inference(model), processor
         return loading.load_trained(student, precision, weights)
 
     def say(mode: str, sample_of: SampleOf) -> Say:
@@ -98,8 +98,8 @@ def model_here(
         return answer
 
     revision = {
-        "weights": checks.weights_digest(checks.named(student), weights),
-        "processor": checks.processor_digest(weights or checks.named(student)),
+        "weights": checks.weights_digest(checks.model_id(student), weights),
+        "processor": checks.processor_digest(weights or checks.model_id(student)),
         "revision": student.revision,
         "quantization": student.quantization,
         "precision": precision,
@@ -178,7 +178,7 @@ def shown(
     item: SelectionItem,
 ) -> Sample:
     """A selection item as a student of a regime is asked about it in a mode."""
-    return asked_sample(item, mode, told(mode, regime), frames, cfg, control=control)
+    return instructed_sample(item, mode, told(mode, regime), frames, cfg, control=control)
 
 
 def known_by(
@@ -191,7 +191,7 @@ def known_by(
     control: str | None,
 ) -> dict[str, Any]:
     """All that an answer in a mode depends on besides its item."""
-    sampling: dict[str, Any] = {"max_new_tokens": new_tokens(mode, student)}
+    sampling: dict[str, Any] = {"max_new_tokens": response_token_limit(mode, student)}
     sampling |= {"thinking": student.thinking, "temperature": student.temperature}
     if student.temperature:
         sampling |= {"top_p": student.top_p, "top_k": student.top_k, "seed": seed}

@@ -18,7 +18,7 @@ from conf.errors import UserError
 from conf.schema import ServerConfig, StudentConfig
 from evaluation.generators.response_log import Keep, Thing, seed_of
 from evaluation.generators.response_schema import schema
-from models.student.generation import THOUGHT, Written, new_tokens
+from models.student.generation import THOUGHT, GeneratedText, response_token_limit
 from models.student.prompts import Clip, Sample
 from teacher.servers.client import Client, UnansweredError
 from teacher.servers.concurrency import in_lanes
@@ -130,7 +130,7 @@ def request_of(cfg: StudentConfig, mode: str, clip: Clip | None) -> Request:
     request = {
         "temperature": cfg.temperature,
         "top_p": cfg.top_p,
-        "max_tokens": new_tokens(mode, cfg),
+        "max_tokens": response_token_limit(mode, cfg),
         "extra_body": extra,
     }
     if mode == "constrained":
@@ -139,7 +139,7 @@ def request_of(cfg: StudentConfig, mode: str, clip: Clip | None) -> Request:
     return request
 
 
-def written(reply: Reply, opened: bool) -> Written:
+def written(reply: Reply, opened: bool) -> GeneratedText:
     """What a server's model wrote, its thought within the text. A thought that the prompt has
     `opened`, or that the server has taken out, is opened again."""
     text = reply.text
@@ -147,7 +147,7 @@ def written(reply: Reply, opened: bool) -> Written:
         text = f"{THOUGHT}{reply.thought}" + (f"</think>{text}" if text else "")
     elif opened and THOUGHT not in text:
         text = f"{THOUGHT}{text}"
-    return Written(text, reply.flaw == CUT_OFF)
+    return GeneratedText(text, reply.flaw == CUT_OFF)
 
 
 def revision(server: ServerConfig) -> dict[str, Any]:

@@ -15,11 +15,11 @@ from tqdm import tqdm
 
 from data.records import FrameRef, RetrievalQuery, SelectionItem
 from evaluation.generators.response_schema import Record, parse, read_record
-from models.student.generation import Written
+from models.student.generation import GeneratedText
 
 Thing = SelectionItem | RetrievalQuery | FrameRef
 """What a model is asked about."""
-Keep = Callable[[list[tuple[Thing, Written]]], None]
+Keep = Callable[[list[tuple[Thing, GeneratedText]]], None]
 """Takes what was said to some things as soon as it is there."""
 Say = Callable[[list[Thing], Keep], None]
 """Has a model answer and keeps what it says."""
@@ -62,7 +62,7 @@ class Told:
 Kept = Answer | Told
 
 
-def judge(item: SelectionItem, mode: str, written: Written) -> Answer:
+def judge(item: SelectionItem, mode: str, written: GeneratedText) -> Answer:
     """What a text says to an item, and whether that is right."""
     choice = parse(written.text, cut=written.cut)
     valid = read_record(written.text) is not None if mode in RECORDS else None
@@ -78,7 +78,7 @@ def judge(item: SelectionItem, mode: str, written: Written) -> Answer:
     )
 
 
-def as_told(thing: Thing, mode: str, written: Written) -> Told:
+def as_told(thing: Thing, mode: str, written: GeneratedText) -> Told:
     """A text as it was written, which nothing judges."""
     return Told(thing.name, mode, written.text, written.cut)
 
@@ -97,7 +97,7 @@ class AnswerLog:
         path: Path,
         asked: dict[str, dict[str, Any]],
         things: Sequence[Thing],
-        judged: Callable[[Thing, str, Written], Kept] = judge,
+        judged: Callable[[Thing, str, GeneratedText], Kept] = judge,
     ) -> None:
         self._path = path
         self.keys = {mode: _key(mode, what) for mode, what in asked.items()}
@@ -133,7 +133,7 @@ class AnswerLog:
                 row, answer = json.loads(line), None
                 thing = None if "asked" in row else self._thing_of.get(row["item_id"])
                 if thing and self._bears_key(row):
-                    answer = self.judged(thing, row["mode"], Written(row["text"], row["cut"]))
+                    answer = self.judged(thing, row["mode"], GeneratedText(row["text"], row["cut"]))
                 found.append((answer, row))
             except (ValueError, TypeError, KeyError, AttributeError):
                 continue
@@ -165,7 +165,7 @@ def ask_all(
     waiting = [t for t in things if (t.name, mode) not in log.answers]
     with tqdm(total=len(things), initial=len(things) - len(waiting), desc=mode, unit=unit) as bar:
 
-        def keep(said: list[tuple[Thing, Written]]) -> None:
+        def keep(said: list[tuple[Thing, GeneratedText]]) -> None:
             log.append([log.judged(thing, mode, written) for thing, written in said])
             bar.update(len(said))
 

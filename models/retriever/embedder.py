@@ -38,15 +38,15 @@ from models.loading import (
     DTYPES,
     UNREADABLE,
     check_reachable,
-    damaged,
+    damaged_error,
     keep_differentiable,
-    load_failure,
+    load_error,
     nf4_config,
-    nothing_adapted,
+    no_targets_error,
     pin_sizes,
 )
 from models.retriever.multi_vector import keep_late_exact, late_modules, load_late
-from models.student.prompts import clip_of
+from models.student.prompts import load_clip
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
 
@@ -95,7 +95,7 @@ def load_retriever(
             processing_kwargs=PROCESSING,
         )
     except UNREADABLE as error:
-        raise load_failure("retriever", cfg.model, error) from error
+        raise load_error("retriever", cfg.model, error) from error
     check_processor("retriever", source, config, backbone.processor)
     pin_sizes(backbone.processor, cfg.image_size, cfg.frames)
     whole = {
@@ -139,7 +139,7 @@ def add_adapters(model: Retriever, lora: LoraConfig) -> None:
     try:
         model.add_adapter(config)
     except (ValueError, re.error) as error:
-        raise nothing_adapted("retriever", lora) from error
+        raise no_targets_error("retriever", lora) from error
     for weight in model[0].parameters():
         if weight.requires_grad:
             weight.data = weight.data.float()
@@ -191,7 +191,7 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
         else:
             model = SentenceTransformer(str(folder), **options)
     except UNREADABLE as error:
-        raise damaged(folder, error) from error
+        raise damaged_error(folder, error) from error
     choose_attention(model[0].model, precision, cfg.max_length, masks=True)
     return model
 
@@ -209,7 +209,7 @@ def load_merged(folder: Path, cfg: RetrieverConfig) -> Retriever:
             return load_late(folder, **options)
         return SentenceTransformer(str(folder), **options)
     except UNREADABLE as error:
-        raise damaged(folder, error, "delete it and export again") from error
+        raise damaged_error(folder, error, "delete it and export again") from error
 
 
 def weight_options(cfg: RetrieverConfig, precision: str) -> dict[str, Any]:
@@ -240,7 +240,7 @@ def longest_query(queries: list[RetrievalQuery], tokenizer: Any) -> RetrievalQue
 def query_input(query: RetrievalQuery, frames: Frames, cfg: RetrieverConfig) -> dict[str, Any]:
     """A query as sentence-transformers takes it: the prefix with its true times, then the text."""
     shown = shown_frames(query.prefix_start, query.prefix_stop, cfg.frames)
-    clip = clip_of(query.scene_id, shown, frames)
+    clip = load_clip(query.scene_id, shown, frames)
     array = torch.from_numpy(clip.pixels).permute(0, 3, 1, 2)
     return {"video": {"array": array, "video_metadata": clip.metadata}, "text": query.question}
 

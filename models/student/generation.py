@@ -17,13 +17,13 @@ THOUGHT, OPENING = "<think>", 8
 """What opens a thought, and how many tokens at a prompt's end are looked at for it."""
 
 
-def new_tokens(mode: str, cfg: StudentConfig) -> int:
+def response_token_limit(mode: str, cfg: StudentConfig) -> int:
     """How many tokens a student may write in a mode."""
     return ANSWER_TOKENS if mode == "answer" and not cfg.thinking else cfg.max_new_tokens
 
 
 @dataclass(frozen=True)
-class Written:
+class GeneratedText:
     """What a model wrote; whether it was stopped before its end."""
 
     text: str
@@ -37,7 +37,7 @@ def generate(
     limit: int,
     precision: str,
     steps: LogitsProcessorList | None = None,
-) -> list[Written]:
+) -> list[GeneratedText]:
     """What a model writes after left-padded prompts, `limit` tokens at most: greedily, after the
     logits have passed the `steps`. A thought that the prompt opens is opened in the text."""
     device = next(model.parameters()).device
@@ -59,6 +59,6 @@ def generate(
     ends = torch.tensor([tokenizer.eos_token_id, tokenizer.pad_token_id], device=new.device)
     ended = torch.isin(new, ends).any(dim=1) | (new.shape[1] < limit)
     return [
-        Written(f"{THOUGHT * opened}{text}", not end)
+        GeneratedText(f"{THOUGHT * opened}{text}", not end)
         for text, end in zip(texts, ended.tolist(), strict=True)
     ]

@@ -24,7 +24,7 @@ from data.tracks.controls import observed
 from teacher.sections import without
 
 MODES = ("reasoning", "answer")
-TOLD = {
+TEXT_INSTRUCTIONS = {
     "rationale": "Reason about the scene step by step: scene parse, motion analysis, prediction "
     "and outcome.",
     "prediction": "Describe in a sentence or two the frame that answers this: the objects that it "
@@ -98,8 +98,8 @@ def answer_line(letter: str) -> str:
 
 def instruction(mode: str, regime: str) -> str:
     """What a student is told to write."""
-    if mode in TOLD:
-        return TOLD[mode]
+    if mode in TEXT_INSTRUCTIONS:
+        return TEXT_INSTRUCTIONS[mode]
     if mode == "answer":
         return 'Reply with one line, "Answer:" and the letter.'
     steps = ["scene parse", "motion analysis", "prediction"]
@@ -146,10 +146,10 @@ def selection_sample(
     """A selection item asked in `mode` ("reasoning" or "answer") as a student of `regime` is, its
     prefix shown as a `control` asks (see `data.tracks.controls`)."""
     asked = instruction(mode, regime)
-    return asked_sample(item, mode, asked, frames, cfg, response, control)
+    return instructed_sample(item, mode, asked, frames, cfg, response, control)
 
 
-def asked_sample(
+def instructed_sample(
     item: SelectionItem,
     mode: str,
     asked: str,
@@ -163,24 +163,24 @@ def asked_sample(
     parts: list[str | np.ndarray] = [item.question]
     for letter, c in zip(LETTERS, item.candidates, strict=True):
         parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
-    clip = clip_of(item.scene_id, shown, frames) if shown else None
+    clip = load_clip(item.scene_id, shown, frames) if shown else None
     return conversation(f"{item.item_id} ({mode})", [*parts, f"\n{asked}"], response, clip)
 
 
-def told_sample(
+def text_sample(
     frames: Frames, cfg: StudentConfig, mode: str, thing: RetrievalQuery | FrameRef
 ) -> Sample:
-    """A query's prefix and question, or a frame, with what is asked of it in a mode of `TOLD`."""
-    name, asked = f"{thing.name} ({mode})", f"\n{TOLD[mode]}"
+    """A query's prefix and question, or a frame, with what is asked of it in a mode of `TEXT_INSTRUCTIONS`."""
+    name, asked = f"{thing.name} ({mode})", f"\n{TEXT_INSTRUCTIONS[mode]}"
     if isinstance(thing, FrameRef):
         pixels = frames.array(thing.scene_id, thing.frame)
         return conversation(name, [pixels, asked], None)
     shown = shown_frames(thing.prefix_start, thing.prefix_stop, cfg.frames)
-    clip = clip_of(thing.scene_id, shown, frames)
+    clip = load_clip(thing.scene_id, shown, frames)
     return conversation(name, [thing.question, asked], None, clip)
 
 
-def clip_of(scene_id: str, shown: list[int], frames: Frames) -> Clip:
+def load_clip(scene_id: str, shown: list[int], frames: Frames) -> Clip:
     """Frames of a scene as a clip, whose times run on in whatever order they are `shown`."""
     scene = frames.scene(scene_id)
     return Clip(frames.stack(scene_id, shown), sorted(shown), scene.fps, scene.frames)

@@ -17,7 +17,7 @@ from transformers import (
 from conf.schema import StudentConfig
 
 
-def sampler(cfg: StudentConfig, seeds: Sequence[int]) -> LogitsProcessorList:
+def sampling_processors(cfg: StudentConfig, seeds: Sequence[int]) -> LogitsProcessorList:
     """What makes greedy decoding draw as `cfg` says, each row by its own seed; nothing where the
     temperature is 0."""
     steps = LogitsProcessorList()

@@ -93,7 +93,7 @@ def test_a_trained_student_answers_as_it_did_when_it_was_saved(
         for name, weight in model.named_parameters():
             if "lora_B" in name:
                 weight.normal_(std=0.1)
-    loading.save(model, processor, tmp_path / "student", "fp32")
+    loading.save_student(model, processor, tmp_path / "student", "fp32")
     again, reader = loading.load_trained(nf4_cfg, "fp32", tmp_path / "student")
     item = micro_store.selection("train")[0]
     batch = Collator(reader, 1500)([selection_sample(item, "answer", "cot", frames, nf4_cfg)])

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from models.precision import of_run, settled
+from models.precision import of_run, resolve_precision
 
 
 @pytest.mark.parametrize("named", ["bf16", "fp32"])
 def test_a_named_precision_is_kept(named) -> None:
-    assert settled(named) == named
+    assert resolve_precision(named) == named
 
 
 @pytest.mark.parametrize(
@@ -22,12 +22,12 @@ def test_a_cpu_computes_in_what_it_has_instructions_for(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: instructions)
-    assert settled("auto") == expected
+    assert resolve_precision("auto") == expected
 
 
 def test_a_run_goes_on_in_what_it_was_begun_in(monkeypatch, tmp_path) -> None:
-    monkeypatch.setattr("models.precision.computes_bf16", lambda: True)
+    monkeypatch.setattr("models.precision.supports_bf16", lambda: True)
     assert of_run(tmp_path, "auto") == "bf16"
-    monkeypatch.setattr("models.precision.computes_bf16", lambda: False)
+    monkeypatch.setattr("models.precision.supports_bf16", lambda: False)
     assert of_run(tmp_path, "auto") == "bf16"
-    assert settled("auto") == "fp32"
+    assert resolve_precision("auto") == "fp32"

@@ -12,7 +12,7 @@ from conf.schema import StudentConfig
 from models.student.collator import Collator
 from models.student.generation import generate
 from models.student.prompts import selection_sample
-from models.student.token_sampling import sampler
+from models.student.token_sampling import sampling_processors
 
 LOGITS = torch.tensor([2.0, 1.0, 0.5, 0.0, -1.0, -3.0])
 
@@ -23,7 +23,7 @@ def drawing(**changes: object) -> StudentConfig:
 
 def drawn(cfg: StudentConfig, count: int = 20_000) -> np.ndarray:
     """How often each token is drawn, by as many seeds."""
-    steps = sampler(cfg, range(count))
+    steps = sampling_processors(cfg, range(count))
     scores = LOGITS.expand(count, -1).clone()
     tokens = steps(torch.zeros(count, 1, dtype=torch.long), scores).argmax(1)
     return np.bincount(tokens, minlength=len(LOGITS)) / count
@@ -44,7 +44,7 @@ def test_tokens_are_drawn_from_the_likeliest_alone() -> None:
 
 def test_a_row_is_drawn_by_its_seed_whatever_stands_beside_it() -> None:
     cfg, ids = drawing(), torch.zeros(3, 1, dtype=torch.long)
-    steps = {seeds: sampler(cfg, seeds) for seeds in ((5, 6, 7), (6,), (7, 6, 5))}
+    steps = {seeds: sampling_processors(cfg, seeds) for seeds in ((5, 6, 7), (6,), (7, 6, 5))}
     for _ in range(20):
         rows = {
             seeds: step(ids[: len(seeds)], LOGITS.expand(len(seeds), -1).clone())
@@ -56,7 +56,7 @@ def test_a_row_is_drawn_by_its_seed_whatever_stands_beside_it() -> None:
 
 
 def test_without_a_temperature_nothing_is_drawn() -> None:
-    assert not sampler(StudentConfig(name="any", model="any"), [0])
+    assert not sampling_processors(StudentConfig(name="any", model="any"), [0])
 
 
 def test_a_models_answer_is_its_items_own(
@@ -67,7 +67,7 @@ def test_a_models_answer_is_its_items_own(
 
     def asked(group: list[int], seed: int = 0) -> list[str]:
         samples = [selection_sample(items[k], "answer", "cot", frames, student_cfg) for k in group]
-        steps = sampler(drawing(top_k=50), [100 * seed + k for k in group])
+        steps = sampling_processors(drawing(top_k=50), [100 * seed + k for k in group])
         inputs = Collator(processor, 1500)(samples)
         return [w.text for w in generate(model.eval(), processor, inputs, 12, "fp32", steps)]
 

@@ -24,10 +24,10 @@ from torch import nn
 
 from conf.runs import write_json
 from conf.schema import ContrastiveTrainConfig, SftTrainConfig
-from models.distributed import sharded
-from models.memory import available, is_out_of_memory, peak, start_peak
+from models.distributed import is_sharded
+from models.memory import available_bytes, is_out_of_memory, peak_bytes, reset_peak
 from models.student.collator import Collator
-from train.student.lazy_samples import ByLength, Samples
+from train.student.lazy_samples import LengthSampler, Samples
 from train.student.trainer import token_mean
 
 log = logging.getLogger(__name__)
@@ -103,7 +103,7 @@ def decide(
     and `named` is how its parts are called."""
     if "auto" not in (asked.micro_batch, asked.gradient_checkpointing):
         return asked
-    if sharded():
+    if is_sharded():
         # What is to be sharded may not fit a rank before it is.
         least_of = {"micro_batch": 1, "gradient_checkpointing": True}
         return Choice(**{k: least_of[k] if v == "auto" else v for k, v in vars(asked).items()})
@@ -115,7 +115,7 @@ def decide(
     model.to(state.device)
     # Ranks on CPUs share one memory.
     sharing = state.num_processes if state.device.type == "cpu" else 1
-    limit = int(spare * available(state.device) / sharing) - optimizer_bytes(model)
+    limit = int(spare * available_bytes(state.device) / sharing) - optimizer_bytes(model)
     with probing(model):
         choice, needed = choose(trial(share), asked, share, limit)
     # All ranks have to make the same steps.
@@ -228,7 +228,7 @@ class Passes:
         self._collator = collator
         self._training = training
         self._longest = sorted(range(len(lengths)), key=lambda k: -lengths[k])
-        self._step = list(ByLength(lengths, train.batch, 0))[:share]
+        self._step = list(LengthSampler(lengths, train.batch, 0))[:share]
         self._bf16 = train.precision == "bf16"
         self._device = next(model.parameters()).device
 
@@ -236,14 +236,14 @@ class Passes:
         switch(self._model, recompute)
         longest = self._longest
         batch = self._batch([longest[k % len(longest)] for k in range(micro_batch)])
-        held = start_peak(self._device)
+        held = reset_peak(self._device)
         try:
             self._pass(batch)
         except RuntimeError as error:
             if not is_out_of_memory(error):
                 raise
             return None
-        return max(0, peak(self._device) - held)
+        return max(0, peak_bytes(self._device) - held)
 
     def seconds(self, micro_batch: int, recompute: bool) -> float:
         switch(self._model, recompute)

@@ -10,7 +10,7 @@ from huggingface_hub import ModelCardData
 
 from conf.multirun.summary import AT_START
 from conf.schema import ContrastiveCommand, RetrieverConfig, SftCommand, StudentConfig
-from models.checks import BASE, in_hub
+from models.checks import BASE, is_hub_model
 from train.common.journal import BEST_STEP
 
 SHOWN_PACKAGES = ("torch", "transformers", "sentence-transformers", "peft", "bitsandbytes")
@@ -100,7 +100,7 @@ def _training(settings: Settings, folder: Path) -> Iterable[tuple[str, str]]:
     student = isinstance(settings, SftCommand)
     record = json.loads((folder / "run.json").read_text())
     yield "base", f"{preset.model}{f' at {preset.revision}' if preset.revision else ''}"
-    if not in_hub(preset.model) and (folder / BASE).exists():
+    if not is_hub_model(preset.model) and (folder / BASE).exists():
         yield "hash of the base's weights", json.loads((folder / BASE).read_text())
     yield "quantisation of the base", preset.quantization
     lora = preset.lora

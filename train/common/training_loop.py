@@ -29,8 +29,8 @@ from conf.entry import Run
 from conf.errors import UserError
 from conf.runs import rank, run_id
 from conf.schema import TrainConfig
-from models.distributed import sharded
-from models.loading import unwritten
+from models.distributed import is_sharded
+from models.loading import unwritable_error
 from models.memory import is_out_of_memory
 from train.common.checkpoints import STATE, check_best
 from train.common.journal import Bar, Journal, NamedMeasure
@@ -188,10 +188,10 @@ def explained(folder: Path, when: Callable[[], str], lower: str) -> Iterator[Non
     try:
         yield
     except SafetensorError as error:
-        raise unwritten(folder, str(error)) from error
+        raise unwritable_error(folder, str(error)) from error
     except RuntimeError as error:
         if is_unwritten(error):
-            raise unwritten(folder, "a file was cut short; the disk may be full") from error
+            raise unwritable_error(folder, "a file was cut short; the disk may be full") from error
         if TOLD in str(error):
             # Of another rank, which the library tells with its traceback.
             raise UserError(sentence(error)) from error
@@ -223,7 +223,7 @@ def check_fsdp(trainer: Trainer, checkpoint: Path | None) -> None:
     """Raises UserError where the FSDP that a launcher was told of is none that trains here, or a
     run was begun with it and goes on without, or the reverse."""
     fsdp = trainer.is_fsdp_enabled
-    if sharded() and not fsdp:
+    if is_sharded() and not fsdp:
         raise UserError(
             "accelerate has FSDP for several GPUs only, and would train without a word about it: "
             "leave --use_fsdp away (and give --multi_gpu, on CPUs too)"

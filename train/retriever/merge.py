@@ -60,7 +60,7 @@ def write_merged(
     model.cpu()
     plain = replace(preset, lora=LoraConfig(rank=0))
     base = load_retriever(plain, precision, [], folder)[0].model
-    model[0].model = loading.merged(base, saved, preset.quantization, cfg.format)
+    model[0].model = loading.merge_adapters(base, saved, preset.quantization, cfg.format)
     model.save_pretrained(str(folder), create_model_card=False)
     del model, base
     log.info("asking the exported retriever")

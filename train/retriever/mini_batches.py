@@ -13,7 +13,7 @@ import torch
 
 from conf.schema import ContrastiveTrainConfig
 from data.records import RetrievalQuery
-from models.memory import is_out_of_memory, peak, start_peak
+from models.memory import is_out_of_memory, peak_bytes, reset_peak
 from models.retriever.embedder import Retriever
 from train.common import memory_probe
 from train.retriever.batches import Batch, batch_of
@@ -89,14 +89,14 @@ class MiniBatches:
         memory_probe.switch(self._model[0].model, recompute)
         batch = self._batch([query for group in self._longest[:mini_batch] for query in group])
         given = self._inputs.on_device(self._inputs.of_prefixes(batch, 0, len(batch.prefixes)))
-        held = start_peak(self._model.device)
+        held = reset_peak(self._model.device)
         try:
             self._pass(given, "query")
         except RuntimeError as error:
             if not is_out_of_memory(error):
                 raise
             return None
-        return max(0, peak(self._model.device) - held)
+        return max(0, peak_bytes(self._model.device) - held)
 
     def seconds(self, mini_batch: int, recompute: bool) -> float:
         memory_probe.switch(self._model[0].model, recompute)

@@ -55,13 +55,15 @@ def train_retriever(
 ) -> dict[str, float]:
     """Train a retriever in its run's folder and give what it measured there. `share` is a rank's
     part of a step's queries."""
-    memory.keep_big_blocks()
+    memory.keep_freed_memory()
     cfg.train.precision = of_run(run.folder, cfg.train.precision)
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
     training, validation = split(cfg, store)
     preset = cfg.retriever
-    cfg.retriever = distributed.from_main(lambda: checks.pinned(checks.based(run.folder, preset)))
+    cfg.retriever = distributed.from_main(
+        lambda: checks.pin_revisions(checks.based(run.folder, preset))
+    )
     log.info("loading retriever %s, to compute in %s", cfg.retriever.name, cfg.train.precision)
     if rank() == 0:
         checks.note_base(run.folder, cfg.retriever)

@@ -25,7 +25,7 @@ from models.student.prompts import (
 from teacher.letters import relabel, reorder
 from teacher.narrator import matches
 from teacher.predicates import predicates_of
-from train.student.lazy_samples import Planned, Samples, rng_of
+from train.student.lazy_samples import LazySample, Samples, seeded_rng
 from train.tiny_base import questions
 
 HELD_OUT = 0.1
@@ -54,7 +54,7 @@ class Supervised:
         """The same with its candidates in the epoch's order, and all letters with them."""
         if self.seed is None:
             return self
-        rng = rng_of(self.seed, epoch, self.item.item_id)
+        rng = seeded_rng(self.seed, epoch, self.item.item_id)
         order = rng.permutation(len(LETTERS)).tolist()
         return replace(
             self,
@@ -69,10 +69,10 @@ class Supervised:
         told = response(shown.rationale, shown.matches, shown.item.letter, self.mode, self.regime)
         return selection_sample(shown.item, self.mode, self.regime, frames, cfg, told)
 
-    def planned(self, frames: Frames, cfg: StudentConfig) -> Planned:
+    def planned(self, frames: Frames, cfg: StudentConfig) -> LazySample:
         media = cfg.frames // 2 + len(LETTERS)
         make = partial(self.sample, frames, cfg)
-        return Planned(self.text(), media, make, self.item.family)
+        return LazySample(self.text(), media, make, self.item.family)
 
 
 def held_out_scenes(store: Store) -> set[str]:
@@ -156,7 +156,7 @@ def splits(
     training = supervised_items(store, trained, by_item, cfg.train, seed)
     validation = supervised_items(store, kept, by_item, cfg.train, None)
 
-    def planned(supervised: list[Supervised]) -> list[Planned]:
+    def planned(supervised: list[Supervised]) -> list[LazySample]:
         return [s.planned(frames, cfg.student) for s in supervised]
 
     # A CoT student learns both modes, so that it can be asked in either.

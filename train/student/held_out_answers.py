@@ -13,10 +13,10 @@ from torch import nn
 from transformers import ProcessorMixin
 
 from conf.schema import StudentConfig
-from models.memory import within_memory
+from models.memory import explain_out_of_memory
 from models.student.answer_parser import parse
 from models.student.collator import Collator
-from models.student.generation import Written, generate, new_tokens
+from models.student.generation import GeneratedText, generate, response_token_limit
 from train.common.journal import WRITTEN
 from train.student.lazy_samples import Samples
 
@@ -51,10 +51,10 @@ class HeldOutAnswers:
         """
         asked = [samples[k] for k in range(min(self._count, len(samples)))]
         inputs = self._collator([replace(sample, response=None) for sample in asked])
-        limit = new_tokens(mode, self._cfg)
+        limit = response_token_limit(mode, self._cfg)
         when = f"where the student answers {len(asked)} held-out items after step {step}"
         lower = "lower train.generated_items, or set it to 0, in a run of its own (run=NAME)"
-        with within_memory(when, lower):
+        with explain_out_of_memory(when, lower):
             texts = generate(model, self._processor, inputs, limit, self._precision)
         rows = [
             _row(step, mode, sample.sample_id, written, sample.response)
@@ -80,7 +80,9 @@ class HeldOutAnswers:
         log.info("step %d, %s%s:\n%s", shown["step"], shown["sample"], told, text)
 
 
-def _row(step: int, mode: str, sample: str, written: Written, response: str) -> dict[str, Any]:
+def _row(
+    step: int, mode: str, sample: str, written: GeneratedText, response: str
+) -> dict[str, Any]:
     """One line of samples.jsonl; `answer` is the right letter, as it stands in the response that
     is held out, and null where none is asked for."""
     choice = parse(written.text, cut=written.cut)

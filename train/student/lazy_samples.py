@@ -17,7 +17,7 @@ TOKEN, STAMP = 32, 8
 
 
 @dataclass(frozen=True)
-class Planned:
+class LazySample:
     """A sample to be made when it is asked for, so that pixels are not held for all of them. It may
     differ by epoch.
 
@@ -36,7 +36,7 @@ class Samples(Dataset):
     """Planned samples as a trainer reads them, as they are in an epoch. At ~index, below 0, is the
     sample of that index with nothing supervised."""
 
-    def __init__(self, planned: Sequence[Planned]) -> None:
+    def __init__(self, planned: Sequence[LazySample]) -> None:
         self._planned = planned
         self._epoch = 0
 
@@ -63,7 +63,7 @@ class Samples(Dataset):
         return [len(i) + p.media * each for i, p in zip(ids, self._planned, strict=True)]
 
 
-class ByLength(Sampler[int]):
+class LengthSampler(Sampler[int]):
     """All samples in a random order of each epoch, those of a step sorted by length, so that little
     of a micro-batch is padding. What a step holds does not hang on how it is split.
 
@@ -111,7 +111,7 @@ class ByLength(Sampler[int]):
         return -samples % (self._micro_batch * self._ranks) if self._ranks > 1 else 0
 
 
-def rng_of(*keys: int | str) -> np.random.Generator:
+def seeded_rng(*keys: int | str) -> np.random.Generator:
     """A generator that follows from `keys` alone."""
     digest = hashlib.sha256(repr(keys).encode()).digest()
     return np.random.default_rng(int.from_bytes(digest[:8], "big"))

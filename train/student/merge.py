@@ -51,7 +51,7 @@ def write_merged(
     del model
     log.info("merging")
     model, processor = merge(settings, saved, cfg.format)
-    loading.write(model, processor, folder)
+    loading.write_model(model, processor, folder)
     del model
     log.info("asking the exported student")
     model, processor = loading.load_merged(folder)
@@ -82,7 +82,7 @@ def merge(
 ) -> tuple[PreTrainedModel, ProcessorMixin]:
     """The base with the adapters added in `precision`, and its processor."""
     base, processor = loading.load_base(settings.student, settings.train.precision, list)
-    return loading.merged(base, saved, settings.student.quantization, precision), processor
+    return loading.merge_adapters(base, saved, settings.student.quantization, precision), processor
 
 
 @dataclass(frozen=True)

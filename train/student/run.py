@@ -29,7 +29,7 @@ from train.common import checkpoints, journal, memory_probe, training_loop
 from train.common.audit import audit
 from train.student import dataset
 from train.student.held_out_answers import HeldOutAnswers
-from train.student.lazy_samples import ByLength, Samples
+from train.student.lazy_samples import LengthSampler, Samples
 from train.student.packing import PackingCollator, rope_of
 from train.student.trainer import LetterChoice, StudentTrainer, TokenChoice, token_mean
 from train.student.vision_cache import Features, Keyed
@@ -42,12 +42,12 @@ def train_student(
     cfg: SftCommand, run: Run, store: Store, rationales: list[Rationale]
 ) -> dict[str, float]:
     """Train a student in its run's folder and give what it measured there."""
-    memory.keep_big_blocks()
+    memory.keep_freed_memory()
     cfg.train.precision = of_run(run.folder, cfg.train.precision)
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
     cfg.student = distributed.from_main(
-        lambda: checks.pinned(checks.based(run.folder, cfg.student))
+        lambda: checks.pin_revisions(checks.based(run.folder, cfg.student))
     )
     log.info("loading student %s, to compute in %s", cfg.student.name, cfg.train.precision)
     if rank() == 0:
@@ -56,7 +56,7 @@ def train_student(
         model, processor = loading.load_student(
             cfg.student, cfg.train.precision, lambda: dataset.corpus(store, rationales)
         )
-        if not distributed.sharded():
+        if not distributed.is_sharded():
             # Else the trainer would only find later that it does not fit.
             model.to(PartialState(cpu=not torch.cuda.is_available()).device)
     fuse(model)
@@ -69,12 +69,12 @@ def train_student(
     longest = training[lengths.index(max(lengths))]
     log.info(audit(model, processor, cfg.student, longest, ways.collator))
     train = memory_probe.settle(cfg.train, run.folder, model, ways.packs, training, lengths)
-    order = ByLength(lengths, train.batch, cfg.seed, train.micro_batch, distributed.ranks())
+    order = LengthSampler(lengths, train.batch, cfg.seed, train.micro_batch, distributed.ranks())
     checkpoint = checkpoints.newest_checkpoint(run.folder)
     if checkpoint is not None:
         checks.check_adapters(checkpoint, model, cfg.student)
 
-    if train.reuse_features and distributed.sharded():
+    if train.reuse_features and distributed.is_sharded():
         raise UserError(
             "train.reuse_features=true cannot be had with FSDP, which leaves no rank a whole "
             "vision tower: leave one of the two away"
@@ -100,7 +100,7 @@ def train_student(
     if rank() == 0:
         # A base for others is written as bases are released, whatever it was computed in.
         written = "bf16" if cfg.train.regime == "describe" else cfg.train.precision
-        loading.save(model, processor, run.folder / "student", written, weights)
+        loading.save_student(model, processor, run.folder / "student", written, weights)
     log.info("the student is in %s", run.folder / "student")
     return journal.evaluated(run.folder, best)
 
@@ -151,7 +151,7 @@ def ways_of(cfg: SftCommand, model: nn.Module, processor: ProcessorMixin) -> Way
 def arguments(
     train: SftTrainConfig, run: Run, cfg: SftCommand, checkpoint: Path | None
 ) -> TrainingArguments:
-    accumulation = distributed.accumulation(train.batch, train.micro_batch)
+    accumulation = distributed.accumulation_steps(train.batch, train.micro_batch)
     shared: dict[str, Any] = training_loop.arguments(train, run, cfg.seed, checkpoint)
     return TrainingArguments(
         **shared,

@@ -20,7 +20,7 @@ from conf.errors import UserError
 from conf.runs import rank, write_json
 from models.student.collator import IGNORED
 from train.student.held_out_answers import HeldOutAnswers
-from train.student.lazy_samples import ByLength, Samples
+from train.student.lazy_samples import LengthSampler, Samples
 from train.student.vision_cache import Features
 
 
@@ -67,7 +67,7 @@ class StudentTrainer(Trainer):
         self,
         *args: Any,
         training_collator: Callable[[list[Any]], dict[str, Any]],
-        order: ByLength,
+        order: LengthSampler,
         choice: TokenChoice | LetterChoice,
         features: Features | None = None,
         answers: HeldOutAnswers | None = None,
@@ -95,7 +95,7 @@ class StudentTrainer(Trainer):
         self.data_collator = others
         return loader
 
-    def _get_train_sampler(self, *_: Any) -> ByLength:
+    def _get_train_sampler(self, *_: Any) -> LengthSampler:
         return self._order
 
     def _shrink(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:

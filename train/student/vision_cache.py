@@ -21,7 +21,7 @@ from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDe
 from conf.errors import UserError
 from conf.runs import ranks_here
 from conf.schema import SftTrainConfig
-from models.memory import available
+from models.memory import available_bytes
 from models.student.collator import MEDIA, Collator
 from models.student.prompts import Sample
 
@@ -85,7 +85,7 @@ class Features:
     def of(cls, model: nn.Module, train: SftTrainConfig) -> Features:
         """For a student, in this rank's part of half of the machine's free memory."""
         base = model.get_base_model() if isinstance(model, peft.PeftModel) else model
-        return cls(base, train.precision, available(torch.device("cpu")) // 2 // ranks_here())
+        return cls(base, train.precision, available_bytes(torch.device("cpu")) // 2 // ranks_here())
 
     def give(self, inputs: dict[str, Any]) -> None:
         """Put a batch's outputs, as `mm_encoder_outputs`, in the place of its pixels."""

@@ -21,7 +21,7 @@ from conf.schema import StudentConfig
 from data.records import LETTERS, Scene, SelectionItem, shown_frames
 from data.render.frame_cache import Frames
 from data.store import Store
-from models.student.prompts import Sample, Sight, answer_line, clip_of, conversation
+from models.student.prompts import Sample, Sight, answer_line, conversation, load_clip
 from teacher.narrator import describe, matches
 from teacher.predicates import (
     REGIONS,
@@ -32,7 +32,7 @@ from teacher.predicates import (
     predicates_of,
     region_of,
 )
-from train.student.lazy_samples import Planned, rng_of
+from train.student.lazy_samples import LazySample, seeded_rng
 
 FRAME = "Describe the frame."
 CANDIDATES = "Describe each candidate."
@@ -69,7 +69,7 @@ NAMED = 4
 
 def kinds(
     store: Store, items: list[SelectionItem], cfg: StudentConfig, frames: Frames, seed: int
-) -> dict[str, list[Planned]]:
+) -> dict[str, list[LazySample]]:
     """Samples of each kind from some items. Which frame is described or is the later, among which
     others, and in which order, is another in each epoch."""
     make = _Maker(store, cfg, frames, seed)
@@ -102,31 +102,31 @@ class _Maker:
     def __init__(self, store: Store, cfg: StudentConfig, frames: Frames, seed: int) -> None:
         self.store, self.cfg, self.frames, self.seed = store, cfg, frames, seed
 
-    def frame(self, item: SelectionItem, k: int) -> Planned:
-        return Planned(
+    def frame(self, item: SelectionItem, k: int) -> LazySample:
+        return LazySample(
             f"{FRAME} {account(self.store.scene(item.scene_id), item.prefix_stop)}",
             1,
             partial(self._frame, item, k),
         )
 
     def _frame(self, item: SelectionItem, k: int, epoch: int) -> Sample:
-        rng = rng_of(self.seed, epoch, item.item_id, "frame", k)
+        rng = seeded_rng(self.seed, epoch, item.item_id, "frame", k)
         scene_id, frame = self._any(item, rng)
         pixels = self.frames.array(scene_id, frame)
         told = account(self.store.scene(scene_id), frame)
         sights = self._sights([(scene_id, frame, "")])
         return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], told, None, sights)
 
-    def candidates(self, item: SelectionItem, others: list[SelectionItem], k: int) -> Planned:
+    def candidates(self, item: SelectionItem, others: list[SelectionItem], k: int) -> LazySample:
         """Four frames: an item's candidates or, the easier to tell apart, of four items."""
         told = account(self.store.scene(item.scene_id), item.prefix_stop)
         text = f"{CANDIDATES} " + "\n".join(f"Candidate {letter}: {told}" for letter in LETTERS)
-        return Planned(text, len(LETTERS), partial(self._candidates, item, others, k))
+        return LazySample(text, len(LETTERS), partial(self._candidates, item, others, k))
 
     def _candidates(
         self, item: SelectionItem, others: list[SelectionItem], k: int, epoch: int
     ) -> Sample:
-        rng = rng_of(self.seed, epoch, item.item_id, "candidates", k)
+        rng = seeded_rng(self.seed, epoch, item.item_id, "candidates", k)
         shown = self._four(item, others, rng)
         told = [
             f"Candidate {letter}: {account(self.store.scene(scene_id), frame)}"
@@ -135,17 +135,17 @@ class _Maker:
         name = f"{item.item_id} (candidates {k})"
         return self._of_four(name, shown, CANDIDATES, told)
 
-    def where(self, item: SelectionItem, others: list[SelectionItem], k: int) -> Planned:
+    def where(self, item: SelectionItem, others: list[SelectionItem], k: int) -> LazySample:
         """An object that one of four frames shows, looked for in all: so does a rationale compare
         candidates."""
         phrase = self.store.scene(item.scene_id).objects[0].phrase
         text = f"{WHERE.format(phrase)} {self._everywhere(phrase)}"
-        return Planned(text, len(LETTERS), partial(self._where, item, others, k))
+        return LazySample(text, len(LETTERS), partial(self._where, item, others, k))
 
     def _where(
         self, item: SelectionItem, others: list[SelectionItem], k: int, epoch: int
     ) -> Sample:
-        rng = rng_of(self.seed, epoch, item.item_id, "where", k)
+        rng = seeded_rng(self.seed, epoch, item.item_id, "where", k)
         shown = self._four(item, others, rng)
         seen = self._seen(shown)
         phrase = self._telling(item, {p for objects in seen for p in objects}, seen, rng)
@@ -202,7 +202,7 @@ class _Maker:
         shown += [(item.scene_id, f) for f in self._prefix(item)]
         return shown[rng.integers(len(shown))]
 
-    def moves(self, item: SelectionItem) -> Iterator[Planned]:
+    def moves(self, item: SelectionItem) -> Iterator[LazySample]:
         """How an object of the clip moves, as often one that rests as another."""
         scene = self.store.scene(item.scene_id)
         facts = facts_of(scene, item.prefix_start, item.prefix_stop, item.target_frame)
@@ -212,23 +212,23 @@ class _Maker:
             text = f"{MOVES.format(seen[0].object)} {longest}"
             for k in range(MOVING):
                 make = partial(self._moves, item, facts.instant, seen, k)
-                yield Planned(text, self.cfg.frames // 2, make)
+                yield LazySample(text, self.cfg.frames // 2, make)
 
     def _moves(
         self, item: SelectionItem, instant: str, seen: list[ObjectFacts], k: int, epoch: int
     ) -> Sample:
-        rng = rng_of(self.seed, epoch, item.item_id, "moves", k)
+        rng = seeded_rng(self.seed, epoch, item.item_id, "moves", k)
         rests = rng.random() < 0.5
         some = [o for o in seen if (o.speed == "stationary") == rests] or seen
         told = some[rng.integers(len(some))]
         return self._after_prefix(item, [MOVES.format(told.object)], _motion(instant, told), [])
 
-    def clip(self, item: SelectionItem) -> Iterator[Planned]:
+    def clip(self, item: SelectionItem) -> Iterator[LazySample]:
         """The clip with the frame that comes of it, to be read off, or without, to be foreseen."""
         if (text := self._told(item)) is not None:
             media = self.cfg.frames // 2 + 1
             for k in range(CLIPS):
-                yield Planned(f"{CLIP} {text}", media, partial(self._clip, item, text, k))
+                yield LazySample(f"{CLIP} {text}", media, partial(self._clip, item, text, k))
 
     def _told(self, item: SelectionItem) -> str | None:
         """The clip and what comes of it in the narrator's words, None where it is too short."""
@@ -236,13 +236,13 @@ class _Maker:
         return describe(scene, item.prefix_start, item.prefix_stop, item.target_frame, self.seed)
 
     def _clip(self, item: SelectionItem, text: str, k: int, epoch: int) -> Sample:
-        shown = rng_of(self.seed, epoch, item.item_id, "clip", k).random() < 0.5
+        shown = seeded_rng(self.seed, epoch, item.item_id, "clip", k).random() < 0.5
         pixels = self.frames.array(item.scene_id, item.target_frame)
         later = ["Later: ", pixels, "\n"] if shown else []
         images = [(item.scene_id, item.target_frame, "")] if shown else []
         return self._after_prefix(item, [*later, CLIP], text, images)
 
-    def compared(self, item: SelectionItem, k: int) -> Iterator[Planned]:
+    def compared(self, item: SelectionItem, k: int) -> Iterator[LazySample]:
         """A clip, what is told of it, and by an object's place whether its item's candidates agree
         with that. As in a rationale, what is foreseen stands before what is to be seen, and must
         not be taken for it; it is not learnt here, or the few words that are seen would weigh next
@@ -252,10 +252,10 @@ class _Maker:
             differs = f", not {REGIONS[0][0]}" * len(LETTERS)
             long = f"{text} {COMPARE.format(phrase)} {self._everywhere(phrase)}{differs}"
             media = self.cfg.frames // 2 + len(LETTERS)
-            yield Planned(long, media, partial(self._compared, item, text, k))
+            yield LazySample(long, media, partial(self._compared, item, text, k))
 
     def _compared(self, item: SelectionItem, text: str, k: int, epoch: int) -> Sample:
-        rng = rng_of(self.seed, epoch, item.item_id, "compared", k)
+        rng = seeded_rng(self.seed, epoch, item.item_id, "compared", k)
         own = [(c.scene_id, c.frame) for c in item.candidates]
         shown = lettered([own[place] for place in rng.permutation(len(own))])
         seen = self._seen(shown)
@@ -268,15 +268,15 @@ class _Maker:
         parts = [*self._labelled(shown), f"\n{text}\n{COMPARE.format(phrase)}"]
         return self._after_prefix(item, parts, told, shown)
 
-    def later(self, item: SelectionItem) -> Iterator[Planned]:
+    def later(self, item: SelectionItem) -> Iterator[LazySample]:
         """Two frames that can be told apart, where something still moves after the prefix."""
         after = moved(self.store.scene(item.scene_id), item.prefix_stop)
         if after:
             text = f"{LATER} {answer_line(LETTERS[0])}"
-            yield Planned(text, self.cfg.frames // 2 + 2, partial(self._later, item, after))
+            yield LazySample(text, self.cfg.frames // 2 + 2, partial(self._later, item, after))
 
     def _later(self, item: SelectionItem, after: list[int], epoch: int) -> Sample:
-        rng = rng_of(self.seed, epoch, item.item_id, "later")
+        rng = seeded_rng(self.seed, epoch, item.item_id, "later")
         first, second = item.prefix_stop, after[rng.integers(len(after))]
         order = rng.permutation(2)
         right = LETTERS[order.tolist().index(1)]
@@ -284,7 +284,7 @@ class _Maker:
         parts = [*self._labelled(shown), f"\n{LATER}"]
         return self._after_prefix(item, parts, answer_line(right), shown)
 
-    def matched(self, item: SelectionItem) -> Iterator[Planned]:
+    def matched(self, item: SelectionItem) -> Iterator[LazySample]:
         """A description that one candidate alone fits, where there is such."""
         predicates = predicates_of(item, self.store.scene(item.scene_id), self.store.scene)
         plain = predicates and _plain(predicates)
@@ -297,7 +297,7 @@ class _Maker:
         asked = MATCH.format(what)
         answer = "\n".join([*matches(plain, item), answer_line(item.letter)])
         make = partial(self._match, item, asked, answer)
-        yield Planned(f"{asked} {answer}", len(LETTERS), make)
+        yield LazySample(f"{asked} {answer}", len(LETTERS), make)
 
     def _match(self, item: SelectionItem, asked: str, answer: str, epoch: int) -> Sample:
         shown = lettered([(c.scene_id, c.frame) for c in item.candidates])
@@ -307,7 +307,7 @@ class _Maker:
         self, item: SelectionItem, parts: list[str | np.ndarray], told: str, images: list[Picture]
     ) -> Sample:
         shown = self._prefix(item)
-        clip = clip_of(item.scene_id, shown, self.frames)
+        clip = load_clip(item.scene_id, shown, self.frames)
         scene = self.store.scene(item.scene_id)
         # A visual token of a clip shows two frames; its object is where the first has it.
         pairs = [(f, shown[min(k + 1, len(shown) - 1)]) for k, f in enumerate(shown)][::2]

@@ -29,7 +29,7 @@ from evaluation import report, retrieve, select
 from evaluation.generators.response_log import AnswerLog
 from models import loading
 from models.retriever import embedder
-from models.trained_runs import check_unseen, measured, settings_of
+from models.trained_runs import check_unseen, resolve_model, trained_settings
 from train.student import dataset
 
 SMALL = ArchitectureConfig(
@@ -53,7 +53,7 @@ def runs(tmp_path_factory, micro, micro_store) -> Path:
     model, processor = loading.load_student(
         student, "bf16", lambda: dataset.corpus(micro_store, [])
     )
-    loading.save(model, processor, folder / "student", "bf16")
+    loading.save_student(model, processor, folder / "student", "bf16")
     OmegaConf.save(OmegaConf.structured(sft), folder / "config.yaml")
     (folder / "metrics.json").write_text('{"answer_loss": 1.0, "answer_loss_at_start": 2.0}')
     (folder / "run.json").write_text(RECORD)
@@ -131,7 +131,7 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
     # A base is asked for the record; drawn answers are the same after a kill.
     drawn = replace(
         asked, model=None, modes=["record"], batch=3, seed=5,
-        student=replace(settings_of(runs / "sft" / "run", SftCommand, "student").student,
+        student=replace(trained_settings(runs / "sft" / "run", SftCommand, "student").student,
                         model=str(runs / "sft" / "run" / "student"), architecture=None,
                         temperature=1.0, top_k=50),
     )  # fmt: skip
@@ -176,7 +176,7 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
 
 def test_a_model_that_is_no_run_is_named(tmp_path) -> None:
     with pytest.raises(UserError, match="is no run folder of a trained student"):
-        settings_of(tmp_path / "nowhere", SftCommand, "student")
+        trained_settings(tmp_path / "nowhere", SftCommand, "student")
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,7 @@ def test_a_run_that_cannot_be_measured_is_told(runs, tmp_path, damage, said) -> 
     shutil.copytree(runs / "sft" / "run", tmp_path / "run")
     damage(tmp_path / "run")
     with pytest.raises(UserError, match=said):
-        settings_of(tmp_path / "run", SftCommand, "student")
+        trained_settings(tmp_path / "run", SftCommand, "student")
 
 
 def test_a_model_is_not_tested_on_scenes_that_it_may_have_seen(runs, micro) -> None:
@@ -201,9 +201,9 @@ def test_a_model_is_not_tested_on_scenes_that_it_may_have_seen(runs, micro) -> N
     unseen = {"seed": 1, "test_share": 0.9}
     for same in ({}, unseen, {"scenes": 99}, {"test_share": 0.01}):
         benchmark = replace(micro, **same)
-        assert measured(cfg, benchmark, SftCommand, "student")[0] == runs / "sft" / "run"
+        assert resolve_model(cfg, benchmark, SftCommand, "student")[0] == runs / "sft" / "run"
     with pytest.raises(UserError, match=r"may have seen scenes that .*test_share=0\.9 tests"):
-        measured(cfg, replace(micro, test_share=0.9), SftCommand, "student")
+        resolve_model(cfg, replace(micro, test_share=0.9), SftCommand, "student")
     # Another seed splits the same release anew.
     release = replace(micro, simulator="clevrer", folder="/release")
     check_unseen("model", release, replace(release, folder="/other", seed=1))
@@ -217,19 +217,23 @@ def test_what_a_run_is_asked_otherwise_is_taken_or_refused(runs, micro) -> None:
         model=str(model), student=StudentConfig(name="x", temperature=0.7, frames=2)
     )
     typed = ("modes=[answer]", "student.temperature=0.7")
-    _, settings = measured(cfg, micro, SftCommand, "student", typed)
+    _, settings = resolve_model(cfg, micro, SftCommand, "student", typed)
     assert settings.student.temperature == 0.7
     # What was not typed is the preset's, and not the run's.
-    assert settings.student.frames == settings_of(model, SftCommand, "student").student.frames != 2
+    assert (
+        settings.student.frames
+        == trained_settings(model, SftCommand, "student").student.frames
+        != 2
+    )
     for refused in ("student=qwen3_vl_8b", "student.lora.rank=8", "++train.regime=cot"):
         with pytest.raises(UserError, match=r"does nothing beside model=.*student\.temperature"):
-            measured(cfg, micro, SftCommand, "student", (*typed, refused))
+            resolve_model(cfg, micro, SftCommand, "student", (*typed, refused))
     matcher = MatcherConfig(model=str(runs / "contrastive" / "run"))
     given = (matcher, micro, ContrastiveCommand, "retriever")
-    measured(*given, ("student.frames=2", "matcher.model=RUN"), "matcher.model")
+    resolve_model(*given, ("student.frames=2", "matcher.model=RUN"), "matcher.model")
     for refused in ("matcher=clip", "matcher.retriever.image_size=64"):
         with pytest.raises(UserError, match=r"does nothing beside matcher\.model=.*matcher\.train"):
-            measured(*given, (refused,), "matcher.model")
+            resolve_model(*given, (refused,), "matcher.model")
 
 
 def test_a_torn_model_is_named(runs, tmp_path) -> None:

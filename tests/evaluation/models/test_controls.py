@@ -17,7 +17,7 @@ from evaluation import select
 from evaluation.generators.response_log import judge
 from evaluation.reporting.rows import SelectionRow
 from evaluation.reporting.selection_results import write_report
-from models.student.generation import Written
+from models.student.generation import GeneratedText
 
 STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
 
@@ -104,7 +104,9 @@ def test_the_questions_of_a_pair_are_held_against_each_other(benchmark_store, tm
     items = benchmark_store.selection(suite=MATCHED)
     said = {"event": "Answer: A", "time": "Answer: B"}
     given = {
-        ("answer", control): [judge(i, "answer", Written(said[i.family], False)) for i in items]
+        ("answer", control): [
+            judge(i, "answer", GeneratedText(said[i.family], False)) for i in items
+        ]
         for control in (None, "candidate_only")
     }
     cfg = SelectCommand(

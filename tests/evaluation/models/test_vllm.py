@@ -43,7 +43,7 @@ def base(tmp_path_factory, micro_store):
     folder = tmp_path_factory.mktemp("base")
     model, processor = loading.load_base(STUDENT, "fp32", lambda: dataset.corpus(micro_store, []))
     processor.image_processor.image_mean = [0.4, 0.45, 0.5]
-    loading.save(model, processor, folder, "fp32")
+    loading.save_student(model, processor, folder, "fp32")
     return folder
 
 
@@ -63,7 +63,7 @@ def adapters(cfg, tmp_path_factory):
         for name, weight in model.named_parameters():
             if "lora_B" in name:
                 weight.normal_(std=0.2)
-    loading.save(model, processor, folder, "fp32")
+    loading.save_student(model, processor, folder, "fp32")
     return folder
 
 
@@ -72,7 +72,7 @@ def merged(cfg, adapters, tmp_path_factory):
     """The same student merged into its base, as `train.export` writes it."""
     folder = tmp_path_factory.mktemp("merged")
     model, processor = loading.load_base(cfg, "fp32", list)
-    loading.write(loading.merged(model, adapters, "none", "fp32"), processor, folder)
+    loading.write_model(loading.merge_adapters(model, adapters, "none", "fp32"), processor, folder)
     return folder
 
 

@@ -32,7 +32,7 @@ from models.student.prompts import conversation
 from train import sft
 from train.common.journal import Bar, read_journal, read_lines
 from train.student.held_out_answers import HeldOutAnswers
-from train.student.lazy_samples import Planned, Samples
+from train.student.lazy_samples import LazySample, Samples
 
 
 @pytest.fixture(scope="module")
@@ -167,8 +167,8 @@ class Writer(nn.Module):
 
 
 def held_out(responses: list[str]) -> Samples:
-    def planned(k: int, response: str) -> Planned:
-        return Planned(response, 0, lambda _: conversation(f"item-{k}", ["Which?"], response))
+    def planned(k: int, response: str) -> LazySample:
+        return LazySample(response, 0, lambda _: conversation(f"item-{k}", ["Which?"], response))
 
     return Samples([planned(k, response) for k, response in enumerate(responses)])
 

@@ -106,9 +106,9 @@ def test_bytes_are_those_of_the_step() -> None:
     """A step that holds 256 MiB takes those, whatever was held and freed before."""
     spent = torch.ones(64 << 20)
     del spent
-    held = memory.start_peak(torch.device("cpu"))
+    held = memory.reset_peak(torch.device("cpu"))
     torch.ones(64 << 20).sum()
-    found = memory.peak(torch.device("cpu")) - held
+    found = memory.peak_bytes(torch.device("cpu")) - held
     assert 0.95 * (256 << 20) < found < 1.2 * (256 << 20)
 
 
@@ -118,9 +118,9 @@ def test_a_containers_limit_holds(tmp_path, monkeypatch) -> None:
         (tmp_path / f"memory.{name}").write_text(f"{text}\n")
     names = ("memory.max", "memory.current", "inactive_file")
     monkeypatch.setattr(memory, "CGROUPS", ((str(tmp_path), *names),))
-    assert memory.available(device) == 600_000
+    assert memory.available_bytes(device) == 600_000
     (tmp_path / "memory.max").write_text("max\n")
-    assert memory.available(device) > 1_000_000
+    assert memory.available_bytes(device) > 1_000_000
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ from train.common import journal
 from train.common.checkpoints import cut_off
 from train.common.journal import read_journal
 from train.student import dataset
-from train.student.lazy_samples import ByLength, Planned, Samples
+from train.student.lazy_samples import LazySample, LengthSampler, Samples
 from train.student.trainer import token_losses, token_mean
 
 ROOT = Path(__file__).parents[3]
@@ -247,8 +247,8 @@ def test_fsdp_that_would_be_passed_over_is_refused(settings, tmp_path, monkeypat
 def test_ranks_share_the_steps_of_one(count, micro_batch, number) -> None:
     """As accelerate deals out an order: micro-batches in turn."""
     lengths = np.random.default_rng(0).integers(1, 1000, count).tolist()
-    alone = list(ByLength(lengths, 8, 0))
-    order = ByLength(lengths, 8, 0, micro_batch, number)
+    alone = list(LengthSampler(lengths, 8, 0))
+    order = LengthSampler(lengths, 8, 0, micro_batch, number)
     batches = BatchSampler(order, micro_batch, drop_last=False)
     dealt = [list(BatchSamplerShard(batches, number, rank)) for rank in range(number)]
     assert len(order) == len(list(order)) == sum(len(b) for part in dealt for b in part)
@@ -266,7 +266,7 @@ def test_ranks_share_the_steps_of_one(count, micro_batch, number) -> None:
 def test_ranks_have_as_much_to_do() -> None:
     """None gets the longer of each two neighbours."""
     lengths = np.random.default_rng(0).integers(1, 1000, 64)
-    order = np.array(list(ByLength(lengths.tolist(), 64, 0, 1, 2))).reshape(-1, 2)
+    order = np.array(list(LengthSampler(lengths.tolist(), 64, 0, 1, 2))).reshape(-1, 2)
     loads = lengths[order].sum(axis=0)
     assert abs(loads[0] - loads[1]) <= lengths.max() - lengths.min()
     assert (lengths[order[::2, 0]] >= lengths[order[::2, 1]]).all()
@@ -277,7 +277,7 @@ def test_a_filler_changes_no_loss(micro_store, frames, student_cfg, processor, m
     items = micro_store.selection("train")[:2]
     made = Samples(
         [
-            Planned("", 0, partial(shown, item, frames, student_cfg, text))
+            LazySample("", 0, partial(shown, item, frames, student_cfg, text))
             for item, text in zip(items, ("Answer: A", "near the top\nAnswer: B"), strict=True)
         ]
     )
@@ -304,10 +304,10 @@ def shown(item, frames, cfg, text, epoch):
 
 
 def test_a_step_is_split_over_micro_batches_and_ranks(monkeypatch) -> None:
-    assert distributed.accumulation(16, 2) == 8
+    assert distributed.accumulation_steps(16, 2) == 8
     monkeypatch.setenv("LOCAL_RANK", "1")
     monkeypatch.setenv("RANK", "1")
     monkeypatch.setenv("WORLD_SIZE", "4")
-    assert distributed.accumulation(16, 2) == 2
+    assert distributed.accumulation_steps(16, 2) == 2
     with pytest.raises(UserError, match=r"batch=16 .* 4 ranks .*micro_batch=8: set .* of 32"):
-        distributed.accumulation(16, 8)
+        distributed.accumulation_steps(16, 8)

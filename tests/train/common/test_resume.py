@@ -16,13 +16,13 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import LateConfig, LoraConfig, RetrieverConfig, SftCommand, StudentConfig
-from models.checks import based, check_base, image_named, named, note_base, pinned
+from models.checks import based, check_base, image_model_id, model_id, note_base, pin_revisions
 from train import contrastive, sft
 from train.common.checkpoints import newest_checkpoint
 from train.common.journal import read_journal
 from train.common.training_loop import Epochs
 from train.student import dataset
-from train.student.lazy_samples import ByLength, Planned, Samples
+from train.student.lazy_samples import LazySample, LengthSampler, Samples
 
 DRAWING = LoraConfig(rank=4, dropout=0.1)
 """Adapters that draw numbers in each pass, as a run that goes on must too."""
@@ -123,8 +123,8 @@ def test_a_student_goes_on_within_a_later_epoch(
 def test_each_epoch_reaches_the_samples_and_their_order() -> None:
     """As the trainer tells it: at an epoch's start, and within one that is gone on with."""
     shown: list[int] = []
-    training = Samples([Planned("", 0, shown.append)])
-    order = ByLength(range(100), 4, seed=0)
+    training = Samples([LazySample("", 0, shown.append)])
+    order = LengthSampler(range(100), 4, seed=0)
     orders = []
     for told, epoch in ((None, 0), (1.0, 1), (1.4, 1), (2.0, 2)):
         Epochs(training, order).on_epoch_begin(None, TrainerState(epoch=told), TrainerControl())
@@ -191,17 +191,17 @@ def test_a_run_holds_to_the_commit_of_a_hubs_base(tmp_path, monkeypatch) -> None
     (cached / "refs").mkdir()
     (cached / "refs" / "main").write_text(commits[0])
     cfg = RetrieverConfig(name="own", model="lab/base")
-    first = pinned(based(tmp_path, cfg))
-    assert (first.revision, named(first)) == (commits[0], f"lab/base@{commits[0]}")
+    first = pin_revisions(based(tmp_path, cfg))
+    assert (first.revision, model_id(first)) == (commits[0], f"lab/base@{commits[0]}")
     note_base(tmp_path, first)
     (cached / "refs" / "main").write_text(commits[1])
-    assert pinned(cfg).revision == commits[1]
-    assert pinned(based(tmp_path, cfg)) == first
+    assert pin_revisions(cfg).revision == commits[1]
+    assert pin_revisions(based(tmp_path, cfg)) == first
     # A preset's own revision is one by which it is known.
-    assert pinned(replace(cfg, revision=commits[0])) == first
+    assert pin_revisions(replace(cfg, revision=commits[0])) == first
     # What embeds frames alone has a commit of its own.
-    two = pinned(replace(cfg, image_model="lab/base", image_revision=commits[0]))
-    assert (named(two), image_named(two)) == tuple(f"lab/base@{c}" for c in reversed(commits))
+    two = pin_revisions(replace(cfg, image_model="lab/base", image_revision=commits[0]))
+    assert (model_id(two), image_model_id(two)) == tuple(f"lab/base@{c}" for c in reversed(commits))
     # Another model of the settings is another base.
     other = replace(cfg, model="lab/other")
     assert based(tmp_path, other) == other
@@ -217,7 +217,7 @@ def test_a_base_that_is_away_for_a_while_leaves_its_note(saved_base, tmp_path, m
     noted = (tmp_path / "base.json").read_text()
     base.rename(tmp_path / "away")
     # What loads it tells that it is gone.
-    note_base(tmp_path, pinned(based(tmp_path, cfg)))
+    note_base(tmp_path, pin_revisions(based(tmp_path, cfg)))
     assert (tmp_path / "base.json").read_text() == noted
     (tmp_path / "away").rename(base)
     check_base(tmp_path, cfg)

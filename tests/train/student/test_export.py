@@ -33,7 +33,7 @@ from evaluation import select
 from models import checks, loading
 from models.student.collator import encode
 from models.student.prompts import selection_sample
-from models.trained_runs import run_title, settings_of
+from models.trained_runs import run_title, trained_settings
 from train import export
 from train.student import merge
 
@@ -62,7 +62,7 @@ def finished_run(settings: SftCommand, root: Path) -> Path:
         for name, weight in model.named_parameters():
             if "lora_B" in name:
                 weight.normal_(std=0.05)
-    loading.save(model, processor, folder / "student", settings.train.precision)
+    loading.save_student(model, processor, folder / "student", settings.train.precision)
     (folder / "metrics.json").write_text(json.dumps(METRICS))
     return root
 
@@ -245,7 +245,7 @@ def test_a_disk_that_takes_no_more_is_told(model, processor, tmp_path) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
         with pytest.raises(UserError, match=r"cannot be written to .* \(os error 27\)"):
-            loading.write(model, processor, tmp_path / "student")
+            loading.write_model(model, processor, tmp_path / "student")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
@@ -322,14 +322,14 @@ def test_a_torn_export_is_told(settings, forms, tmp_path) -> None:
     shutil.copytree(forms["bf16"][1], tmp_path / "export")
     weights = tmp_path / "export" / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:5000])
-    trained = settings_of(tmp_path / "export", SftCommand, "student")
+    trained = trained_settings(tmp_path / "export", SftCommand, "student")
     assert asdict(trained) == asdict(settings)
     with pytest.raises(UserError, match=r"is damaged .* export again"):
         loading.load_trained(trained.student, "fp32", tmp_path / "export")
     (tmp_path / "config.yaml").write_text("format: bf16")
     (tmp_path / "export").rename(tmp_path / "student")
     with pytest.raises(UserError, match=r"holds an export: give model=.*/student"):
-        settings_of(tmp_path, SftCommand, "student")
+        trained_settings(tmp_path, SftCommand, "student")
     (tmp_path / "student" / "export.json").write_text("{")
     with pytest.raises(UserError, match="is missing or damaged"):
         run_title(tmp_path / "student")

@@ -13,7 +13,7 @@ from conf.errors import UserError
 from data.records import FPS, SelectionItem, shown_frames
 from models.student.collator import IGNORED, Collator, encode, letter_ids, pad
 from models.student.prompts import Sample, selection_sample
-from train.student.lazy_samples import ByLength, Planned, Samples
+from train.student.lazy_samples import LazySample, LengthSampler, Samples
 from train.student.trainer import LetterChoice, TokenChoice, token_mean
 
 
@@ -109,7 +109,7 @@ def test_lengths_rank_samples_without_making_them(
 
     items = micro_store.selection("train")[:4]
     texts = ["near the top " * words + "\nAnswer: A" for words in (3, 9, 27, 1)]
-    made = Samples([Planned(text, 10, refuse) for text in texts])
+    made = Samples([LazySample(text, 10, refuse) for text in texts])
     guessed = made.lengths(processor.tokenizer, 96)
     real = [
         len(encode(selection_sample(i, "answer", "cot", frames, student_cfg, t), processor, 1500)
@@ -139,7 +139,7 @@ def test_the_letters_logits_choose_the_answer(
     assert right.tolist() == [i.answer for i in items]
     assert (chosen == right).tolist() == [False] + [True] * 5
     measured = Samples(
-        [Planned("", 0, lambda epoch: None, f) for f in ("event",) * 4 + ("time",) * 2]
+        [LazySample("", 0, lambda epoch: None, f) for f in ("event",) * 4 + ("time",) * 2]
     )
     told = LetterChoice.measure(
         EvalPrediction(torch.stack([chosen, right], dim=1).numpy(), None), measured
@@ -171,7 +171,7 @@ def test_controls_reach_the_prompt(micro_store, frames, student_cfg, processor) 
 @pytest.mark.parametrize("count", [1, 7, 64, 1000])
 def test_an_order_is_of_its_epoch_and_sorts_each_step(count) -> None:
     lengths = np.random.default_rng(0).integers(1, 1000, count)
-    order = ByLength(lengths.tolist(), 16, seed=0)
+    order = LengthSampler(lengths.tolist(), 16, seed=0)
     first = list(order)
     assert sorted(first) == list(range(count))
     assert first == list(order)
@@ -182,7 +182,7 @@ def test_an_order_is_of_its_epoch_and_sorts_each_step(count) -> None:
     assert sorted(second) == list(range(count))
     # One step alone is sorted into one order.
     assert first != second or count <= 16
-    assert second != list(ByLength(lengths.tolist(), 16, seed=1)) or count <= 16
+    assert second != list(LengthSampler(lengths.tolist(), 16, seed=1)) or count <= 16
 
 
 def test_the_right_tokens_are_counted() -> None:

@@ -11,12 +11,12 @@ from data.records import LETTERS
 from data.render.frame_cache import Frames
 from data.store import Store
 from teacher.predicates import cut_of, region_of
-from train.student.lazy_samples import Planned
+from train.student.lazy_samples import LazySample
 from train.tiny_base import questions
 
 
 @pytest.fixture
-def kinds(micro_store, frames, student_cfg) -> dict[str, list[Planned]]:
+def kinds(micro_store, frames, student_cfg) -> dict[str, list[LazySample]]:
     return questions.kinds(micro_store, micro_store.selection("train"), student_cfg, frames, 0)
 
 
@@ -40,7 +40,7 @@ def all_shown(store: Store, frames: Frames) -> dict[bytes, list[dict[str, str]]]
     return every
 
 
-def asked_and_answered(planned: Planned, epoch: int = 0) -> tuple[str, str]:
+def asked_and_answered(planned: LazySample, epoch: int = 0) -> tuple[str, str]:
     sample = planned.make(epoch)
     return sample.content[-1]["text"], sample.response
 
