@@ -15,7 +15,6 @@ import argparse
 import json
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from pathlib import Path
 from threading import Lock
 
@@ -70,11 +69,8 @@ def main() -> None:
     if not args.table:
         run(["data.build", f"benchmark={args.benchmark}", f"store={args.store}"])
         # Seed by seed: a comparison over fewer seeds is complete early.
-        jobs = [
-            ("zero-shot", 0),
-            *product(range(args.seeds), [m for m in MODES if m != "zero-shot"]),
-        ]
-        jobs = [job if job[0] == "zero-shot" else job[::-1] for job in jobs]
+        trained = [regime for regime in MODES if regime != "zero-shot"]
+        jobs = [("zero-shot", 0), *((r, seed) for seed in range(args.seeds) for r in trained)]
         run_all(partial(train_and_evaluate, experiment), experiment.missing(jobs), args.jobs)
     print_tables(experiment.recorded(args.seeds))
 

@@ -1,4 +1,4 @@
-"""Text that would make a careless number finder slow: repeated openings, disguises and near-words."""
+"""Hostile text that would make a careless number finder slow."""
 
 from __future__ import annotations
 
