@@ -38,7 +38,7 @@ from models import memory, parameter_counts
 from models.attention import choose_attention
 from models.retriever import embedder
 from train.retriever import mini_batches
-from train.retriever.inputs import Inputs
+from train.retriever.inputs import RetrieverInputs
 from train.retriever.loss import RankingLoss
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -83,7 +83,7 @@ def measure(name: str, base: str, batch: int, steps: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         model = built(name, cfg, queries, Path(folder))
         # As the trainer settles it, for all lines alike.
-        inputs = Inputs(model, noise, cfg.retriever, cfg.train.precision)
+        inputs = RetrieverInputs(model, noise, cfg.retriever, cfg.train.precision)
         cfg.train = mini_batches.settle(
             cfg.train, Path(folder), model, inputs, RankingLoss, queries
         )
@@ -138,10 +138,12 @@ def built(name: str, cfg: ContrastiveCommand, queries: list[RetrievalQuery], fol
     preset = cfg.retriever
     small = replace(preset, model=None, architecture=ArchitectureConfig(), quantization="none")
     small = replace(small, lora=replace(small.lora, rank=0))
-    model = embedder.load_retriever(small, "bf16", embedder.corpus(queries, preset), folder)
+    model = embedder.load_retriever(
+        small, "bf16", embedder.tokenizer_texts(queries, preset), folder
+    )
     device = model.device
     model[0].model = random_model(name, preset.quantization, device).model
-    embedder.prepare(model, preset, "bf16")
+    embedder.prepare_for_training(model, preset, "bf16")
     return model.to(device)
 
 

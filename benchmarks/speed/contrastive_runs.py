@@ -30,11 +30,17 @@ from models import memory
 from models.lora_kernels import fuse, unfuse
 from models.precision import resolve_precision
 from models.retriever import embedder
-from train.retriever.batches import Batch, Composed, batch_of
-from train.retriever.inputs import Inputs
+from train.retriever.batches import Batch, QueryBatchSampler, batch_of
+from train.retriever.inputs import RetrieverInputs
 from train.retriever.loss import RankingLoss
 from train.retriever.mining import HardNegatives
-from train.retriever.run import ByName, RetrieverTrainer, arguments, loss_of, named
+from train.retriever.run import (
+    IndexCollator,
+    RetrieverTrainer,
+    build_loss,
+    named,
+    training_arguments,
+)
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,7 @@ def train(
     if one_clip:
         queries = after_one_clip(queries)
     model = embedder.load_retriever(
-        cfg.retriever, cfg.train.precision, embedder.corpus(queries, cfg.retriever), folder
+        cfg.retriever, cfg.train.precision, embedder.tokenizer_texts(queries, cfg.retriever), folder
     )
     if not helped:
         model[0].model.set_attn_implementation("sdpa")
@@ -96,7 +102,7 @@ def trained(
     or what gives
     pixels like them; `store` is asked for a scene's oracle where the objective needs it."""
     cfg = replace(cfg, train=replace(cfg.train, max_steps=steps))
-    order = Composed(
+    order = QueryBatchSampler(
         queries,
         cfg.train.hard_negatives,
         cfg.train.batch,
@@ -123,14 +129,14 @@ NEVER = {"eval_strategy": "no", "eval_on_start": False, "save_strategy": "no"}
 def ours(cfg, model, queries, frames, store, folder, order) -> Trainer:
     """The trainer as `train.contrastive` makes it, without evaluations and checkpoints."""
     fuse(model)
-    inputs = Inputs(model, frames, cfg.retriever, cfg.train.precision)
+    inputs = RetrieverInputs(model, frames, cfg.retriever, cfg.train.precision)
     negatives = HardNegatives(queries, cfg.train, model, inputs, RankingLoss, store, folder)
     return RetrieverTrainer(
         model=model,
         args=settings(cfg, folder),
         train_dataset=Dataset.from_list([{"query": k} for k in range(len(queries))]),
-        loss=loss_of(cfg, model, inputs, store),
-        data_collator=ByName(preprocess_fn=model.preprocess),
+        loss=build_loss(cfg, model, inputs, store),
+        data_collator=IndexCollator(preprocess_fn=model.preprocess),
         batch_of=lambda places: named(cfg.train, queries, negatives, places),
         sampler=order,
     )
@@ -163,7 +169,7 @@ def plains(cfg, model, queries, frames, store, folder, order) -> Trainer:
 
 
 def settings(cfg: ContrastiveCommand, folder: Path) -> Any:
-    made = arguments(cfg, Run("benchmark", folder), None, cfg.train.batch)
+    made = training_arguments(cfg, Run("benchmark", folder), None, cfg.train.batch)
     for name, value in {**NEVER, "disable_tqdm": True}.items():
         setattr(made, name, value)
     return made
@@ -172,11 +178,11 @@ def settings(cfg: ContrastiveCommand, folder: Path) -> Any:
 class PlainTrainer(SentenceTransformerTrainer):
     """The library's trainer on batches of ours."""
 
-    def __init__(self, *args: Any, sampler: Composed, **settings: Any) -> None:
+    def __init__(self, *args: Any, sampler: QueryBatchSampler, **settings: Any) -> None:
         self._sampler = sampler
         super().__init__(*args, **settings)
 
-    def get_batch_sampler(self, *_: Any, **__: Any) -> Composed:
+    def get_batch_sampler(self, *_: Any, **__: Any) -> QueryBatchSampler:
         return self._sampler
 
 

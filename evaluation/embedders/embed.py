@@ -125,9 +125,11 @@ def built_base(
     built here."""
     if folder is not None and (folder / "untrained").is_dir():
         return folder / "untrained"
-    from models.retriever.embedder import corpus, load_retriever
+    from models.retriever.embedder import load_retriever, tokenizer_texts
 
-    load_retriever(preset, precision, corpus(store.retrieval("train"), preset), run / "untrained")
+    load_retriever(
+        preset, precision, tokenizer_texts(store.retrieval("train"), preset), run / "untrained"
+    )
     return run / "untrained"
 
 

@@ -45,7 +45,7 @@ from models.loading import (
     no_targets_error,
     pin_sizes,
 )
-from models.retriever.multi_vector import keep_late_exact, late_modules, load_late
+from models.retriever.multi_vector import keep_head_fp32, load_multi_vector, multi_vector_modules
 from models.student.prompts import load_clip
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
@@ -64,7 +64,7 @@ PROCESSING = {
 
 
 def load_retriever(
-    cfg: RetrieverConfig, precision: str, corpus: list[str], folder: Path
+    cfg: RetrieverConfig, precision: str, tokenizer_texts: list[str], folder: Path
 ) -> Retriever:
     """A retriever ready to train. One that is built from a seed is written to `folder` first, so
     that it is loaded as any other.
@@ -76,7 +76,7 @@ def load_retriever(
     """
     source = cfg.model
     if cfg.architecture is not None:
-        source = from_main(partial(built, cfg, corpus, folder))
+        source = from_main(partial(build_base, cfg, tokenizer_texts, folder))
     check_reachable("retriever", source)
     if is_retriever(source, cfg.revision):
         check_modules(source, cfg.revision)
@@ -103,18 +103,18 @@ def load_retriever(
         "device": "cuda" if torch.cuda.is_available() else "cpu",
     }
     if cfg.late is not None:
-        model = MultiVectorEncoder(modules=late_modules(backbone, cfg.late), **whole)
-        keep_late_exact(model)
+        model = MultiVectorEncoder(modules=multi_vector_modules(backbone, cfg.late), **whole)
+        keep_head_fp32(model)
     else:
         pooling = Pooling(backbone.get_embedding_dimension(), pooling_mode="lasttoken")
         model = SentenceTransformer(modules=[backbone, pooling, Normalize()], **whole)
     # Rows name queries by number: there is no text of theirs that a model card could show.
     model.model_card_data.generate_widget_examples = False
-    prepare(model, cfg, precision)
+    prepare_for_training(model, cfg, precision)
     return model
 
 
-def prepare(model: Retriever, cfg: RetrieverConfig, precision: str) -> None:
+def prepare_for_training(model: Retriever, cfg: RetrieverConfig, precision: str) -> None:
     """Make a loaded retriever ready to train: its attention, and adapters where it has some."""
     # Prefixes are shared by masks.
     choose_attention(model[0].model, precision, cfg.max_length, masks=True)
@@ -145,7 +145,7 @@ def add_adapters(model: Retriever, lora: LoraConfig) -> None:
             weight.data = weight.data.float()
 
 
-def take_adapters(model: Retriever, folder: Path) -> None:
+def load_adapters(model: Retriever, folder: Path) -> None:
     """Give a retriever the adapters, and the weights of its modules after the backbone, that were
     saved of it in a folder."""
     import peft
@@ -161,10 +161,10 @@ def take_adapters(model: Retriever, folder: Path) -> None:
             model[part["idx"]].load_state_dict(load_file(weights))
 
 
-def built(cfg: RetrieverConfig, corpus: list[str], folder: Path) -> str:
+def build_base(cfg: RetrieverConfig, tokenizer_texts: list[str], folder: Path) -> str:
     """The folder of a base that is built from a seed and written there."""
     assert cfg.architecture is not None
-    processor = build_processor(corpus, cfg.architecture.vocabulary, cfg.image_size)
+    processor = build_processor(tokenizer_texts, cfg.architecture.vocabulary, cfg.image_size)
     build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
     processor.save_pretrained(folder)
     return str(folder)
@@ -186,8 +186,8 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
     }
     try:
         if cfg.late is not None:
-            model = load_late(folder, **options)
-            keep_late_exact(model)
+            model = load_multi_vector(folder, **options)
+            keep_head_fp32(model)
         else:
             model = SentenceTransformer(str(folder), **options)
     except UNREADABLE as error:
@@ -206,7 +206,7 @@ def load_merged(folder: Path, cfg: RetrieverConfig) -> Retriever:
     options = {"model_kwargs": {"dtype": "auto", "use_safetensors": True}, "local_files_only": True}
     try:
         if cfg.late is not None:
-            return load_late(folder, **options)
+            return load_multi_vector(folder, **options)
         return SentenceTransformer(str(folder), **options)
     except UNREADABLE as error:
         raise damaged_error(folder, error, "delete it and export again") from error
@@ -223,7 +223,7 @@ def weight_options(cfg: RetrieverConfig, precision: str) -> dict[str, Any]:
     return options
 
 
-def corpus(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list[str]:
+def tokenizer_texts(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list[str]:
     """Texts for a tokenizer built from nothing: questions, instructions and timestamps."""
     texts = sorted({q.question for q in queries})
     clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]

@@ -26,7 +26,7 @@ ScoredTokens.__module__ = "scored_tokens"
 SAVED_AS = {"scored_tokens.ScoredTokens": ScoredTokens}
 
 
-def late_modules(backbone: Transformer, late: LateConfig) -> list[Module]:
+def multi_vector_modules(backbone: Transformer, late: LateConfig) -> list[Module]:
     """What makes vectors of the backbone's states. The projection is always drawn alike."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
@@ -49,26 +49,26 @@ def late_modules(backbone: Transformer, late: LateConfig) -> list[Module]:
     return modules
 
 
-def load_late(folder: Path, **options: Any) -> MultiVectorEncoder:
+def load_multi_vector(folder: Path, **options: Any) -> MultiVectorEncoder:
     """A saved multi-vector retriever. Its token mask is this project's, as in the library's own
     checkpoints: no code that stands in `folder` runs."""
     return MultiVectorEncoder._load_with_module_classes(str(folder), SAVED_AS, **options)
 
 
-def keep_late_exact(model: MultiVectorEncoder) -> None:
+def keep_head_fp32(model: MultiVectorEncoder) -> None:
     """Keep what follows a base of lower precision in fp32: the projection, as adapters are, since
     updates of its size vanish in bf16's steps; and the distances by which tokens are pooled, which
     the library cannot read where autocast on a CPU makes them bf16."""
-    model[1].float().register_forward_pre_hook(widen)
+    model[1].float().register_forward_pre_hook(cast_to_fp32)
     for module in model:
         if isinstance(module, HierarchicalTokenPooling):
             module.pool_one = torch.autocast("cpu", enabled=False)(module.pool_one)
 
 
-def widen(_: nn.Module, given: tuple[dict[str, Any]]) -> None:
+def cast_to_fp32(_: nn.Module, given: tuple[dict[str, Any]]) -> None:
     (features,) = given
     features["token_embeddings"] = features["token_embeddings"].float()
 
 
-def scored_tokens(model: MultiVectorEncoder) -> ScoredTokens:
+def find_scored_tokens(model: MultiVectorEncoder) -> ScoredTokens:
     return next(module for module in model if isinstance(module, ScoredTokens))

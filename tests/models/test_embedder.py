@@ -18,11 +18,16 @@ from models.parameter_counts import count_towers
 from models.retriever import embedder
 from models.retriever.embedder import frame_input, query_input
 from train.common.audit import audit_retriever
-from train.retriever.evaluator import STEP, HeldOutRanking, LateHeldOutRanking, slice_database
+from train.retriever.evaluator import (
+    STEP,
+    HeldOutEvaluator,
+    MultiVectorHeldOutEvaluator,
+    slice_database,
+)
 
 
 def load(micro_store, cfg, folder) -> SentenceTransformer:
-    texts = embedder.corpus(micro_store.retrieval("train"), cfg)
+    texts = embedder.tokenizer_texts(micro_store.retrieval("train"), cfg)
     return embedder.load_retriever(cfg, "fp32", texts, folder)
 
 
@@ -159,7 +164,7 @@ def test_a_held_out_ranking_is_that_of_all_pixels_at_once(
     cfg = replace(retriever_cfg, late=late)
     model = load(micro_store, cfg, tmp_path).eval()
     queries = micro_store.retrieval("train")[:7]
-    kind = LateHeldOutRanking if late else HeldOutRanking
+    kind = MultiVectorHeldOutEvaluator if late else HeldOutEvaluator
     evaluator = kind(queries, slice_database(queries, micro_store), frames, cfg, 2)
     assert all(isinstance(one, FrameRef) for one in evaluator.corpus)
     asked = model.encode_query([query_input(q, frames, cfg) for q in queries])

@@ -17,7 +17,7 @@ from data.render.frame_cache import Frames
 from models.checks import check_widths
 from models.parameter_counts import check_towers, count_towers, tower_table
 from models.retriever.embedder import Retriever, frame_input, query_input
-from models.retriever.multi_vector import scored_tokens
+from models.retriever.multi_vector import find_scored_tokens
 from models.student.collator import IGNORED, Collator
 from models.student.prompts import Sample
 
@@ -104,7 +104,7 @@ def embedded_at_scored(model: MultiVectorEncoder, asked: dict, shown: dict) -> l
     told = []
     for what, features in (("the longest query", asked), ("a frame", shown)):
         ids, attended = features["input_ids"], features["attention_mask"]
-        scored = scored_tokens(model).scored(ids, attended)[0].tolist()
+        scored = find_scored_tokens(model).scored(ids, attended)[0].tolist()
         runs = [
             (kept, model.tokenizer.decode([token for token, _ in run]))
             for kept, run in groupby(zip(ids[0].tolist(), scored, strict=True), lambda one: one[1])

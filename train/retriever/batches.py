@@ -89,7 +89,7 @@ def prefix_of(query: RetrievalQuery) -> tuple[str, int, int]:
     return query.scene_id, query.prefix_start, query.prefix_stop
 
 
-class Composed(DefaultBatchSampler):
+class QueryBatchSampler(DefaultBatchSampler):
     """Batches of an epoch, composed by a rule: `random`; `scenes`, where `together` queries of a
     scene stand side by side; or `spread`, with as few of a scene in a batch as can be. As far as
     can be, no frame is one query's target and shown for another too: it would be its own negative.

@@ -113,13 +113,13 @@ class Slice:
         return query_input(one, self._frames, self._cfg)
 
 
-class HeldOutRanking(Slice, InformationRetrievalEvaluator):
+class HeldOutEvaluator(Slice, InformationRetrievalEvaluator):
     """Of a retriever with one vector."""
 
     joined = staticmethod(torch.stack)
 
 
-class LateHeldOutRanking(Slice, MultiVectorInformationRetrievalEvaluator):
+class MultiVectorHeldOutEvaluator(Slice, MultiVectorInformationRetrievalEvaluator):
     """Of a retriever with many."""
 
     score = staticmethod(maxsim)

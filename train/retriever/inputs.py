@@ -22,7 +22,7 @@ SEEN = "seen"
 """With a kind of media: the tower's outputs, (1 + deepstack layers, tokens, width)."""
 
 
-class Inputs:
+class RetrieverInputs:
     """Makes inputs of a model, which is prepared to take them."""
 
     def __init__(

@@ -13,7 +13,7 @@ from conf.runs import ranks
 from train.retriever.loss import RankingLoss
 
 
-class LateRankingLoss(RankingLoss):
+class MultiVectorRankingLoss(RankingLoss):
     """Cached multiple-negatives ranking by late interaction over a `Batch`: for the same queries
     its gradients are those of the library's CachedMultiVectorMultipleNegativesRankingLoss.
 

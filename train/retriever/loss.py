@@ -25,7 +25,7 @@ from torch.nn.functional import cross_entropy
 from conf.runs import rank, ranks
 from models.nonfinite_guard import check_finite
 from train.retriever.batches import Batch
-from train.retriever.inputs import Inputs
+from train.retriever.inputs import RetrieverInputs
 from train.retriever.negatives import Weighing
 
 Made = TypeVar("Made")
@@ -40,7 +40,7 @@ class RankingLoss(CachedMultipleNegativesRankingLoss):
     def __init__(
         self,
         model: SentenceTransformer,
-        inputs: Inputs,
+        inputs: RetrieverInputs,
         weighing: Weighing,
         scale: float,
         mini_batch: int,

@@ -78,7 +78,7 @@ def write_merged(
 
 
 @dataclass(frozen=True)
-class Outputs:
+class RetrieverOutputs:
     """What a retriever gives for some queries and their targets, fp32.
 
     Attributes:
@@ -95,7 +95,7 @@ class Outputs:
 
 def outputs(
     model: Retriever, settings: ContrastiveCommand, queries: list[RetrievalQuery], frames: Frames
-) -> Outputs:
+) -> RetrieverOutputs:
     """The outputs for queries and for their targets, each of these once."""
     preset = settings.retriever
     targets = dict.fromkeys(q.target for q in queries)
@@ -106,7 +106,7 @@ def outputs(
     shown = model.encode_document(shown, prompt=preset.frame_instruction, **batch)
     asked, shown = (rows_of(made) for made in (asked, shown))
     own = model.similarity(asked, asked).diagonal()
-    return Outputs(asked, model.similarity(asked, shown).cpu(), own.cpu())
+    return RetrieverOutputs(asked, model.similarity(asked, shown).cpu(), own.cpu())
 
 
 def rows_of(embedded: list) -> torch.Tensor:
@@ -115,7 +115,7 @@ def rows_of(embedded: list) -> torch.Tensor:
     return pad_sequence(rows, batch_first=True)
 
 
-def compare(before: Outputs, after: Outputs) -> Measured:
+def compare(before: RetrieverOutputs, after: RetrieverOutputs) -> Measured:
     """The sizes of the differences of the queries' embeddings, as a share of their own size, and of
     the scores, as a share of those that queries have with themselves, since scores may all be near
     zero; and the share of queries whose best frame is the same."""

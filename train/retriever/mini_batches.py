@@ -17,7 +17,7 @@ from models.memory import is_out_of_memory, peak_bytes, reset_peak
 from models.retriever.embedder import Retriever
 from train.common import memory_probe
 from train.retriever.batches import Batch, batch_of
-from train.retriever.inputs import Inputs
+from train.retriever.inputs import RetrieverInputs
 from train.retriever.loss import RankingLoss
 
 TIMED = 64
@@ -28,7 +28,7 @@ def settle(
     train: ContrastiveTrainConfig,
     folder: Path,
     model: Retriever,
-    inputs: Inputs,
+    inputs: RetrieverInputs,
     ranking: type[RankingLoss],
     queries: Sequence[RetrievalQuery],
 ) -> ContrastiveTrainConfig:
@@ -70,7 +70,7 @@ class MiniBatches:
     def __init__(
         self,
         model: Retriever,
-        inputs: Inputs,
+        inputs: RetrieverInputs,
         ranking: type[RankingLoss],
         queries: Sequence[RetrievalQuery],
         train: ContrastiveTrainConfig,

@@ -28,7 +28,7 @@ from models.distributed import from_main
 from models.nonfinite_guard import check_finite
 from models.retriever.embedder import Retriever
 from train.retriever.batches import Batch, batch_of
-from train.retriever.inputs import Inputs
+from train.retriever.inputs import RetrieverInputs
 from train.retriever.loss import RankingLoss
 
 log = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ class HardNegatives(TrainerCallback):
         queries: Sequence[RetrievalQuery],
         train: ContrastiveTrainConfig,
         model: Retriever,
-        inputs: Inputs,
+        inputs: RetrieverInputs,
         ranking: type[RankingLoss],
         store: Store,
         folder: Path,

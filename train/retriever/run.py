@@ -38,10 +38,10 @@ from models.retriever.embedder import ADAPTERS, Retriever
 from train.common import checkpoints, journal, training_loop
 from train.common.audit import audit_retriever
 from train.retriever import mini_batches
-from train.retriever.batches import Batch, Composed, batch_of
-from train.retriever.evaluator import HeldOutRanking, LateHeldOutRanking, slice_database
-from train.retriever.inputs import Inputs
-from train.retriever.late_loss import LateRankingLoss
+from train.retriever.batches import Batch, QueryBatchSampler, batch_of
+from train.retriever.evaluator import HeldOutEvaluator, MultiVectorHeldOutEvaluator, slice_database
+from train.retriever.inputs import RetrieverInputs
+from train.retriever.late_loss import MultiVectorRankingLoss
 from train.retriever.loss import RankingLoss
 from train.retriever.mining import HardNegatives
 from train.retriever.negatives import Weighing
@@ -73,7 +73,7 @@ def train_retriever(
         model = embedder.load_retriever(
             cfg.retriever,
             cfg.train.precision,
-            corpus=embedder.corpus(store.retrieval("train"), cfg.retriever),
+            corpus=embedder.tokenizer_texts(store.retrieval("train"), cfg.retriever),
             folder=run.folder / "untrained",
         )
     fuse(model)
@@ -81,13 +81,13 @@ def train_retriever(
     log.info(audit_retriever(model, cfg.retriever, longest, frames))
 
     late = cfg.retriever.late is not None
-    ranking = LateRankingLoss if late else RankingLoss
-    inputs = Inputs(model, frames, cfg.retriever, cfg.train.precision)
+    ranking = MultiVectorRankingLoss if late else RankingLoss
+    inputs = RetrieverInputs(model, frames, cfg.retriever, cfg.train.precision)
     train = mini_batches.settle(cfg.train, run.folder, model, inputs, ranking, training)
     cfg = replace(cfg, train=train)
     checkpoint = checkpoints.newest_checkpoint(run.folder)
     negatives = HardNegatives(training, cfg.train, model, inputs, ranking, store, run.folder)
-    order = Composed(
+    order = QueryBatchSampler(
         training,
         cfg.train.hard_negatives,
         cfg.train.batch,
@@ -96,19 +96,19 @@ def train_retriever(
         cfg.seed,
         distributed.ranks(),
     )
-    trainer = (LateTrainer if late else RetrieverTrainer)(
+    trainer = (MultiVectorTrainer if late else RetrieverTrainer)(
         model=model,
-        args=arguments(cfg, run, checkpoint, share),
+        args=training_arguments(cfg, run, checkpoint, share),
         train_dataset=Dataset.from_list([{"query": k} for k in range(len(training))]),
-        evaluator=(LateHeldOutRanking if late else HeldOutRanking)(
+        evaluator=(MultiVectorHeldOutEvaluator if late else HeldOutEvaluator)(
             validation,
             slice_database(validation, store),
             frames,
             cfg.retriever,
             cfg.train.mini_batch,
         ),
-        loss=loss_of(cfg, model, inputs, store),
-        data_collator=ByName(preprocess_fn=model.preprocess),
+        loss=build_loss(cfg, model, inputs, store),
+        data_collator=IndexCollator(preprocess_fn=model.preprocess),
         callbacks=[negatives, training_loop.Epochs(order)],
         batch_of=partial(named, cfg.train, training, negatives),
         sampler=order,
@@ -150,13 +150,13 @@ def split(
     return training, validation
 
 
-def loss_of(
-    cfg: ContrastiveCommand, model: Retriever, inputs: Inputs, store: Store
-) -> MatryoshkaLoss | LateRankingLoss:
+def build_loss(
+    cfg: ContrastiveCommand, model: Retriever, inputs: RetrieverInputs, store: Store
+) -> MatryoshkaLoss | MultiVectorRankingLoss:
     train, late = cfg.train, cfg.retriever.late is not None
     # What is mined for one query may be another's target.
     identical = train.mask_identical or train.mine_every > 0
-    ranking = (LateRankingLoss if late else RankingLoss)(
+    ranking = (MultiVectorRankingLoss if late else RankingLoss)(
         model,
         inputs,
         Weighing(store, identical, train.mask_near, train.hard_weight),
@@ -171,7 +171,7 @@ def loss_of(
     return MatryoshkaLoss(model, ranking, list(cfg.retriever.widths), train.width_weights)
 
 
-def arguments(
+def training_arguments(
     cfg: ContrastiveCommand, run: Run, checkpoint: Path | None, share: int
 ) -> SentenceTransformerTrainingArguments | MultiVectorEncoderTrainingArguments:
     late = cfg.retriever.late is not None
@@ -196,7 +196,7 @@ def named(
     return batch_of(asked, train.hard_negatives, train.distinct_frames, train.shared_prefixes)
 
 
-class ByName(SentenceTransformerDataCollator):
+class IndexCollator(SentenceTransformerDataCollator):
     """Leaves a batch the places of its queries: one that is made ahead may come after a mining."""
 
     def __call__(self, rows: list[dict[str, int]]) -> dict[str, list[int]]:
@@ -210,7 +210,7 @@ class NamedBatches:
     def __init__(
         self,
         *args: Any,
-        sampler: Composed,
+        sampler: QueryBatchSampler,
         batch_of: Callable[[Sequence[int]], Batch],
         **settings: Any,
     ) -> None:
@@ -222,7 +222,7 @@ class NamedBatches:
         """Rows name queries by number: there is no text of theirs that a model card could show, nor
         a bar for looking for it."""
 
-    def get_batch_sampler(self, *_: Any, **__: Any) -> Composed:
+    def get_batch_sampler(self, *_: Any, **__: Any) -> QueryBatchSampler:
         return self._sampler
 
     def _load_from_checkpoint(self, checkpoint_path: str) -> None:
@@ -230,7 +230,7 @@ class NamedBatches:
         quantised, and find that the weights do not fit."""
         folder = Path(checkpoint_path)
         if (folder / ADAPTERS).exists():
-            embedder.take_adapters(self.model, folder)
+            embedder.load_adapters(self.model, folder)
         else:
             super()._load_from_checkpoint(checkpoint_path)
 
@@ -246,5 +246,5 @@ class RetrieverTrainer(NamedBatches, SentenceTransformerTrainer):
     """Of a retriever with one vector."""
 
 
-class LateTrainer(NamedBatches, MultiVectorEncoderTrainer):
+class MultiVectorTrainer(NamedBatches, MultiVectorEncoderTrainer):
     """Of a retriever with many."""

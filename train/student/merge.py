@@ -86,7 +86,7 @@ def merge(
 
 
 @dataclass(frozen=True)
-class Outputs:
+class StudentOutputs:
     """What a student gives for one sample.
 
     Attributes:
@@ -104,14 +104,14 @@ def outputs(
     settings: SftCommand,
     held_out: dict[str, Samples],
     precision: str,
-) -> dict[str, list[Outputs]]:
+) -> dict[str, list[StudentOutputs]]:
     """The outputs for the first held-out samples of each mode. A student that is trained computes
     in bf16 where that is its `precision`, one that was written as its weights are."""
     describes = settings.train.regime == "describe"
     letters = None if describes else LetterChoice(letter_ids(processor))
     collator = Collator(processor, settings.student.max_length)
     device = next(model.parameters()).device
-    found: dict[str, list[Outputs]] = {}
+    found: dict[str, list[StudentOutputs]] = {}
     for mode, samples in held_out.items():
         found[mode] = []
         for k in range(min(CHECKED, len(samples))):
@@ -121,11 +121,13 @@ def outputs(
             with torch.inference_mode(), computing:
                 logits = model(**batch).logits.float()
             letter = int(letters.shrink(logits, labels)[0, 0]) if letters else None
-            found[mode].append(Outputs(logits[0, :-1].cpu(), letter))
+            found[mode].append(StudentOutputs(logits[0, :-1].cpu(), letter))
     return found
 
 
-def compare(before: dict[str, list[Outputs]], after: dict[str, list[Outputs]]) -> Measured:
+def compare(
+    before: dict[str, list[StudentOutputs]], after: dict[str, list[StudentOutputs]]
+) -> Measured:
     """By mode, the size of the logits' difference as a share of the logits' own, and the share of
     samples for which the chosen letter is the same."""
     measured: Measured = {}

@@ -61,7 +61,7 @@ def runs(tmp_path_factory, micro, micro_store) -> Path:
     cfg = RetrieverConfig(name="small", widths=[64, 32], **SHARED)
     folder = root / "contrastive" / "run"
     folder.mkdir(parents=True)
-    texts = embedder.corpus(micro_store.retrieval("train"), cfg)
+    texts = embedder.tokenizer_texts(micro_store.retrieval("train"), cfg)
     built = embedder.load_retriever(cfg, "fp32", texts, folder / "untrained")
     built.save_pretrained(str(folder / "retriever"), create_model_card=False)
     settings = ContrastiveCommand(benchmark=micro, retriever=cfg)

@@ -50,7 +50,7 @@ def saved(tmp_path_factory, micro, micro_store) -> Path:
 
 def save_run(cfg: RetrieverConfig, folder: Path, micro, micro_store) -> Path:
     """A finished run of the trainer, as it leaves it."""
-    texts = embedder.corpus(micro_store.retrieval("train"), cfg)
+    texts = embedder.tokenizer_texts(micro_store.retrieval("train"), cfg)
     built = embedder.load_retriever(cfg, "fp32", texts, folder / "untrained")
     # Far enough from its start that frames are apart: a new model's cosines differ by fp32's noise.
     noise = torch.Generator().manual_seed(0)

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from train.retriever.batches import ORDERS, Batch, Composed, batch_of, prefix_of
+from train.retriever.batches import ORDERS, Batch, QueryBatchSampler, batch_of, prefix_of
 
 
 @pytest.fixture
@@ -15,7 +15,7 @@ def queries(micro_store):
 
 
 def composed(queries, rule="random", batch=8, ranks=1, epoch=0, together=3) -> list[list[int]]:
-    sampler = Composed(queries, 1, batch, rule, together, seed=0, ranks=ranks)
+    sampler = QueryBatchSampler(queries, 1, batch, rule, together, seed=0, ranks=ranks)
     sampler.set_epoch(epoch)
     made = list(sampler)
     assert len(made) == len(sampler)

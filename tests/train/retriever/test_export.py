@@ -32,7 +32,7 @@ from evaluation import retrieve
 from models import checks, loading
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
 from train import export
-from train.retriever.merge import Outputs, compare, rows_of
+from train.retriever.merge import RetrieverOutputs, compare, rows_of
 
 METRICS = {"recall@10_at_start": 0.25, "recall@10": 0.5}
 
@@ -190,7 +190,7 @@ def test_a_card_says_what_the_run_says(settings, forms) -> None:
 
 def test_differences_are_shares_and_a_nan_is_not_small() -> None:
     queries, scores = [[3.0, 0.0], [0.0, 4.0]], [[1.0, 0.0], [0.6, 0.8]]
-    before = Outputs(torch.tensor(queries), torch.tensor(scores), torch.tensor([2.0, 2.0]))
+    before = RetrieverOutputs(torch.tensor(queries), torch.tensor(scores), torch.tensor([2.0, 2.0]))
     moved = before.queries + torch.tensor([[0.0, 1.0], [0.0, 0.0]])
     after = replace(before, queries=moved, scores=before.scores.flip(1))
     assert compare(before, before) == {

@@ -20,13 +20,19 @@ from transformers import dynamic_module_utils
 from conf.compose import compose, register
 from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
 from models.loading import keep_differentiable
-from models.retriever.embedder import corpus, frame_input, load_retriever, load_trained, query_input
-from models.retriever.multi_vector import scored_tokens
+from models.retriever.embedder import (
+    frame_input,
+    load_retriever,
+    load_trained,
+    query_input,
+    tokenizer_texts,
+)
+from models.retriever.multi_vector import find_scored_tokens
 from models.retriever.scored_tokens import ScoredTokens
 from train.common.audit import audit_retriever
 from train.retriever.batches import batch_of
-from train.retriever.inputs import Inputs
-from train.retriever.late_loss import LateRankingLoss
+from train.retriever.inputs import RetrieverInputs
+from train.retriever.late_loss import MultiVectorRankingLoss
 from train.retriever.negatives import Weighing
 
 SCALE = 0.5
@@ -38,7 +44,9 @@ FRAME = 9
 def load(cfg, micro_store, folder, noise: float = 0.0) -> MultiVectorEncoder:
     """In which adapters, if any, already do something."""
     torch.manual_seed(0)
-    model = load_retriever(cfg, "fp32", corpus(micro_store.retrieval("train"), cfg), folder)
+    model = load_retriever(
+        cfg, "fp32", tokenizer_texts(micro_store.retrieval("train"), cfg), folder
+    )
     with torch.no_grad():
         for name, weight in model.named_parameters():
             if "lora_B" in name:
@@ -96,7 +104,7 @@ def gradients(model, loss, features) -> tuple[float, dict[str, torch.Tensor]]:
 def ours(trained, queries, frames, store, distinct=True, shared=True, **settings):
     model, cfg = trained
     settings = {"mini_batch": 4, "weighing": Weighing(store), "scale": SCALE, **settings}
-    loss = LateRankingLoss(model, Inputs(model, frames, cfg, "fp32"), **settings)
+    loss = MultiVectorRankingLoss(model, RetrieverInputs(model, frames, cfg, "fp32"), **settings)
     return gradients(model, loss, [batch_of(queries, NEGATIVES, distinct, shared)])
 
 
@@ -154,13 +162,13 @@ def test_scored_are_the_question_and_what_is_shown_alone(model, late_cfg, querie
         prompt=late_cfg.query_instruction,
     )
     ids = features["input_ids"]
-    scored = scored_tokens(model).scored(ids, features["attention_mask"])
+    scored = find_scored_tokens(model).scored(ids, features["attention_mask"])
     video = model.tokenizer.convert_tokens_to_ids("<|video_pad|>")
     for query, row, kept in zip((asked, queries[-1]), ids, scored, strict=True):
         assert (row[kept] == video).sum() == (row == video).sum() == 6 * FRAME
         assert model.tokenizer.decode(row[kept & (row != video)]) == query.question
     shown = model.preprocess([frame_input(asked.target, frames)], prompt=late_cfg.frame_instruction)
-    kept = scored_tokens(model).scored(shown["input_ids"], shown["attention_mask"])[0]
+    kept = find_scored_tokens(model).scored(shown["input_ids"], shown["attention_mask"])[0]
     image = model.tokenizer.convert_tokens_to_ids("<|image_pad|>")
     assert shown["input_ids"][0][kept].tolist() == [image] * FRAME
 
@@ -179,7 +187,9 @@ def test_vectors_are_the_scored_tokens_projected_and_normalised(
     assert len(together[0]) != len(together[1])
     for one, vectors in zip(inputs, together, strict=True):
         features = model.preprocess([one], prompt=late_cfg.query_instruction, task="query")
-        kept = scored_tokens(model).scored(features["input_ids"], features["attention_mask"])[0]
+        kept = find_scored_tokens(model).scored(features["input_ids"], features["attention_mask"])[
+            0
+        ]
         with torch.no_grad():
             states = model[0](dict(features))["token_embeddings"][0]
             made = torch.nn.functional.normalize(states[kept] @ model[1].linear.weight.T, dim=1)
@@ -237,7 +247,7 @@ def test_no_code_of_a_saved_folder_runs_here(micro_store, late_cfg, tmp_path) ->
     model = load(late_cfg, micro_store, tmp_path / "base")
     model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
     (tmp_path / "saved" / "scored_tokens.py").write_text("raise RuntimeError('this ran')")
-    assert scored_tokens(load_trained(late_cfg, "fp32", tmp_path / "saved")).shown
+    assert find_scored_tokens(load_trained(late_cfg, "fp32", tmp_path / "saved")).shown
 
 
 def test_adapters_and_projection_are_read_back_over_4_bit_weights(

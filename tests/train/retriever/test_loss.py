@@ -19,9 +19,9 @@ from conf.schema import LoraConfig, RetrieverConfig
 from data.records import FrameRef
 from data.world.geometry import displacements
 from models.lora_kernels import fuse, unfuse
-from models.retriever.embedder import corpus, frame_input, load_retriever, query_input
+from models.retriever.embedder import frame_input, load_retriever, query_input, tokenizer_texts
 from train.retriever.batches import batch_of
-from train.retriever.inputs import Inputs
+from train.retriever.inputs import RetrieverInputs
 from train.retriever.loss import RankingLoss, early
 from train.retriever.negatives import Weighing
 
@@ -37,7 +37,7 @@ def trained(request, micro_store, retriever_cfg, saved_base, tmp_path_factory):
     if request.param == "adapters":
         over = {"architecture": None, "model": saved_base, "quantization": "nf4"}
         cfg = replace(cfg, **over, lora=LoraConfig(rank=4))
-    texts = corpus(micro_store.retrieval("train"), cfg)
+    texts = tokenizer_texts(micro_store.retrieval("train"), cfg)
     torch.manual_seed(0)
     model = load_retriever(cfg, "fp32", texts, tmp_path_factory.mktemp("base"))
     with torch.no_grad():
@@ -77,7 +77,7 @@ def gradients(
 def ours(trained, queries, frames, store, distinct=True, shared=True, **settings):
     model, cfg = trained
     settings = {"mini_batch": 5, "weighing": Weighing(store), "scale": SCALE, **settings}
-    inputs = Inputs(model, frames, cfg, "fp32")
+    inputs = RetrieverInputs(model, frames, cfg, "fp32")
     loss = MatryoshkaLoss(model, RankingLoss(model, inputs, **settings), cfg.widths, WEIGHTS)
     fuse(model)
     try:
@@ -133,7 +133,7 @@ def test_bf16_moves_gradients_by_its_rounding_alone(
         for name, weight in model.named_parameters():
             if "lora_B" in name:
                 weight.data.normal_(std=0.05)
-        inputs = Inputs(model, frames, cfg, precision)
+        inputs = RetrieverInputs(model, frames, cfg, precision)
         settings = {"mini_batch_tokens": 400, "reuse_features": True, "scale": SCALE}
         ranking = RankingLoss(
             model, inputs, weighing=Weighing(micro_store), mini_batch=5, **settings

@@ -11,12 +11,12 @@ import torch
 
 from conf.entry import Run
 from conf.schema import LateConfig
-from models.retriever.embedder import corpus, load_retriever
+from models.retriever.embedder import load_retriever, tokenizer_texts
 from train import contrastive
 from train.common import memory_probe
 from train.common.journal import read_journal
-from train.retriever.inputs import Inputs
-from train.retriever.late_loss import LateRankingLoss
+from train.retriever.inputs import RetrieverInputs
+from train.retriever.late_loss import MultiVectorRankingLoss
 from train.retriever.loss import RankingLoss
 from train.retriever.mini_batches import MiniBatches, settle
 
@@ -30,10 +30,15 @@ def train(contrastive_settings):
 @pytest.fixture(params=[None, LateConfig(width=24)], ids=["one", "late"])
 def given(request, micro_store, frames, retriever_cfg, tmp_path):
     cfg = replace(retriever_cfg, late=request.param)
-    texts = corpus(micro_store.retrieval("train"), cfg)
+    texts = tokenizer_texts(micro_store.retrieval("train"), cfg)
     model = load_retriever(cfg, "fp32", texts, tmp_path / "untrained")
-    ranking = LateRankingLoss if request.param else RankingLoss
-    return model, Inputs(model, frames, cfg, "fp32"), ranking, micro_store.retrieval("train")[:12]
+    ranking = MultiVectorRankingLoss if request.param else RankingLoss
+    return (
+        model,
+        RetrieverInputs(model, frames, cfg, "fp32"),
+        ranking,
+        micro_store.retrieval("train")[:12],
+    )
 
 
 def test_a_probe_leaves_no_trace_and_a_note(train, given, tmp_path, monkeypatch) -> None:

@@ -279,8 +279,8 @@ def test_a_card_says_what_the_run_says(settings, runs, forms) -> None:
 
 
 def test_differences_are_shares_of_the_logits_size() -> None:
-    def outputs(*values: float, letter: int | None = 0) -> merge.Outputs:
-        return merge.Outputs(torch.tensor([values]), letter)
+    def outputs(*values: float, letter: int | None = 0) -> merge.StudentOutputs:
+        return merge.StudentOutputs(torch.tensor([values]), letter)
 
     before = {"answer": [outputs(3.0, 0.0), outputs(0.0, 4.0)]}
     after = {"answer": [outputs(3.0, 1.0), outputs(0.0, 4.0, letter=2)]}
