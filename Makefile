@@ -23,11 +23,13 @@ help: ## Print this
 
 setup: $(READY) ## Make .venv with everything that is needed
 
-# Where a machine's registry lacks one of the tested versions, the ranges have to do.
+# A registry may lack a tested version; the ranges of pyproject.toml then choose others.
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --upgrade uv
-	$(INSTALL) --constraint constraints.txt || $(INSTALL)
+	$(INSTALL) --constraint constraints.txt || { \
+	  echo "warning: the tested versions of constraints.txt cannot be installed; installing versions within the ranges of pyproject.toml"; \
+	  $(INSTALL); }
 	@touch $(READY)
 
 vllm-env: $(VLLM_READY) ## Make .venv-vllm, for teacher.serve: on the GPU, or on the CPU where there is none
