@@ -36,7 +36,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
 
     from data.render.frame_cache import Frames
     from evaluation.embedders import embed
-    from evaluation.metrics.accuracy import breakdown
+    from evaluation.metrics import breakdown
     from evaluation.reporting import tables
     from evaluation.retrieval import faiss_index, standard_test
     from models.precision import resolve_precision

@@ -14,18 +14,7 @@ from typing import Any
 from jsonschema import Draft202012Validator
 
 from data.records import LETTERS
-from models.student.answer_parser import Choice, Reason, parse, parse_choice
-
-__all__ = [
-    "Choice",
-    "Reason",
-    "Record",
-    "instruction",
-    "parse",
-    "parse_choice",
-    "read_record",
-    "schema",
-]
+from models.student.answer_parser import parse
 
 AMBIGUITY = ("none", "some", "high")
 """How hard the candidates are to tell apart."""

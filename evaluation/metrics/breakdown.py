@@ -11,16 +11,9 @@ import numpy as np
 
 from data.records import RetrievalQuery, SelectionItem
 from data.tracks.selection.time import CELLS
-from evaluation.metrics.accuracy import (
-    Interval,
-    SceneBootstrap,
-    accuracy_by,
-    accuracy_table,
-    expected_hits,
-    macro_by_scene,
-    query_measures,
-    summary,
-)
+from evaluation.metrics.accuracy import accuracy_by, accuracy_table
+from evaluation.metrics.intervals import Interval, SceneBootstrap, macro_by_scene
+from evaluation.metrics.ranking import expected_hits, query_measures, summary
 from evaluation.reporting.rows import RECALLS, RetrievalRow, SelectionRow
 from evaluation.retrieval.exact_search import Ranks
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from data.records import LETTERS
-from evaluation.metrics.accuracy import Interval, wilson
+from evaluation.metrics.intervals import Interval, wilson
 
 BINS = 10
 """Bins of equal width that confidences are sorted into."""

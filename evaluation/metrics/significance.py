@@ -10,7 +10,7 @@ import numpy as np
 from conf.errors import UserError
 from data.records import FAMILIES, SelectionItem
 from data.tracks.controls import pairs
-from evaluation.metrics.accuracy import macro_by_scene
+from evaluation.metrics.intervals import macro_by_scene
 
 NAMED = 3
 """Items that are named of those that one side alone answered."""

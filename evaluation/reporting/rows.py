@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from evaluation.metrics.accuracy import Accuracy, Interval
+from evaluation.metrics.accuracy import Accuracy
+from evaluation.metrics.intervals import Interval
 
 RECALLS = (1, 10, 50)
 """Cut-offs that the retrieval rows report."""

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from data.records import FAMILIES, LETTERS
-from evaluation.metrics.accuracy import Interval
 from evaluation.metrics.calibration import Calibration, Positions
+from evaluation.metrics.intervals import Interval
 from evaluation.metrics.significance import Paired
 from evaluation.reporting import paper
 from evaluation.reporting.rows import RECALLS, SIMILARITY, RetrievalRow, SelectionRow

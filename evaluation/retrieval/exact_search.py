@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from evaluation.metrics.accuracy import compare
+from evaluation.metrics.ranking import compare
 
 GRID = 2.0**26
 """Steps of a unit vector's entries."""

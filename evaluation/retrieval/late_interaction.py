@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from evaluation.embedders.cache import filled_up
-from evaluation.metrics.accuracy import compare
+from evaluation.metrics.ranking import compare
 from evaluation.retrieval.exact_search import FP32, Ranks
 
 if TYPE_CHECKING:

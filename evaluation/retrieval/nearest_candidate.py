@@ -10,7 +10,7 @@ import numpy as np
 from conf.schema import RetrieverConfig
 from data.records import LETTERS, SelectionItem
 from evaluation.embedders.cache import Embeddings
-from evaluation.metrics.accuracy import expected_hits, gold_scores, ranks_of
+from evaluation.metrics.ranking import expected_hits, gold_scores, ranks_of
 from evaluation.retrieval.exact_search import Cut, pair_scores
 
 

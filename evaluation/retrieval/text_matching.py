@@ -15,7 +15,7 @@ from data.records import FrameRef, RetrievalQuery
 from data.render.frame_cache import Frames
 from data.store import Store
 from evaluation.embedders.embed import Embedder, embed_frames, embed_images, embed_texts
-from evaluation.metrics.accuracy import query_measures
+from evaluation.metrics.ranking import query_measures
 from evaluation.retrieval.exact_search import Ranks
 from evaluation.retrieval.image_server import draw
 from evaluation.retrieval.predicted_texts import TEXTS, Route, Texts

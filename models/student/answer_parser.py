@@ -103,11 +103,6 @@ _SECOND_THOUGHT = re.compile(
 """The line after the answer's, which may take it back."""
 
 
-def parse_choice(raw: str) -> str | None:
-    """The letter that a model's output chooses, or None. See `parse`."""
-    return parse(raw).letter
-
-
 def parse(raw: str, letters: str = LETTERS, cut: bool = False) -> Choice:
     """Reads an output: a structured record, prose that ends in "Answer: B", or a lone letter.
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from conf.errors import UserError
 from conf.multirun.summary import AT_START
-from evaluation.metrics.accuracy import Interval
+from evaluation.metrics.intervals import Interval
 from evaluation.reporting import paper
 from evaluation.reporting.page.run_rows import SUITES, Measured
 from evaluation.reporting.page.runs import Finished, unreadable

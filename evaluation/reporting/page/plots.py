@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from data.records import LETTERS
-from evaluation.metrics.accuracy import Interval, wilson
+from evaluation.metrics.intervals import Interval, wilson
 from evaluation.reporting import paper
 from evaluation.reporting.figures import FAINT, INK, color_of, legend_above, literal
 from evaluation.reporting.rows import UNTRAINED

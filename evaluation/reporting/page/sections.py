@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from evaluation.metrics.accuracy import Interval
 from evaluation.metrics.calibration import Calibration, Positions
+from evaluation.metrics.intervals import Interval
 from evaluation.metrics.significance import Paired
 from evaluation.reporting import figures, paper, tables
 from evaluation.reporting.page import paper_tables as shaped

@@ -6,18 +6,15 @@ import pytest
 import pytrec_eval
 import torch
 
-from evaluation.metrics.accuracy import (
-    SceneBootstrap,
-    accuracy_by,
-    accuracy_table,
+from evaluation.metrics.accuracy import accuracy_by, accuracy_table
+from evaluation.metrics.intervals import SceneBootstrap, macro_by_scene, wilson
+from evaluation.metrics.ranking import (
     compare,
     expected_hits,
     gold_scores,
-    macro_by_scene,
     metrics_from_counts,
     rank_metrics,
     ranks_of,
-    wilson,
 )
 from tests.evaluation.metrics.resampled import interval
 

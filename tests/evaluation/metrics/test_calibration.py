@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from evaluation.metrics.accuracy import wilson
 from evaluation.metrics.calibration import BINS, calibration, positions
+from evaluation.metrics.intervals import wilson
 from evaluation.reporting.tables import calibration_table, position_table, reading_table
 
 

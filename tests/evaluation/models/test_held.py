@@ -11,7 +11,8 @@ from conf.entry import Run
 from conf.schema import ArchitectureConfig, LoraConfig, SelectCommand, StudentConfig
 from evaluation import select
 from evaluation.generators.response_log import AnswerLog
-from evaluation.generators.response_schema import parse, schema
+from evaluation.generators.response_schema import schema
+from models.student.answer_parser import parse
 
 SMALL = ArchitectureConfig(
     hidden=64, layers=1, heads=2, kv_heads=2, feed_forward=64,

@@ -8,7 +8,7 @@ import pytest
 from sentence_transformers.util.similarity import maxsim
 
 from evaluation.embedders.cache import Embeddings, filled_up
-from evaluation.metrics.accuracy import ranks_of
+from evaluation.metrics.ranking import ranks_of
 from evaluation.retrieval import late_interaction
 from evaluation.retrieval.late_interaction import late_ranks, pair_scores
 

@@ -31,7 +31,7 @@ from data.store import open_store
 from evaluation import retrieve
 from evaluation.embedders import base
 from evaluation.embedders.embed import EMBEDDINGS, embed_frames, embed_queries, embedders
-from evaluation.metrics.accuracy import metrics_from_counts, rank_metrics
+from evaluation.metrics.ranking import metrics_from_counts, rank_metrics
 from models.retriever import embedder
 
 CFG = RetrieverConfig(

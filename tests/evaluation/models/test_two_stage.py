@@ -35,8 +35,8 @@ from data.store import Store, open_store
 from evaluation import two_stage
 from evaluation.embedders.base import released_encoder
 from evaluation.embedders.embed import embed_queries, embedders, untrained_embedder
-from evaluation.metrics.accuracy import query_measures, rank_metrics
 from evaluation.metrics.breakdown import retrieval_rows
+from evaluation.metrics.ranking import query_measures, rank_metrics
 from evaluation.retrieval import text_matching
 from evaluation.retrieval.predicted_texts import ROUTES, foreseen
 from evaluation.retrieval.standard_test import ranks_of, standard_test

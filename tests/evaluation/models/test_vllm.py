@@ -18,8 +18,9 @@ from data.render.frame_cache import Frames
 from evaluation import select
 from evaluation.generators.model_source import shown
 from evaluation.generators.openai_server import chat_of, request_of
-from evaluation.generators.response_schema import Reason, parse, schema
+from evaluation.generators.response_schema import schema
 from models import loading
+from models.student.answer_parser import Reason, parse
 from models.student.collator import Collator, encode
 from tests.teacher.serving import Serving
 from train.student import dataset

@@ -8,9 +8,11 @@ import pytest
 from PIL import Image
 
 from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
-from evaluation.metrics.accuracy import accuracy_table, metrics_from_counts, query_measures, wilson
+from evaluation.metrics.accuracy import accuracy_table
 from evaluation.metrics.breakdown import ranks_apart, recall_curves, selection_row
 from evaluation.metrics.breakdown import retrieval_rows as retrieval_rows_of
+from evaluation.metrics.intervals import wilson
+from evaluation.metrics.ranking import metrics_from_counts, query_measures
 from evaluation.reporting import paper
 from evaluation.reporting.figures import (
     builders_figure,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.metrics.accuracy import ranks_of
+from evaluation.metrics.ranking import ranks_of
 from evaluation.retrieval import exact_search
 from evaluation.retrieval.exact_search import (
     Cut,
