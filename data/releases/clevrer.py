@@ -22,7 +22,13 @@ import numpy as np
 from PIL import Image
 
 from data.records import COLORS, FRAMES, MATERIALS, SHAPES, Collision, Scene, SceneObject
-from data.releases.parsing import BadRecord, entry, numbers, only_once, scene_id
+from data.releases.validation import (
+    RecordError,
+    check_unique_scenes,
+    finite_array,
+    get_field,
+    scene_id,
+)
 from data.world.geometry import Camera, visibility
 
 if TYPE_CHECKING:
@@ -37,30 +43,30 @@ EULER = "xyz"
 """scipy's word for angles about fixed x, y and z axes."""
 
 
-def scene_files(folder: Path) -> list[Path]:
+def list_scenes(folder: Path) -> list[Path]:
     """Annotations below a folder, in order of their number.
 
     Raises:
         UserError: there are none, or one number twice.
     """
     found = sorted(folder.rglob("annotation_*.json"), key=lambda path: (path.stem, path))
-    return only_once(folder, found, _scene_id, LAYOUT)
+    return check_unique_scenes(folder, found, _scene_id, LAYOUT)
 
 
 def _scene_id(path: Path) -> str:
     return scene_id("clevrer", path.stem.removeprefix("annotation_"))
 
 
-def read(path: Path, folder: Path, split: str) -> Scene:
+def read_scene(path: Path, folder: Path, split: str) -> Scene:
     """The scene of an annotation. Visible fractions are counted from poses, as for scenes of one's
     own; whether an object is in view is as the annotation says.
 
     Raises:
-        BadRecord: the annotation or its video is not as CLEVRER's release has them.
+        RecordError: the annotation or its video is not as CLEVRER's release has them.
     """
     record = _parsed(path)
     if "collisions" in record:
-        raise BadRecord(
+        raise RecordError(
             f"{path} has the key 'collisions' where CLEVRER's release has 'collision': it is "
             "another generator's file"
         )
@@ -71,7 +77,7 @@ def read(path: Path, folder: Path, split: str) -> Scene:
     camera = Camera()
     image_positions, _ = camera.project(poses[0])
     _, fraction = visibility(looks, *poses, camera)
-    video = entry(record, "video_filename", str, str(path))
+    video = get_field(record, "video_filename", str, str(path))
     beside = Path(str(path.relative_to(folder)).replace("annotation", "video"))
     scene = Scene(
         scene_id=_scene_id(path),
@@ -88,7 +94,7 @@ def read(path: Path, folder: Path, split: str) -> Scene:
         image_size=(camera.width, camera.height),
         footage=beside.with_name(video).as_posix(),
     )
-    check_footage(scene, folder)
+    check_frames(scene, folder)
     return scene
 
 
@@ -96,58 +102,58 @@ def _parsed(path: Path) -> dict[str, Any]:
     try:
         record = json.loads(path.read_bytes())
     except ValueError as error:
-        raise BadRecord(f"{path} is not whole, or no JSON: {error}") from error
+        raise RecordError(f"{path} is not whole, or no JSON: {error}") from error
     if not isinstance(record, dict):
-        raise BadRecord(f"{path} holds a {type(record).__name__}, expected an object with keys")
+        raise RecordError(f"{path} holds a {type(record).__name__}, expected an object with keys")
     return record
 
 
 def _objects(record: dict[str, Any], path: Path) -> dict[int, SceneObject]:
     """What objects look like, by object id."""
     found = {}
-    for listed in entry(record, "object_property", list, str(path)):
+    for listed in get_field(record, "object_property", list, str(path)):
         where = f"{path}: object_property"
         look = {
-            key: _one_of(entry(listed, key, str, where), key, known, path)
+            key: _one_of(get_field(listed, key, str, where), key, known, path)
             for key, known in (("shape", SHAPES), ("material", MATERIALS), ("color", COLORS))
         }
-        found[entry(listed, "object_id", int, where)] = SceneObject(**look)
+        found[get_field(listed, "object_id", int, where)] = SceneObject(**look)
     return found
 
 
 def _one_of(word: str, key: str, known: tuple[str, ...], path: Path) -> str:
     if word not in known:
-        raise BadRecord(f"{path} has an object of {key} {word!r}, expected {', '.join(known)}")
+        raise RecordError(f"{path} has an object of {key} {word!r}, expected {', '.join(known)}")
     return word
 
 
 def _states(record: dict[str, Any], ids: list[int], path: Path) -> dict[str, np.ndarray]:
     """(F, N, 3) arrays of the vectors, and (F, N) whether an object is in view."""
-    trajectory = entry(record, "motion_trajectory", list, str(path))
+    trajectory = get_field(record, "motion_trajectory", list, str(path))
     where = f"{path}: motion_trajectory"
-    numbered = [entry(moment, "frame_id", int, where) for moment in trajectory]
+    numbered = [get_field(moment, "frame_id", int, where) for moment in trajectory]
     if numbered != list(range(FRAMES)):
-        raise BadRecord(f"{path} has {len(numbered)} frames, expected 0 to {FRAMES - 1} in order")
+        raise RecordError(f"{path} has {len(numbered)} frames, expected 0 to {FRAMES - 1} in order")
     columns: dict[str, list[list[Any]]] = {key: [] for key in (*VECTORS, "inside_camera_view")}
     for frame, moment in enumerate(trajectory):
         where = f"{path}: frame {frame}"
         by_id = {
-            entry(state, "object_id", int, where): state
-            for state in entry(moment, "objects", list, where)
+            get_field(state, "object_id", int, where): state
+            for state in get_field(moment, "objects", list, where)
         }
         if sorted(by_id) != sorted(ids):
-            raise BadRecord(f"{where} lists objects {sorted(by_id)}, expected {sorted(ids)}")
+            raise RecordError(f"{where} lists objects {sorted(by_id)}, expected {sorted(ids)}")
         for key, rows in columns.items():
             kind = bool if key == "inside_camera_view" else list
-            rows.append([entry(by_id[k], key, kind, where) for k in ids])
+            rows.append([get_field(by_id[k], key, kind, where) for k in ids])
     if any(len(angles) == 4 for row in columns["orientation"] for angles in row):
-        raise BadRecord(
+        raise RecordError(
             f"{path} has orientations of four numbers where CLEVRER's release has three angles: it "
             "is another generator's file"
         )
     shape = (FRAMES, len(ids), 3)
     return {
-        **{key: numbers(columns[key], shape, f"{path}: values of {key!r}") for key in VECTORS},
+        **{key: finite_array(columns[key], shape, f"{path}: values of {key!r}") for key in VECTORS},
         "inside_camera_view": np.array(columns["inside_camera_view"], bool),
     }
 
@@ -162,11 +168,14 @@ def quaternions(angles: np.ndarray) -> np.ndarray:
 
 def _collisions(record: dict[str, Any], ids: list[int], path: Path) -> tuple[Collision, ...]:
     found = []
-    for event in entry(record, "collision", list, str(path)):
+    for event in get_field(record, "collision", list, str(path)):
         where = f"{path}: collision"
-        frame, pair = entry(event, "frame_id", int, where), entry(event, "object_ids", list, where)
+        frame, pair = (
+            get_field(event, "frame_id", int, where),
+            get_field(event, "object_ids", list, where),
+        )
         if not 0 <= frame < FRAMES or len(pair) != 2 or not set(pair) <= set(ids):
-            raise BadRecord(
+            raise RecordError(
                 f"{where} is of objects {pair} at frame {frame}, expected two of {ids} at 0 to "
                 f"{FRAMES - 1}"
             )
@@ -175,24 +184,24 @@ def _collisions(record: dict[str, Any], ids: list[int], path: Path) -> tuple[Col
     return tuple(sorted(found, key=lambda c: (c.frame, c.objects)))
 
 
-def check_footage(scene: Scene, folder: Path) -> None:
+def check_frames(scene: Scene, folder: Path) -> None:
     """Whether a scene's video is there with every frame, counted without decoding any.
 
     Raises:
-        BadRecord: it is missing, cannot be read, or has another number of frames.
+        RecordError: it is missing, cannot be read, or has another number of frames.
     """
     with _opened(scene, folder) as video:
         count = sum(packet.size > 0 for packet in video.demux(video=0))
     if count != scene.frames:
         path = folder / str(scene.footage)
-        raise BadRecord(f"{path} has {count} frames, expected {scene.frames}")
+        raise RecordError(f"{path} has {count} frames, expected {scene.frames}")
 
 
-def images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
+def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
     """Frames of a scene's video as RGB images, by frame index.
 
     Raises:
-        BadRecord: the video cannot be decoded up to the last of them.
+        RecordError: the video cannot be decoded up to the last of them.
     """
     wanted = set(frames)
     found: dict[int, Image.Image] = {}
@@ -204,7 +213,7 @@ def images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image
                 break
     if wanted != found.keys():
         path = folder / str(scene.footage)
-        raise BadRecord(f"{path} ends before frame {min(wanted - found.keys())}")
+        raise RecordError(f"{path} ends before frame {min(wanted - found.keys())}")
     return found
 
 
@@ -214,11 +223,11 @@ def _opened(scene: Scene, folder: Path) -> Iterator[InputContainer]:
 
     path = folder / str(scene.footage)
     if not path.is_file():
-        raise BadRecord(f"{path} is missing: the annotation names it as its video")
+        raise RecordError(f"{path} is missing: the annotation names it as its video")
     try:
         with av.open(str(path)) as video:
             if not video.streams.video:
-                raise BadRecord(f"{path} holds no video")
+                raise RecordError(f"{path} holds no video")
             yield video
     except av.FFmpegError as error:
-        raise BadRecord(f"{path} cannot be decoded: {error.strerror or error}") from error
+        raise RecordError(f"{path} cannot be decoded: {error.strerror or error}") from error

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data.releases.parsing import BadRecord, numbers
+from data.releases.validation import RecordError, finite_array
 
 if TYPE_CHECKING:
     import h5py
@@ -20,7 +20,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
     """A file to read from.
 
     Raises:
-        BadRecord: it is no HDF5, or damaged; also where that shows only on reading.
+        RecordError: it is no HDF5, or damaged; also where that shows only on reading.
     """
     import h5py
 
@@ -28,7 +28,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
         with h5py.File(path, "r") as file:
             yield file
     except (OSError, KeyError, RuntimeError) as error:
-        raise BadRecord(f"{path} is no HDF5 file, damaged or cut off: {error}") from error
+        raise RecordError(f"{path} is no HDF5 file, damaged or cut off: {error}") from error
 
 
 def where(parent: h5py.Group, *keys: str) -> str:
@@ -38,7 +38,7 @@ def where(parent: h5py.Group, *keys: str) -> str:
 
 def group(parent: h5py.Group, key: str) -> h5py.Group:
     if key not in parent or not hasattr(parent[key], "keys"):
-        raise BadRecord(f"{where(parent, key)} is missing, expected a group")
+        raise RecordError(f"{where(parent, key)} is missing, expected a group")
     return parent[key]
 
 
@@ -47,13 +47,13 @@ def dataset(parent: h5py.Group, *names: str) -> h5py.Dataset:
     for name in names:
         if name in parent and hasattr(parent[name], "dtype"):
             return parent[name]
-    raise BadRecord(f"{where(parent, names[0])} is missing, expected a dataset")
+    raise RecordError(f"{where(parent, names[0])} is missing, expected a dataset")
 
 
 def array(parent: h5py.Group, *names: str, shape: tuple[int | None, ...]) -> np.ndarray:
     """Numbers of `shape`, where None stands for any length, as float32."""
     found = dataset(parent, *names)
-    return numbers(found[()], shape, where(found))
+    return finite_array(found[()], shape, where(found))
 
 
 def integers(parent: h5py.Group, name: str, *tail: int) -> np.ndarray:
@@ -61,7 +61,7 @@ def integers(parent: h5py.Group, name: str, *tail: int) -> np.ndarray:
     found = dataset(parent, name)
     values = np.asarray(found[()])
     if values.dtype.kind not in "iuf" or values.size % int(np.prod(tail)):
-        raise BadRecord(
+        raise RecordError(
             f"{where(found)} are {values.dtype} of shape {values.shape}, expected whole numbers"
         )
     return values.reshape(-1, *tail).astype(np.int64)

@@ -18,8 +18,8 @@ from PIL import Image
 
 from data.records import Landing, Scene
 from data.releases import tfrecord
-from data.releases.movi_a_forms import FPS, FRAMES, Example, from_folder, from_record
-from data.releases.parsing import BadRecord, decoded, only_once, scene_id
+from data.releases.movi_a_formats import FPS, FRAMES, Example, from_folder, from_record
+from data.releases.validation import RecordError, check_unique_scenes, decode_image, scene_id
 from data.world.events import first_contacts
 
 LAYOUT = (
@@ -32,7 +32,7 @@ UPRIGHT = 0.7
 """Least vertical share of a floor contact's normal."""
 
 
-def scene_files(folder: Path) -> list[Path]:
+def list_scenes(folder: Path) -> list[Path]:
     """One path a scene, in order: its metadata.json, or a shard's path with the record's number
     behind it (`movi_a-train.tfrecord-00000-of-00512/00003`).
 
@@ -51,7 +51,7 @@ def scene_files(folder: Path) -> list[Path]:
         for number in range(len(tfrecord.offsets(shard)))
     ]
     named = partial(_scene_id, folder=folder)
-    return only_once(folder, sorted(raw) + sorted(records), named, LAYOUT)
+    return check_unique_scenes(folder, sorted(raw) + sorted(records), named, LAYOUT)
 
 
 def _scene_id(path: Path, folder: Path) -> str:
@@ -61,12 +61,12 @@ def _scene_id(path: Path, folder: Path) -> str:
     return scene_id("movi_a", split, shard.partition("-of-")[0], path.name)
 
 
-def read(path: Path, folder: Path, split: str) -> Scene:
-    """The scene of a path that `scene_files` gives. Visible fractions are not known; an object is
+def read_scene(path: Path, folder: Path, split: str) -> Scene:
+    """The scene of a path that `list_scenes` gives. Visible fractions are not known; an object is
     in view where it has a pixel.
 
     Raises:
-        BadRecord: the scene is not as MoVi-A's release has it.
+        RecordError: the scene is not as MoVi-A's release has it.
     """
     raw = path.name == "metadata.json"
     told = from_folder(path.parent) if raw else from_record(path)
@@ -93,7 +93,7 @@ def read(path: Path, folder: Path, split: str) -> Scene:
         landings=_landings(told, real),
         footage=(path.parent if raw else path).relative_to(folder).as_posix(),
     )
-    check_footage(scene, folder)
+    check_frames(scene, folder)
     return scene
 
 
@@ -111,11 +111,11 @@ def _landings(told: Example, real: np.ndarray) -> tuple[Landing, ...]:
     return tuple(sorted(shown, key=lambda landing: (landing.frame, landing.object)))
 
 
-def check_footage(scene: Scene, folder: Path) -> None:
+def check_frames(scene: Scene, folder: Path) -> None:
     """Whether a scene's frames are all there, without decoding any.
 
     Raises:
-        BadRecord: one is missing.
+        RecordError: one is missing.
     """
     place = folder / str(scene.footage)
     if place.is_dir():
@@ -123,26 +123,28 @@ def check_footage(scene: Scene, folder: Path) -> None:
             path for f in range(scene.frames) if not (path := _frame_file(place, f)).exists()
         ]
         if missing:
-            raise BadRecord(f"{missing[0]} is missing, {len(missing)} of {scene.frames} frames are")
+            raise RecordError(
+                f"{missing[0]} is missing, {len(missing)} of {scene.frames} frames are"
+            )
         return
     count = len(_video(place))
     if count != scene.frames:
-        raise BadRecord(f"{place} has a video of {count} frames, expected {scene.frames}")
+        raise RecordError(f"{place} has a video of {count} frames, expected {scene.frames}")
 
 
-def images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
+def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
     """Frames of a scene as RGB images, by frame index.
 
     Raises:
-        BadRecord: one is missing or cannot be decoded.
+        RecordError: one is missing or cannot be decoded.
     """
     place = folder / str(scene.footage)
-    check_footage(scene, folder)
+    check_frames(scene, folder)
     if place.is_dir():
         files = {frame: _frame_file(place, frame) for frame in frames}
-        return {frame: decoded(file.read_bytes(), str(file)) for frame, file in files.items()}
+        return {frame: decode_image(file.read_bytes(), str(file)) for frame, file in files.items()}
     video = _video(place)
-    return {frame: decoded(video[frame], f"{place}: frame {frame}") for frame in frames}
+    return {frame: decode_image(video[frame], f"{place}: frame {frame}") for frame in frames}
 
 
 def _frame_file(place: Path, frame: int) -> Path:
@@ -152,8 +154,8 @@ def _frame_file(place: Path, frame: int) -> Path:
 def _video(place: Path) -> list[bytes]:
     """
     Raises:
-        BadRecord: neither a folder of frames nor a file of records is where it was.
+        RecordError: neither a folder of frames nor a file of records is where it was.
     """
     if not place.parent.is_file():
-        raise BadRecord(f"{place} is missing")
+        raise RecordError(f"{place} is missing")
     return list(tfrecord.example(place.parent, int(place.name), ("video",)).get("video", []))

@@ -22,8 +22,8 @@ from PIL import Image
 
 from data.records import Scene, SceneObject
 from data.releases import hdf5
-from data.releases.parsing import BadRecord, decoded, only_once, scene_id
 from data.releases.physion_contacts import collisions, landings
+from data.releases.validation import RecordError, check_unique_scenes, decode_image, scene_id
 
 if TYPE_CHECKING:
     import h5py
@@ -48,14 +48,14 @@ SCENARIOS = {
 VECTORS = {"positions": 3, "rotations": 4, "velocities": 3, "angular_velocities": 3}
 
 
-def scene_files(folder: Path) -> list[Path]:
+def list_scenes(folder: Path) -> list[Path]:
     """Trials below a folder, in order of their path.
 
     Raises:
         UserError: there are none.
     """
     found = sorted(path for end in ("hdf5", "h5") for path in folder.rglob(f"*.{end}"))
-    return only_once(folder, found, partial(_stimulus, folder=folder), LAYOUT)
+    return check_unique_scenes(folder, found, partial(_stimulus, folder=folder), LAYOUT)
 
 
 def _stimulus(path: Path, folder: Path) -> str:
@@ -63,19 +63,19 @@ def _stimulus(path: Path, folder: Path) -> str:
     return "_".join(path.relative_to(folder).with_suffix("").parts)
 
 
-def read(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
+def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
     """The scene of a trial. Objects are told apart by the name of their model; visible fractions
     are not known, and an object is in view where the segmentation image has its colour.
 
     Raises:
-        BadRecord: the file is not as Physion's trials are, or is cut off.
+        RecordError: the file is not as Physion's trials are, or is cut off.
     """
     with hdf5.opened(path) as file:
         static, moments = hdf5.group(file, "static"), _moments(file)
         ids = hdf5.integers(static, "object_ids").tolist()
         models = [_text(name) for name in hdf5.dataset(static, "model_names")[()]]
         if len(models) != len(ids):
-            raise BadRecord(f"{path} names {len(models)} models of {len(ids)} objects")
+            raise RecordError(f"{path} names {len(models)} models of {len(ids)} objects")
         colors = hdf5.array(static, "object_segmentation_colors", shape=(len(ids), 3))
         columns = {
             key: np.stack([_of_objects(moment, key, (len(ids), n)) for moment in moments])
@@ -108,7 +108,7 @@ def read(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
             scenario=scenario,
             footage=path.relative_to(folder).as_posix(),
         )
-    check_footage(scene, folder)
+    check_frames(scene, folder)
     return scene
 
 
@@ -127,7 +127,7 @@ def _scenario(names: str, path: Path) -> str:
     found = re.search(f"(?<![a-z])(?i:{'|'.join(SCENARIOS)})", names)
     if found is None:
         known = ", ".join(dict.fromkeys(SCENARIOS.values()))
-        raise BadRecord(f"{path}: neither its path nor its stimulus name tells one of {known}")
+        raise RecordError(f"{path}: neither its path nor its stimulus name tells one of {known}")
     return SCENARIOS[found.group().lower()]
 
 
@@ -136,11 +136,11 @@ def _moments(file: h5py.File) -> list[h5py.Group]:
     frames = hdf5.group(file, "frames")
     names = sorted(frames)
     if names[:1] not in (["0000"], ["0001"]):
-        raise BadRecord(f"{hdf5.where(frames)} begins with {names[:1]}, expected 0000 or 0001")
+        raise RecordError(f"{hdf5.where(frames)} begins with {names[:1]}, expected 0000 or 0001")
     first = int(names[0])
     for k, name in enumerate(names):
         if name != f"{first + k:04d}":
-            raise BadRecord(f"{hdf5.where(frames)} has {name}, expected {first + k:04d} there")
+            raise RecordError(f"{hdf5.where(frames)} has {name}, expected {first + k:04d} there")
     return [frames[name] for name in names]
 
 
@@ -154,7 +154,7 @@ def _projected(
         for key in ("camera_matrix", "projection_matrix")
     )
     if world.size != 16 or lens.size != 16:
-        raise BadRecord(
+        raise RecordError(
             f"{hdf5.where(cameras)} has matrices of {world.size} and {lens.size} numbers, expected "
             "16 each"
         )
@@ -172,29 +172,29 @@ def _shown(moment: h5py.Group, colors: np.ndarray) -> np.ndarray:
     return np.array([(codes == code).any() for code in colors.astype(np.int32) @ place], bool)
 
 
-def check_footage(scene: Scene, folder: Path) -> None:
+def check_frames(scene: Scene, folder: Path) -> None:
     """Whether a trial has an image of each frame, without decoding any.
 
     Raises:
-        BadRecord: one is missing.
+        RecordError: one is missing.
     """
     path = folder / str(scene.footage)
     with hdf5.opened(path) as file:
         moments = _moments(file)
         if len(moments) != scene.frames:
-            raise BadRecord(f"{path} has {len(moments)} frames, expected {scene.frames}")
+            raise RecordError(f"{path} has {len(moments)} frames, expected {scene.frames}")
         for moment in moments:
             hdf5.dataset(hdf5.group(moment, "images"), *_named("_img"))
 
 
-def images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
+def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
     """Frames of a trial as RGB images, by frame index, from 0 whatever the file calls its first.
 
     Raises:
-        BadRecord: one is missing or cannot be decoded.
+        RecordError: one is missing or cannot be decoded.
     """
     path = folder / str(scene.footage)
-    check_footage(scene, folder)
+    check_frames(scene, folder)
     with hdf5.opened(path) as file:
         moments = _moments(file)
         return {frame: _image(moments[frame], "_img") for frame in frames}
@@ -202,7 +202,7 @@ def images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image
 
 def _image(moment: h5py.Group, key: str) -> Image.Image:
     found = hdf5.dataset(hdf5.group(moment, "images"), *_named(key))
-    return decoded(found[()].tobytes(), hdf5.where(found))
+    return decode_image(found[()].tobytes(), hdf5.where(found))
 
 
 def _of_objects(moment: h5py.Group, key: str, shape: tuple[int, int]) -> np.ndarray:

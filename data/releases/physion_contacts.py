@@ -13,7 +13,7 @@ import numpy as np
 
 from data.records import Collision, Landing
 from data.releases import hdf5
-from data.releases.parsing import BadRecord
+from data.releases.validation import RecordError
 from data.world.events import first_contacts
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def _pairs(moment: h5py.Group) -> list[tuple[list[int], bytes | None]]:
         return [(pair, None) for pair in pairs]
     states = [bytes(state) for state in listed["states"][()].reshape(-1)]
     if len(states) != len(pairs):
-        raise BadRecord(f"{hdf5.where(listed)} has {len(states)} states of {len(pairs)} pairs")
+        raise RecordError(f"{hdf5.where(listed)} has {len(states)} states of {len(pairs)} pairs")
     return list(zip(pairs, states, strict=True))
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data.releases.parsing import BadRecord
+from data.releases.validation import RecordError
 
 HEADER, FOOTER = 12, 4
 """Bytes before and after a record's data."""
@@ -46,25 +46,25 @@ def example(path: Path, number: int, names: Collection[str]) -> dict[str, Featur
     """The features of these names that record `number` of a file has.
 
     Raises:
-        BadRecord: there is no such record, or it is cut off or damaged.
+        RecordError: there is no such record, or it is cut off or damaged.
     """
     starts = offsets(path)
     if number >= len(starts):
-        raise BadRecord(f"{path} has {len(starts)} records, expected one at {number}")
+        raise RecordError(f"{path} has {len(starts)} records, expected one at {number}")
     with open(path, "rb") as file:
         file.seek(starts[number])
         length = _length(file.read(HEADER))
         if length is None:
-            raise BadRecord(
+            raise RecordError(
                 f"{path}: record {number} does not begin with a length and its checksum"
             )
         data = file.read(length)
     if len(data) < length:
-        raise BadRecord(f"{path}: record {number} ends after {len(data)} of {length} bytes")
+        raise RecordError(f"{path}: record {number} ends after {len(data)} of {length} bytes")
     try:
         return _features(memoryview(data), names)
     except (ValueError, IndexError, KeyError, TypeError) as error:
-        raise BadRecord(f"{path}: record {number} holds no tf.train.Example: {error}") from error
+        raise RecordError(f"{path}: record {number} holds no tf.train.Example: {error}") from error
 
 
 def _length(header: bytes) -> int | None:

@@ -23,7 +23,7 @@ import pyarrow as pa
 from PIL import Image
 
 from data.records import Scene
-from data.releases.registry import RELEASES
+from data.releases.readers import READERS
 from data.render import renderer
 from data.store import Store, cached_scene, scene_path, write_atomically
 from data.world.standins import view_of
@@ -117,7 +117,7 @@ class FrameCache:
             return {}
         scene = cached_scene(scene_path(self.folder, scene_id))
         if scene.footage is not None:
-            images = RELEASES[self.simulator].images(scene, Path(self.release), frames)
+            images = READERS[self.simulator].load_images(scene, Path(self.release), frames)
             return {frame: np.asarray(image) for frame, image in images.items()}
         render = renderer(self.renderer, self.width, self.height, view_of(self.standin)).render
         return {frame: np.asarray(render(scene, frame)) for frame in frames}

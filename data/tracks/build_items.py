@@ -21,7 +21,7 @@ from typing import Any
 from conf.schema import BenchmarkConfig, Quota
 from data.parallel import Workers
 from data.records import RetrievalQuery, Scene, SelectionItem
-from data.releases import recipes as transfer
+from data.releases import transfer_suites as transfer
 from data.store import PARTS, load_scene, scene_path, write_atomically
 from data.tracks.controls import MATCHED, fill_pairs
 from data.tracks.retrieval import counterfactual, future
@@ -72,14 +72,14 @@ def make_items_and_queries(
 
 def recipes(cfg: BenchmarkConfig) -> Mapping[str, Any]:
     """How the items of a benchmark's suite are made, by family: each has `CELLS` and `draft`."""
-    return transfer.RECIPES.get(suite(cfg), RECIPES)
+    return transfer.TRANSFER_SUITES.get(suite(cfg), RECIPES)
 
 
 def suite(cfg: BenchmarkConfig) -> str:
     """What the benchmark's items belong to."""
     if cfg.standin is not None:
         return f"standin_{cfg.standin}"
-    return cfg.simulator if cfg.simulator in transfer.RECIPES else "dynapix"
+    return cfg.simulator if cfg.simulator in transfer.TRANSFER_SUITES else "dynapix"
 
 
 def family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:

@@ -17,8 +17,8 @@ from conf.errors import UserError
 from conf.schema import BenchmarkConfig
 from data.parallel import Workers
 from data.records import SPLITS
-from data.releases.parsing import BadRecord
-from data.releases.registry import RELEASES
+from data.releases.readers import READERS
+from data.releases.validation import RecordError
 from data.store import PARTS, save_scene, scene_path, write_atomically
 from data.tracks.retrieval import counterfactual
 from data.world.sampling import record, sample_bodies, scene_id, without
@@ -127,7 +127,7 @@ def read_release(
             "benchmark.folder=FOLDER"
         )
     source = Path(cfg.folder)
-    paths = RELEASES[cfg.simulator].scene_files(source)[: cfg.scenes]
+    paths = READERS[cfg.simulator].list_scenes(source)[: cfg.scenes]
     split_of = {path: split for split, found in split_scenes(cfg, paths).items() for path in found}
     parts = {str(path): _record_part(folder, path, split_of[path]) for path in paths}
     jobs = {
@@ -164,11 +164,11 @@ def _record_part(folder: Path, path: Path, split: str) -> Path:
 
 
 def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: Path) -> None:
-    release, source = RELEASES[cfg.simulator], Path(cfg.folder)
+    release, source = READERS[cfg.simulator], Path(cfg.folder)
     rate = {"fps": cfg.fps} if cfg.simulator == "physion" else {}
     try:
-        scene = release.read(path, source, split, **rate)
-    except BadRecord as error:
+        scene = release.read_scene(path, source, split, **rate)
+    except RecordError as error:
         told = {"problem": str(error)}
     else:
         save_scene(scene, scene_path(folder, scene.scene_id))

@@ -16,7 +16,7 @@ from conf.schema import BenchmarkConfig
 from data.publish.clevrer_format import write_clevrer
 from data.records import Collision
 from data.releases import clevrer
-from data.releases.parsing import BadRecord
+from data.releases.validation import RecordError
 from data.render import renderer
 from data.world.geometry import rotation
 from data.world.sampling import simulate_scene
@@ -25,8 +25,8 @@ from tests.data.releases.clevrer_files import clevrer_annotation, write_clevrer_
 
 def test_a_scene_is_as_its_annotation_says(tmp_path: Path) -> None:
     write_clevrer_scene(tmp_path, clevrer_annotation(7), 7)
-    (path,) = clevrer.scene_files(tmp_path)
-    scene = clevrer.read(path, tmp_path, "test")
+    (path,) = clevrer.list_scenes(tmp_path)
+    scene = clevrer.read_scene(path, tmp_path, "test")
     assert (scene.scene_id, scene.split, scene.fps) == ("clevrer-00007", "test", 25)
     assert [o.phrase for o in scene.objects] == ["red metal cube", "blue rubber sphere"]
     assert scene.collisions == (Collision(20, (0, 1)),)
@@ -41,7 +41,7 @@ def test_a_scene_is_as_its_annotation_says(tmp_path: Path) -> None:
 
 def test_angles_turn_about_fixed_axes_x_first(tmp_path: Path) -> None:
     path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
-    turn = rotation(clevrer.read(path, tmp_path, "test").quaternions[0, 0])
+    turn = rotation(clevrer.read_scene(path, tmp_path, "test").quaternions[0, 0])
     (a, b, c) = (0.3, -0.5, 1.1)
     x = [[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]
     y = [[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]]
@@ -51,12 +51,12 @@ def test_angles_turn_about_fixed_axes_x_first(tmp_path: Path) -> None:
 
 def test_frames_are_those_asked_for(tmp_path: Path) -> None:
     path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
-    scene = clevrer.read(path, tmp_path, "test")
-    shown = clevrer.images(scene, tmp_path, [100, 5, 127])
+    scene = clevrer.read_scene(path, tmp_path, "test")
+    shown = clevrer.load_images(scene, tmp_path, [100, 5, 127])
     assert sorted(shown) == [5, 100, 127]
     for frame, image in shown.items():
         assert np.asarray(image).mean() == pytest.approx(frame + 60, abs=1.5)
-    assert clevrer.images(scene, tmp_path, []) == {}
+    assert clevrer.load_images(scene, tmp_path, []) == {}
 
 
 def rename(record: dict) -> None:
@@ -106,49 +106,49 @@ def test_what_only_looks_like_a_release_is_refused(tmp_path: Path, trap: str) ->
     record = clevrer_annotation()
     spoil(record)
     path, _ = write_clevrer_scene(tmp_path, record)
-    with pytest.raises(BadRecord, match=said) as refusal:
-        clevrer.read(path, tmp_path, "test")
+    with pytest.raises(RecordError, match=said) as refusal:
+        clevrer.read_scene(path, tmp_path, "test")
     assert str(refusal.value).startswith(str(path))
 
 
 @pytest.mark.parametrize("text", ["", "[]", json.dumps(clevrer_annotation())[:4000]])
 def test_a_broken_annotation_is_refused(tmp_path: Path, text: str) -> None:
     path, _ = write_clevrer_scene(tmp_path, text, 10800)
-    with pytest.raises(BadRecord, match=r"annotation_10800.json (is not whole|holds a list)"):
-        clevrer.read(path, tmp_path, "test")
+    with pytest.raises(RecordError, match=r"annotation_10800.json (is not whole|holds a list)"):
+        clevrer.read_scene(path, tmp_path, "test")
 
 
 def test_a_video_that_is_not_whole_is_refused(tmp_path: Path) -> None:
     path, video = write_clevrer_scene(tmp_path, clevrer_annotation(), video_frames=120)
-    with pytest.raises(BadRecord, match=r"video_00000.mp4 has 120 frames, expected 128"):
-        clevrer.read(path, tmp_path, "test")
+    with pytest.raises(RecordError, match=r"video_00000.mp4 has 120 frames, expected 128"):
+        clevrer.read_scene(path, tmp_path, "test")
     whole = video.read_bytes()
     for damaged in (whole[: len(whole) // 2], b"no video at all"):
         video.write_bytes(damaged)
         with pytest.raises(
-            BadRecord, match=r"video_00000.mp4 (cannot be decoded|has [0-9]+ frames)"
+            RecordError, match=r"video_00000.mp4 (cannot be decoded|has [0-9]+ frames)"
         ):
-            clevrer.read(path, tmp_path, "test")
+            clevrer.read_scene(path, tmp_path, "test")
     video.unlink()
-    with pytest.raises(BadRecord, match=r"video_00000.mp4 is missing"):
-        clevrer.read(path, tmp_path, "test")
+    with pytest.raises(RecordError, match=r"video_00000.mp4 is missing"):
+        clevrer.read_scene(path, tmp_path, "test")
 
 
 def test_a_folder_without_scenes_is_refused_with_the_layout(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds no scene: expected annotation_train/"):
-        clevrer.scene_files(tmp_path)
+        clevrer.list_scenes(tmp_path)
     with pytest.raises(UserError, match="there is no folder"):
-        clevrer.scene_files(tmp_path / "nowhere")
+        clevrer.list_scenes(tmp_path / "nowhere")
 
 
 def test_scenes_come_in_order_and_once(tmp_path: Path) -> None:
     for index in (1200, 3, 10):
         write_clevrer_scene(tmp_path / "here", clevrer_annotation(index), index, 1)
-    names = [path.stem for path in clevrer.scene_files(tmp_path / "here")]
+    names = [path.stem for path in clevrer.list_scenes(tmp_path / "here")]
     assert names == ["annotation_00003", "annotation_00010", "annotation_01200"]
     write_clevrer_scene(tmp_path / "copy", clevrer_annotation(3), 3, 1)
     with pytest.raises(UserError, match="holds scene clevrer-00003 twice"):
-        clevrer.scene_files(tmp_path)
+        clevrer.list_scenes(tmp_path)
 
 
 def test_what_is_exported_is_read_back(tmp_path: Path) -> None:
@@ -159,8 +159,8 @@ def test_what_is_exported_is_read_back(tmp_path: Path) -> None:
     block = "validation/{0}_10000-11000/{0}_10042"
     assert annotation == tmp_path / f"annotation_{block.format('annotation')}.json"
     assert video == tmp_path / f"video_{block.format('video')}.mp4"
-    assert clevrer.scene_files(tmp_path) == [annotation]
-    again = clevrer.read(annotation, tmp_path, "test")
+    assert clevrer.list_scenes(tmp_path) == [annotation]
+    again = clevrer.read_scene(annotation, tmp_path, "test")
     assert (again.objects, again.collisions) == (scene.objects, scene.collisions)
     for name in ("positions", "velocities", "angular_velocities", "in_view"):
         np.testing.assert_array_equal(getattr(again, name), getattr(scene, name))
@@ -169,7 +169,7 @@ def test_what_is_exported_is_read_back(tmp_path: Path) -> None:
         Rotation.from_quat(s.quaternions.reshape(-1, 4).astype(float)) for s in (scene, again)
     )
     assert (turns.inv() * turned).magnitude().max() < 1e-5
-    shown = clevrer.images(again, tmp_path, range(128))
+    shown = clevrer.load_images(again, tmp_path, range(128))
     for frame, image in drawn.items():
         error = np.square(np.asarray(image, float) - np.asarray(shown[frame], float)).mean()
         assert 10 * np.log10(255**2 / error) > 35
@@ -177,8 +177,8 @@ def test_what_is_exported_is_read_back(tmp_path: Path) -> None:
 
 def test_only_what_clevrer_has_is_exported(tmp_path: Path) -> None:
     path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
-    scene = clevrer.read(path, tmp_path, "test")
-    drawn = clevrer.images(scene, tmp_path, range(128))
+    scene = clevrer.read_scene(path, tmp_path, "test")
+    drawn = clevrer.load_images(scene, tmp_path, range(128))
     with pytest.raises(UserError, match="numbered 0 to 14999"):
         write_clevrer(scene, drawn, tmp_path / "new", 15_000)
     with pytest.raises(UserError, match="128 frames and 127 images"):

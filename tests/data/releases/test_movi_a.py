@@ -12,7 +12,7 @@ import pytest
 
 from data.records import Collision, Landing, Scene
 from data.releases import movi_a, tfrecord
-from data.releases.parsing import BadRecord
+from data.releases.validation import RecordError
 from data.world.geometry import rotation
 from tests.data.releases.movi_a_files import (
     movi_example,
@@ -26,13 +26,13 @@ SHARD = "movi_a-train.tfrecord-00003-of-00512"
 
 def from_folder(folder: Path, contacts: list) -> Scene:
     path = write_movi_folder(folder / "00012", movi_example(contacts))
-    return movi_a.read(path, folder, "test")
+    return movi_a.read_scene(path, folder, "test")
 
 
 def from_record(folder: Path, contacts: list) -> Scene:
     write_tfrecord(folder / SHARD, [movi_features(movi_example(contacts))])
-    (path,) = movi_a.scene_files(folder)
-    return movi_a.read(path, folder, "test")
+    (path,) = movi_a.list_scenes(folder)
+    return movi_a.read_scene(path, folder, "test")
 
 
 @pytest.fixture(params=[from_folder, from_record])
@@ -72,7 +72,7 @@ def test_image_positions_become_pixels(read_form, tmp_path: Path) -> None:
 
 def test_frames_are_those_asked_for_without_transparency(read_form, tmp_path: Path) -> None:
     scene = read_form(tmp_path, [])
-    shown = movi_a.images(scene, tmp_path, [17, 2])
+    shown = movi_a.load_images(scene, tmp_path, [17, 2])
     assert {f: image.getpixel((9, 9)) for f, image in shown.items()} == {
         2: (62,) * 3,
         17: (77,) * 3,
@@ -131,8 +131,8 @@ def test_scenes_of_both_forms_are_found_in_order(tmp_path: Path) -> None:
     write_tfrecord(tmp_path / "tfds" / SHARD, [features, features])
     for own in ("metadata.json", "dataset_info.json", "features.json"):
         (tmp_path / "tfds" / own).write_text("{}")
-    paths = movi_a.scene_files(tmp_path)
-    assert [movi_a.read(p, tmp_path, "test").scene_id for p in paths] == [
+    paths = movi_a.list_scenes(tmp_path)
+    assert [movi_a.read_scene(p, tmp_path, "test").scene_id for p in paths] == [
         "movi_a-raw-00003", "movi_a-raw-00012",
         "movi_a-train-00003-00000", "movi_a-train-00003-00001",
     ]  # fmt: skip
@@ -185,18 +185,18 @@ def test_a_folder_that_is_nearly_right_is_refused(tmp_path: Path, trap: str) -> 
     spoil, said = TRAPS[trap]
     path = write_movi_folder(tmp_path / "00012", movi_example([(9.5, 0, 1, 0.5, 0.0)]))
     spoil(path)
-    with pytest.raises(BadRecord, match=said) as refusal:
-        movi_a.read(path, tmp_path, "test")
+    with pytest.raises(RecordError, match=said) as refusal:
+        movi_a.read_scene(path, tmp_path, "test")
     assert str(refusal.value).startswith(str(tmp_path / "00012"))
 
 
 def test_a_folder_that_went_away_is_named(tmp_path: Path) -> None:
     path = write_movi_folder(tmp_path / "00012", movi_example([(9.5, 0, 1, 0.5, 0.0)]))
-    scene = movi_a.read(path, tmp_path, "test")
+    scene = movi_a.read_scene(path, tmp_path, "test")
     shutil.rmtree(tmp_path / "00012")
-    for look in (lambda: movi_a.check_footage(scene, tmp_path),
-                 lambda: movi_a.images(scene, tmp_path, [0])):  # fmt: skip
-        with pytest.raises(BadRecord, match="00012 is missing"):
+    for look in (lambda: movi_a.check_frames(scene, tmp_path),
+                 lambda: movi_a.load_images(scene, tmp_path, [0])):  # fmt: skip
+        with pytest.raises(RecordError, match="00012 is missing"):
             look()
 
 
@@ -223,9 +223,9 @@ def test_a_record_that_is_nearly_right_is_refused(tmp_path: Path, trap: str) -> 
     features = movi_features(movi_example())
     spoil(features)
     write_tfrecord(tmp_path / SHARD, [features])
-    (path,) = movi_a.scene_files(tmp_path)
-    with pytest.raises(BadRecord, match=said):
-        movi_a.read(path, tmp_path, "test")
+    (path,) = movi_a.list_scenes(tmp_path)
+    with pytest.raises(RecordError, match=said):
+        movi_a.read_scene(path, tmp_path, "test")
 
 
 def test_a_shard_that_is_cut_off_keeps_what_is_whole(tmp_path: Path) -> None:
@@ -234,14 +234,14 @@ def test_a_shard_that_is_cut_off_keeps_what_is_whole(tmp_path: Path) -> None:
     whole = shard.read_bytes()
     for cut in (len(whole) - 500, len(whole) * 2 // 3 + 5):
         shard.write_bytes(whole[:cut])
-        *good, bad = movi_a.scene_files(tmp_path)
-        assert [movi_a.read(path, tmp_path, "test").frames for path in good] == [24, 24]
-        with pytest.raises(BadRecord, match=f"{SHARD}: record 2"):
-            movi_a.read(bad, tmp_path, "test")
+        *good, bad = movi_a.list_scenes(tmp_path)
+        assert [movi_a.read_scene(path, tmp_path, "test").frames for path in good] == [24, 24]
+        with pytest.raises(RecordError, match=f"{SHARD}: record 2"):
+            movi_a.read_scene(bad, tmp_path, "test")
     shard.write_bytes(bytes([whole[0] ^ 1]) + whole[1:])
-    (bad,) = movi_a.scene_files(tmp_path)
-    with pytest.raises(BadRecord, match="does not begin with a length and its checksum"):
-        movi_a.read(bad, tmp_path, "test")
+    (bad,) = movi_a.list_scenes(tmp_path)
+    with pytest.raises(RecordError, match="does not begin with a length and its checksum"):
+        movi_a.read_scene(bad, tmp_path, "test")
 
 
 def test_the_checksum_is_crc_32c() -> None:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from data.records import Collision, Landing, Scene
 from data.releases import physion
-from data.releases.parsing import BadRecord
+from data.releases.validation import RecordError
 from data.world.events import onsets
 from tests.data.releases.physion_files import IDS, physion_trial, write_physion
 
@@ -22,7 +22,7 @@ A, B, C = IDS
 
 def read(folder: Path, trial: dict, **version: object) -> Scene:
     path = write_physion(folder / "Collide" / "box" / "0003.hdf5", trial, **version)
-    return physion.read(path, folder, "test")
+    return physion.read_scene(path, folder, "test")
 
 
 def test_a_trial_is_as_its_file_says(tmp_path: Path) -> None:
@@ -32,13 +32,13 @@ def test_a_trial_is_as_its_file_says(tmp_path: Path) -> None:
     assert [o.phrase for o in scene.objects] == ["bowl", "cone", "bowl"]
     assert np.isnan(scene.visible_fraction).all()
     assert scene.footage == "Collide/box/0003.hdf5"
-    shown = physion.images(scene, tmp_path, [59, 0])
+    shown = physion.load_images(scene, tmp_path, [59, 0])
     assert {f: image.getpixel((1, 1))[0] for f, image in shown.items()} == {0: 60, 59: 119}
 
 
 def test_the_frame_rate_is_the_callers(tmp_path: Path) -> None:
     path = write_physion(tmp_path / "drop" / "0000.hdf5", physion_trial())
-    assert physion.read(path, tmp_path, "test", fps=100).fps == 100
+    assert physion.read_scene(path, tmp_path, "test", fps=100).fps == 100
 
 
 def test_up_is_z_and_a_fall_is_down(tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_later_versions_name_cameras_and_begin_at_frame_one(tmp_path: Path) -> N
     assert late.collisions == early.collisions == (Collision(30, (0, 1)),)
     for name in ("positions", "image_positions", "in_view"):
         np.testing.assert_array_equal(getattr(late, name), getattr(early, name))
-    shown = physion.images(late, tmp_path / "late", [0])
+    shown = physion.load_images(late, tmp_path / "late", [0])
     assert shown[0].getpixel((1, 1)) == (60, 60, 60)
 
 
@@ -290,8 +290,8 @@ def test_a_trial_that_is_nearly_right_is_refused(tmp_path: Path, trap: str) -> N
     change, said = TRAPS[trap]
     path = write_physion(tmp_path / "roll" / "0000.hdf5", physion_trial(12))
     change(path)
-    with pytest.raises(BadRecord, match=said) as refusal:
-        physion.read(path, tmp_path, "test")
+    with pytest.raises(RecordError, match=said) as refusal:
+        physion.read_scene(path, tmp_path, "test")
     assert str(refusal.value).startswith(str(path))
 
 
@@ -300,8 +300,8 @@ def test_a_file_that_is_cut_off_is_refused(tmp_path: Path, kept: float) -> None:
     path = write_physion(tmp_path / "roll" / "0000.hdf5", physion_trial(12))
     whole = path.read_bytes()
     path.write_bytes(whole[: int(kept * len(whole))])
-    with pytest.raises(BadRecord, match=r"0000\.hdf5 is no HDF5 file, damaged or cut off"):
-        physion.read(path, tmp_path, "test")
+    with pytest.raises(RecordError, match=r"0000\.hdf5 is no HDF5 file, damaged or cut off"):
+        physion.read_scene(path, tmp_path, "test")
 
 
 @pytest.mark.parametrize(
@@ -320,12 +320,12 @@ def test_the_scenario_is_in_the_path_or_the_name(
 ) -> None:
     path = tmp_path / folder / "0000.hdf5"
     write_physion(path, {**physion_trial(12), "stimulus_name": stimulus})
-    scene = physion.read(path, tmp_path, "test")
+    scene = physion.read_scene(path, tmp_path, "test")
     assert scene.scenario == scenario
     assert scene.scene_id == f"physion-{scenario}-{folder}_0000"
 
 
 def test_a_trial_of_no_known_scenario_is_refused(tmp_path: Path) -> None:
     path = write_physion(tmp_path / "0" / "0.hdf5", {**physion_trial(12), "stimulus_name": "x"})
-    with pytest.raises(BadRecord, match="tells one of Dominoes, Support"):
-        physion.read(path, tmp_path, "test")
+    with pytest.raises(RecordError, match="tells one of Dominoes, Support"):
+        physion.read_scene(path, tmp_path, "test")

@@ -15,7 +15,7 @@ from PIL import Image
 from conf.errors import UserError
 
 
-class BadRecord(UserError):  # noqa: N818
+class RecordError(UserError):
     """A record of a release that is not as published. Its sentence names the file, what was found
     and what was expected; a caller leaves the record out and counts it, or stops."""
 
@@ -25,7 +25,7 @@ def scene_id(suite: str, *parts: str) -> str:
     return "-".join([suite, *(re.sub(r"[^A-Za-z0-9_.-]+", "_", part) for part in parts)])
 
 
-def only_once(
+def check_unique_scenes(
     folder: Path, found: Sequence[Path], id_of: Callable[[Path], str], layout: str
 ) -> list[Path]:
     """`found` as it is, where it names scenes and none of them twice.
@@ -48,40 +48,40 @@ def only_once(
     return list(found)
 
 
-def entry(record: Any, key: str, kind: type, where: str) -> Any:
+def get_field(record: Any, key: str, kind: type, where: str) -> Any:
     """`record[key]`, which must be of `kind`; `where` says whose key it is.
 
     Raises:
-        BadRecord: it is not there, or something else.
+        RecordError: it is not there, or something else.
     """
     if not isinstance(record, dict) or key not in record:
-        raise BadRecord(f"{where} lacks the key {key!r} that the release has")
+        raise RecordError(f"{where} lacks the key {key!r} that the release has")
     if not isinstance(record[key], kind):
-        raise BadRecord(
+        raise RecordError(
             f"{where} has a {type(record[key]).__name__} under {key!r}, expected a {kind.__name__}"
         )
     return record[key]
 
 
-def numbers(values: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
+def finite_array(values: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
     """`values` as float32 of `shape`, where None stands for any length.
 
     Raises:
-        BadRecord: they are of another shape, or not all finite numbers.
+        RecordError: they are of another shape, or not all finite numbers.
     """
     try:
         array = np.asarray(values, np.float64)
     except (TypeError, ValueError) as error:
-        raise BadRecord(f"{where} are not numbers of shape {_spelled(shape)}") from error
+        raise RecordError(f"{where} are not numbers of shape {_spelled(shape)}") from error
     if array.shape == (0,) and shape[0] in (None, 0):
         array = array.reshape(0, *(n or 0 for n in shape[1:]))
     agrees = len(array.shape) == len(shape) and all(
         wanted in (None, found) for wanted, found in zip(shape, array.shape, strict=True)
     )
     if not agrees:
-        raise BadRecord(f"{where} have shape {_spelled(array.shape)}, expected {_spelled(shape)}")
+        raise RecordError(f"{where} have shape {_spelled(array.shape)}, expected {_spelled(shape)}")
     if not np.isfinite(array).all():
-        raise BadRecord(f"{where} are not all finite numbers")
+        raise RecordError(f"{where} are not all finite numbers")
     return array.astype(np.float32)
 
 
@@ -89,13 +89,13 @@ def _spelled(shape: Sequence[int | None]) -> str:
     return f"({', '.join('any' if n is None else str(n) for n in shape)})"
 
 
-def decoded(data: bytes, where: str) -> Image.Image:
+def decode_image(data: bytes, where: str) -> Image.Image:
     """An encoded image as RGB; transparency is dropped, not blended in.
 
     Raises:
-        BadRecord: it cannot be decoded.
+        RecordError: it cannot be decoded.
     """
     try:
         return Image.open(io.BytesIO(data)).convert("RGB")
     except (OSError, SyntaxError, ValueError) as error:
-        raise BadRecord(f"{where} cannot be decoded as an image: {error}") from error
+        raise RecordError(f"{where} cannot be decoded as an image: {error}") from error

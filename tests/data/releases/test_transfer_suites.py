@@ -13,9 +13,9 @@ import pytest
 
 from conf.schema import Quota
 from data.records import Collision, Landing, Scene, SceneObject, SelectionItem
-from data.releases.parsing import BadRecord
-from data.releases.recipes import RECIPES
-from data.releases.registry import RELEASES
+from data.releases.readers import READERS
+from data.releases.transfer_suites import TRANSFER_SUITES
+from data.releases.validation import RecordError
 from data.tracks.selection import event, time
 from data.tracks.selection.distractors import fill
 from data.world.events import onsets
@@ -71,7 +71,7 @@ SCENES = {
 def items_of(
     suite: str, family: str, subtype: str, scenes: dict[str, Scene]
 ) -> list[SelectionItem]:
-    draw = partial(RECIPES[suite][family].draft, subtype)
+    draw = partial(TRANSFER_SUITES[suite][family].draft, subtype)
     names = {"train": [], "test": list(scenes)}
     found, _ = fill(subtype, draw, names, scenes.__getitem__, Quota(0, 24), 0, LEAST)
     return found
@@ -79,7 +79,7 @@ def items_of(
 
 CELLS = [
     (suite, family, subtype)
-    for suite, families in RECIPES.items()
+    for suite, families in TRANSFER_SUITES.items()
     for family, recipe in families.items()
     for subtype in recipe.CELLS
 ]
@@ -198,11 +198,11 @@ def test_what_cannot_be_told_apart_gives_no_item() -> None:
 
 
 def test_readers_and_refusals_can_be_sent_to_processes(tmp_path: Path) -> None:
-    for release in RELEASES.values():
-        job = pickle.loads(pickle.dumps(partial(release.read, tmp_path, tmp_path, "test")))
-        assert job.func is release.read
-        for name in ("scene_files", "check_footage", "images"):
+    for release in READERS.values():
+        job = pickle.loads(pickle.dumps(partial(release.read_scene, tmp_path, tmp_path, "test")))
+        assert job.func is release.read_scene
+        for name in ("list_scenes", "check_frames", "load_images"):
             assert callable(getattr(release, name))
-    refused = pickle.loads(pickle.dumps(BadRecord("a file: what differs")))
-    assert isinstance(refused, BadRecord)
+    refused = pickle.loads(pickle.dumps(RecordError("a file: what differs")))
+    assert isinstance(refused, RecordError)
     assert str(refused) == "a file: what differs"

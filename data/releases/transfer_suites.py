@@ -157,7 +157,7 @@ PHYSION_EVENTS = {
 }
 PHYSION_TIMES = {"in_1s": ahead(1), "in_2s": ahead(2)}
 
-RECIPES = {
+TRANSFER_SUITES = {
     "movi_a": {
         "event": Recipe("movi_a", "event", same=1, later=False, CELLS=MOVI_A_EVENTS),
         "time": Recipe("movi_a", "time", same=1, later=False, CELLS=MOVI_A_TIMES),
@@ -167,10 +167,10 @@ RECIPES = {
         "time": Recipe("physion", "time", same=2, later=True, CELLS=PHYSION_TIMES),
     },
 }
-RECIPES |= {
+TRANSFER_SUITES |= {
     f"standin_{suite}": {
         family: replace(recipe, suite=f"standin_{suite}") for family, recipe in by.items()
     }
-    for suite, by in RECIPES.items()
+    for suite, by in TRANSFER_SUITES.items()
 }
 """Scenes that stand in for a suite's take its recipe under a name of their own."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from data.records import SceneObject
 from data.releases import tfrecord
-from data.releases.parsing import BadRecord, entry, numbers
+from data.releases.validation import RecordError, finite_array, get_field
 
 FRAMES, FPS = 24, 12
 LABELS = {
@@ -61,34 +61,38 @@ class Example:
 def from_folder(folder: Path) -> Example:
     metadata, events = (_parsed(folder / name) for name in ("metadata.json", "events.json"))
     where = str(folder / "metadata.json")
-    about = entry(metadata, "metadata", dict, where)
+    about = get_field(metadata, "metadata", dict, where)
     _check_clock(
-        entry(about, "num_frames", int, where), entry(about, "frame_rate", int, where), where
+        get_field(about, "num_frames", int, where),
+        get_field(about, "frame_rate", int, where),
+        where,
     )
-    width, height = numbers(entry(about, "resolution", list, where), (2,), f"{where}: resolution")
-    instances = entry(metadata, "instances", list, where)
+    width, height = finite_array(
+        get_field(about, "resolution", list, where), (2,), f"{where}: resolution"
+    )
+    instances = get_field(metadata, "instances", list, where)
     looks = tuple(
-        SceneObject(**{axis: entry(i, key, str, where) for axis, key in RAW_KEYS.items()})
+        SceneObject(**{axis: get_field(i, key, str, where) for axis, key in RAW_KEYS.items()})
         for i in instances
     )
     for look in looks:
         for axis, words in LABELS.items():
             if getattr(look, axis) not in words:
-                raise BadRecord(
+                raise RecordError(
                     f"{where} has an object of {axis} {getattr(look, axis)!r}, expected "
                     f"{', '.join(words)}"
                 )
 
     def stacked(key: str, *tail: int) -> np.ndarray:
-        values = [entry(i, key, list, where) for i in instances]
-        return numbers(values, (len(looks), FRAMES, *tail), f"{where}: {key}")
+        values = [get_field(i, key, list, where) for i in instances]
+        return finite_array(values, (len(looks), FRAMES, *tail), f"{where}: {key}")
 
     where_events = str(folder / "events.json")
-    contacts = entry(events, "collisions", list, where_events)
+    contacts = get_field(events, "collisions", list, where_events)
 
     def column(key: str, *tail: int) -> np.ndarray:
-        values = [entry(c, key, list if tail else float, where_events) for c in contacts]
-        return numbers(values, (len(contacts), *tail), f"{where_events}: {key}")
+        values = [get_field(c, key, list if tail else float, where_events) for c in contacts]
+        return finite_array(values, (len(contacts), *tail), f"{where_events}: {key}")
 
     return Example(
         objects=looks,
@@ -106,14 +110,14 @@ def _parsed(path: Path) -> Any:
     try:
         return json.loads(path.read_bytes())
     except FileNotFoundError as error:
-        raise BadRecord(f"{path} is missing, which a scene of MoVi-A has") from error
+        raise RecordError(f"{path} is missing, which a scene of MoVi-A has") from error
     except ValueError as error:
-        raise BadRecord(f"{path} is not whole, or no JSON: {error}") from error
+        raise RecordError(f"{path} is not whole, or no JSON: {error}") from error
 
 
 def _check_clock(frames: int, rate: int, where: str) -> None:
     if (frames, rate) != (FRAMES, FPS):
-        raise BadRecord(
+        raise RecordError(
             f"{where} tells of {frames} frames at {rate} a second, expected {FRAMES} at {FPS}"
         )
 
@@ -131,20 +135,22 @@ def from_record(path: Path) -> Example:
     where = f"{path.parent}: record {int(path.name)}"
     missing = [name for name in names if name not in found]
     if missing:
-        raise BadRecord(f"{where} lacks the feature {missing[0]!r} that MoVi-A's release has")
+        raise RecordError(f"{where} lacks the feature {missing[0]!r} that MoVi-A's release has")
 
     def of(name: str, *shape: int) -> np.ndarray:
         values, size = found[name], int(np.prod(shape))
         if len(values) != size:
-            raise BadRecord(f"{where} has {len(values)} values of {name!r}, expected {size}")
-        return numbers(np.reshape(values, shape), shape, f"{where}: {name}")
+            raise RecordError(f"{where} has {len(values)} values of {name!r}, expected {size}")
+        return finite_array(np.reshape(values, shape), shape, f"{where}: {name}")
 
     frames, count, width, height = (int(of(f"metadata/{key}")) for key in about)
     _check_clock(frames, FPS, where)
     looks = {axis: of(f"instances/{axis}_label", count).astype(int) for axis in LABELS}
     for axis, words in LABELS.items():
         if not ((looks[axis] >= 0) & (looks[axis] < len(words))).all():
-            raise BadRecord(f"{where} numbers a {axis} {looks[axis].max()}, of {len(words)} words")
+            raise RecordError(
+                f"{where} numbers a {axis} {looks[axis].max()}, of {len(words)} words"
+            )
     rows = len(found["events/collisions/frame"])
     return Example(
         objects=tuple(
