@@ -41,7 +41,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     from evaluation.retrieval import faiss_index, standard_test
     from models.precision import resolve_precision
 
-    queries, database = standard_test.standard_test(store)
+    queries, database = standard_test.load_standard_test(store)
     frames = Frames(store, preset.image_size)
     ids = [q.query_id for q in queries]
     names = [f.name for f in database]
@@ -55,7 +55,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
         log.info("ranking %s frames with %s", f"{len(names):,}", name)
         if cfg.index == "exact":
             parts = standard_test.in_parts(shown, names)
-            ranks = standard_test.ranks_of(preset, asked, shown.rows(targets), parts)
+            ranks = standard_test.rank_targets(preset, asked, shown.rows(targets), parts)
         else:
             name = f"{name} ({cfg.index})"
             ranks, told = faiss_index.approximate_ranks(
@@ -66,7 +66,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
         rows += breakdown.retrieval_rows(store.name, name, ranks, queries, cfg.seed)
         curves += breakdown.recall_curves(name, ranks, queries)
 
-    apart = breakdown.ranks_apart(found, queries, cfg.seed)
+    apart = breakdown.compare_retrievers(found, queries, cfg.seed)
     told = [tables.ranks_apart_table(apart)] if apart else []
     told += [tables.index_table(indexes)] if indexes else []
     standard_test.write_ranks(run.folder, found, queries)

@@ -37,25 +37,25 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from evaluation.generators import model_source, response_log
     from evaluation.reporting import selection_results
 
-    items = chosen_items(store, cfg.suite, cfg.limit, cfg.seed)
+    items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = Frames(store, student.image_size)
-    model = model_source.asked_model(cfg, folder, trained)
+    model = model_source.open_generator(cfg, folder, trained)
     given, keys, runs = {}, {}, Path(cfg.checkpoints, "select")
     # What a control changes shows only beside the same items as they are.
     for control in dict.fromkeys([None, cfg.control]):
         known = {
-            mode: model_source.known_by(
+            mode: model_source.response_settings(
                 mode, regime, student, cfg.seed, model.revision, store.identity, control
             )
             for mode in modes
         }
-        journal = response_log.AnswerLog(run.folder / "answers.jsonl", known, items)
+        journal = response_log.ResponseLog(run.folder / "answers.jsonl", known, items)
         if cfg.control and (taken := journal.take_over(sorted(runs.glob("**/answers.jsonl")))):
             log.info("%d answers are there already, from other runs of this model", taken)
         sample_of = partial(model_source.shown, regime, frames, student, control)
         for mode in modes:
             log.info("asking %s in %s mode%s", model.name, mode, f", {control}" if control else "")
-            given[mode, control] = response_log.ask_all(
+            given[mode, control] = response_log.collect_responses(
                 items, mode, model.say(mode, sample_of), journal
             )
             keys[mode, control] = journal.keys[mode]
@@ -95,7 +95,7 @@ def draw_item(item, chosen, frames, path: Path) -> None:
     )
 
 
-def chosen_items(
+def select_items(
     store: Store, suite: str | None, limit: int | None, seed: int
 ) -> list[SelectionItem]:
     """The test items of a suite that are asked, see `spread`.
@@ -114,10 +114,10 @@ def chosen_items(
             f"{store.folder} has no test items of the {suite or store.suite} suite to measure on"
             f"{hint if suite == MATCHED else ''}"
         )
-    return spread(items, limit, seed)
+    return limit_items(items, limit, seed)
 
 
-def spread(items: list[SelectionItem], limit: int | None, seed: int) -> list[SelectionItem]:
+def limit_items(items: list[SelectionItem], limit: int | None, seed: int) -> list[SelectionItem]:
     """`limit` items in a seeded order that takes the families in turn; all where it is null. Of
     matched-anchor pairs it takes both items or neither."""
     import numpy as np

@@ -32,16 +32,16 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from data.render.frame_cache import Frames
     from data.tracks.controls import MATCHED
     from evaluation.embedders import embed
-    from evaluation.metrics.breakdown import by_subtype, selection_row
-    from evaluation.metrics.calibration import positions
-    from evaluation.metrics.significance import anchors
+    from evaluation.metrics.breakdown import accuracy_by_subtype, selection_row
+    from evaluation.metrics.calibration import measure_position_bias
+    from evaluation.metrics.significance import compare_anchors
     from evaluation.reporting import figures, paper, tables
     from evaluation.reporting.rows import SIMILARITY
     from evaluation.retrieval import nearest_candidate
-    from evaluation.select import chosen_items
+    from evaluation.select import select_items
     from models.precision import resolve_precision
 
-    items = chosen_items(store, cfg.suite, cfg.limit, cfg.seed)
+    items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     candidates = {FrameRef(c.scene_id, c.frame) for item in items for c in item.candidates}
     frames = Frames(store, preset.image_size)
     precision = resolve_precision(trained.train.precision)
@@ -56,13 +56,13 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         told += nearest_candidate.told(name, items, scores)
         how = (None, cfg.seed, cfg.suite)
         rows.append(selection_row(store.name, name, SIMILARITY, items, right, *how))
-        subtypes[name] = by_subtype(items, right)
-        letters[name] = positions(
+        subtypes[name] = accuracy_by_subtype(items, right)
+        letters[name] = measure_position_bias(
             nearest_candidate.letters(scores), [item.letter for item in items]
         )
         if cfg.suite == MATCHED:
             credits = {item.item_id: credit for item, credit in zip(items, right, strict=True)}
-            apart.append((name, anchors(items, credits, cfg.seed)))
+            apart.append((name, compare_anchors(items, credits, cfg.seed)))
 
     write_text(run.folder / "scores.jsonl", "".join(f"{line}\n" for line in told))
     suite = items[0].suite

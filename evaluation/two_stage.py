@@ -45,7 +45,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
 
     from data.render.frame_cache import Frames
     from evaluation.embedders.embed import embedders
-    from evaluation.generators.model_source import asked_model
+    from evaluation.generators.model_source import open_generator
     from evaluation.metrics import breakdown
     from evaluation.reporting import paper, tables
     from evaluation.reporting.rows import UNTRAINED
@@ -53,12 +53,12 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from models.precision import resolve_precision
     from models.student.prompts import text_sample
 
-    queries, database = standard_test.standard_test(store)
+    queries, database = standard_test.load_standard_test(store)
     precision = resolve_precision(frozen.train.precision)
     matcher = next(embedders(matched_by, frozen.retriever, precision, store, run.folder))
     student = trained.student
     sample_of = partial(text_sample, Frames(store, student.image_size), student)
-    model = asked_model(cfg, folder, trained)
+    model = open_generator(cfg, folder, trained)
     name = model.name
     log.info("asking %s", name)
     modes = predicted_texts.modes_of(routes)

@@ -34,7 +34,7 @@ import numpy as np
 
 from conf.errors import UserError
 from data.records import FRAMES as SCENE
-from evaluation.embedders.cache import Embeddings
+from evaluation.embedders.cache import EmbeddingCache
 from evaluation.retrieval.exact_search import Ranks, exact_ranks
 from evaluation.retrieval.faiss_index import approximate_ranks, import_faiss
 
@@ -121,10 +121,10 @@ def measure_index(args: argparse.Namespace) -> None:
     tell(ranks)
 
 
-def written(folder: Path, args: argparse.Namespace) -> Embeddings:
+def written(folder: Path, args: argparse.Namespace) -> EmbeddingCache:
     """Random embeddings where `evaluation.embedders.cache` has a model's; those that are there are
     kept."""
-    shown = Embeddings(folder, "frame", {"weights": "random", "entries": args.widths[0]})
+    shown = EmbeddingCache(folder, "frame", {"weights": "random", "entries": args.widths[0]})
     things = {name(k): k for k in range(args.frames)}
     shown.complete(things, lambda some: vectors(some, args.widths[0]), SCENE)
     return shown

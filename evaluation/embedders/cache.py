@@ -47,7 +47,7 @@ class Part:
     names: list[str]
 
 
-class Embeddings:
+class EmbeddingCache:
     """One model's embeddings of one kind of thing, by name."""
 
     def __init__(self, root: Path, kind: str, about: Mapping[str, Any]) -> None:

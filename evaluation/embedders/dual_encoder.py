@@ -56,7 +56,7 @@ class DualEncoder:
             for q in asked
         ]
         prefixes = self.watch(clips) if self.watch else self._means(clips)
-        return unit(prefixes + self.texts([q.question for q in asked]))
+        return unit_rows(prefixes + self.texts([q.question for q in asked]))
 
     def frames(self, shown: list[FrameRef], frames: Frames) -> np.ndarray:
         return self.drawn([frames.array(f.scene_id, f.frame) for f in shown])
@@ -79,18 +79,18 @@ class DualEncoder:
         if self.language.config.model_type.startswith("siglip"):
             given = {"input_ids": given["input_ids"]}
         with torch.inference_mode():
-            return unit(as_array(self.language.get_text_features(**given).pooler_output))
+            return unit_rows(as_array(self.language.get_text_features(**given).pooler_output))
 
     def _means(self, clips: list[np.ndarray]) -> np.ndarray:
         ends = np.cumsum([len(clip) for clip in clips])[:-1]
         each = np.split(self._seen(np.concatenate(clips)), ends)
-        return unit(np.stack([embeddings.mean(axis=0) for embeddings in each]))
+        return unit_rows(np.stack([embeddings.mean(axis=0) for embeddings in each]))
 
     def _seen(self, pixels: np.ndarray) -> np.ndarray:
         """Of (images, S, S, 3) uint8."""
         shown = pixel_values(self.image_processor, pixels)
         with torch.inference_mode():
-            return unit(
+            return unit_rows(
                 np.concatenate(
                     [
                         as_array(self.images.get_image_features(**part).pooler_output)
@@ -121,7 +121,7 @@ def at_once(
         }
 
 
-def unit(rows: np.ndarray) -> np.ndarray:
+def unit_rows(rows: np.ndarray) -> np.ndarray:
     """Rows of length 1, fp32; a row of zeros stays."""
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     return (rows / np.where(lengths > 0, lengths, 1)).astype(np.float32)

@@ -21,7 +21,7 @@ from conf.schema import RetrieverConfig
 from data.records import FrameRef
 from data.render.frame_cache import Frames, resized
 from data.store import Store
-from evaluation.embedders.cache import Embeddings
+from evaluation.embedders.cache import EmbeddingCache
 from evaluation.reporting.rows import UNTRAINED
 from models.checks import (
     check_base,
@@ -152,7 +152,7 @@ def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Em
 
 def embed_queries(
     embedder: Embedder, queries: Sequence[Query], store: Store, frames: Frames, batch: int
-) -> Embeddings:
+) -> EmbeddingCache:
     """The embeddings of prefixes with their questions, by name; pixels are read a batch at
     a time.
 
@@ -171,7 +171,7 @@ def embed_queries(
 
 def embed_frames(
     embedder: Embedder, database: Iterable[FrameRef], store: Store, frames: Frames, batch: int
-) -> Embeddings:
+) -> EmbeddingCache:
     """The embeddings of frames, by name. Errors are those of `embed_queries`."""
     about = {"instruction": embedder.preset.frame_instruction}
     ordered = sorted(database, key=lambda f: (f.scene_id, f.frame))
@@ -181,7 +181,9 @@ def embed_frames(
     )
 
 
-def embed_texts(embedder: Embedder, texts: Iterable[str], store: Store, batch: int) -> Embeddings:
+def embed_texts(
+    embedder: Embedder, texts: Iterable[str], store: Store, batch: int
+) -> EmbeddingCache:
     """The embeddings of texts that stand for a query by themselves, by the text. Errors are those
     of `embed_queries`."""
     about = {"instruction": embedder.preset.query_instruction}
@@ -192,7 +194,7 @@ def embed_texts(embedder: Embedder, texts: Iterable[str], store: Store, batch: i
 
 def embed_images(
     embedder: Embedder, images: Mapping[str, Path], store: Store, batch: int
-) -> Embeddings:
+) -> EmbeddingCache:
     """The embeddings of images in files, by their names, made as those of frames are. Errors are
     those of `embed_queries`."""
     about = {"instruction": embedder.preset.frame_instruction}
@@ -218,7 +220,7 @@ def _embedded(
     encode: Callable[[Encoder, list[Thing]], np.ndarray],
     store: Store,
     batch: int,
-) -> Embeddings:
+) -> EmbeddingCache:
     preset = embedder.preset
 
     def embed(some: list[Thing]) -> np.ndarray:
@@ -233,7 +235,7 @@ def _embedded(
             check_widths(preset, rows.shape[1])
         return rows
 
-    kept = Embeddings(store.folder / EMBEDDINGS, kind, embedder.about(store) | about)
+    kept = EmbeddingCache(store.folder / EMBEDDINGS, kind, embedder.about(store) | about)
     kept.complete(things, embed, batch)
     if preset.late is None:
         check_widths(preset, kept.width)

@@ -25,7 +25,7 @@ from evaluation.embedders.dual_encoder import (
     check_size,
     check_words,
     pixel_values,
-    unit,
+    unit_rows,
     whole,
 )
 from models.loading import UNREADABLE, check_reachable, load_error
@@ -122,7 +122,7 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
                 as_array(video.get_image_features(**part).pooler_output)
                 for part in at_once(shown, video, times)
             ]
-        return unit(np.concatenate(each).reshape(len(clips), times, -1).mean(axis=1))
+        return unit_rows(np.concatenate(each).reshape(len(clips), times, -1).mean(axis=1))
 
     return DualEncoder(preset, image, video, tokenizer, processor, watch)
 

@@ -11,7 +11,7 @@ from xgrammar.contrib.hf import LogitsProcessor
 
 from conf.schema import StudentConfig
 from evaluation.generators.constrained_decoding import record_grammar
-from evaluation.generators.response_log import Keep, Thing, seed_of
+from evaluation.generators.response_log import SaveResponses, Subject, response_seed
 from models.memory import explain_out_of_memory
 from models.student.collator import Collator
 from models.student.generation import THOUGHT, generate, response_token_limit
@@ -27,9 +27,9 @@ def say(
     batch: int,
     seed: int,
     mode: str,
-    sample_of: Callable[[Thing], Sample],
-    things: list[Thing],
-    keep: Keep,
+    sample_of: Callable[[Subject], Sample],
+    things: list[Subject],
+    keep: SaveResponses,
 ) -> None:
     """Have a model answer in `mode`, as `sample_of` shows and asks each; in constrained mode it can
     write nothing but a record.
@@ -42,7 +42,7 @@ def say(
     grammar = record_grammar(model, processor) if mode == "constrained" else None
     for start in range(0, len(things), batch):
         group = things[start : start + batch]
-        steps = sampling_processors(cfg, [seed_of(seed, thing, mode) for thing in group])
+        steps = sampling_processors(cfg, [response_seed(seed, thing, mode) for thing in group])
         if grammar is not None:
             # Before tokens are drawn from what is left.
             steps.insert(0, LogitsProcessor(grammar))

@@ -15,7 +15,7 @@ from conf.schema import SelectCommand, SftCommand, StudentConfig, TwoStageComman
 from data.records import SelectionItem
 from data.render.frame_cache import Frames
 from evaluation.generators import local, openai_server
-from evaluation.generators.response_log import RECORDS, Keep, Say, Thing
+from evaluation.generators.response_log import RECORD_MODES, Respond, SaveResponses, Subject
 from evaluation.generators.response_schema import instruction as record_instruction
 from evaluation.generators.response_schema import schema
 from models import checks, loading, memory
@@ -33,25 +33,25 @@ log = logging.getLogger(__name__)
 INPUTS = 1
 """Rises with how an item is put to a model, so that no earlier answer is taken for one."""
 
-SampleOf = Callable[[str, Thing], Sample]
+SampleOf = Callable[[str, Subject], Sample]
 """Shows and asks a thing in a mode."""
 
 
 @dataclass(frozen=True)
-class Asked:
+class Generator:
     """A model that can be asked: its name for a table, what its answers are known by, and
     `say(mode, sample_of)`, by which it answers things as `sample_of` shows and asks them."""
 
     name: str
     revision: dict[str, Any]
-    say: Callable[[str, SampleOf], Say]
+    say: Callable[[str, SampleOf], Respond]
 
 
-def asked_model(
+def open_generator(
     cfg: SelectCommand | TwoStageCommand,
     folder: Path | None,
     trained: SftCommand | SelectCommand | TwoStageCommand,
-) -> Asked:
+) -> Generator:
     """The model that `cfg` names: at servers where it names some, else on this machine. `trained`
     are the settings of the run in `folder`, or the command's own.
 
@@ -68,7 +68,7 @@ def model_here(
     folder: Path | None,
     student: StudentConfig,
     precision: str,
-) -> Asked:
+) -> Generator:
     """A model that is loaded on this machine, when it is first asked: the student in a run's or an
     export's `folder`, or the base.
 
@@ -90,8 +90,8 @@ def model_here(
             return loading.for_inference(model), processor
         return loading.load_trained(student, precision, weights)
 
-    def say(mode: str, sample_of: SampleOf) -> Say:
-        def answer(things: list[Thing], keep: Keep) -> None:
+    def say(mode: str, sample_of: SampleOf) -> Respond:
+        def answer(things: list[Subject], keep: SaveResponses) -> None:
             shown = partial(sample_of, mode)
             local.say(*loaded(), student, precision, cfg.batch, cfg.seed, mode, shown, things, keep)
 
@@ -106,12 +106,12 @@ def model_here(
     }
     if student.architecture is not None and folder is None:
         revision["architecture"] = asdict(student.architecture)
-    return Asked(_title(folder, student), revision, say)
+    return Generator(_title(folder, student), revision, say)
 
 
 def model_served(
     cfg: SelectCommand | TwoStageCommand, folder: Path | None, student: StudentConfig
-) -> Asked:
+) -> Generator:
     """A model that servers have.
 
     Raises:
@@ -150,14 +150,14 @@ def model_served(
     told["weights"] = checks.weights_digest(told["root"], told["parent"], weights)
     told["processor"] = checks.processor_digest(seen)
 
-    def say(mode: str, sample_of: SampleOf) -> Say:
-        def answer(things: list[Thing], keep: Keep) -> None:
+    def say(mode: str, sample_of: SampleOf) -> Respond:
+        def answer(things: list[Subject], keep: SaveResponses) -> None:
             shown = partial(sample_of, mode)
             asyncio.run(openai_server.say(server, student, cfg.seed, mode, shown, things, keep))
 
         return answer
 
-    return Asked(_title(folder, student), {"served": server.model, **told}, say)
+    return Generator(_title(folder, student), {"served": server.model, **told}, say)
 
 
 def _title(folder: Path | None, student: StudentConfig) -> str:
@@ -166,7 +166,7 @@ def _title(folder: Path | None, student: StudentConfig) -> str:
 
 def told(mode: str, regime: str) -> str:
     """What a model is told to write in a mode; `regime` is how a student was trained."""
-    return record_instruction() if mode in RECORDS else instruction(mode, regime)
+    return record_instruction() if mode in RECORD_MODES else instruction(mode, regime)
 
 
 def shown(
@@ -181,7 +181,7 @@ def shown(
     return instructed_sample(item, mode, told(mode, regime), frames, cfg, control=control)
 
 
-def known_by(
+def response_settings(
     mode: str,
     regime: str,
     student: StudentConfig,

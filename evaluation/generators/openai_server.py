@@ -16,7 +16,7 @@ from PIL import Image
 
 from conf.errors import UserError
 from conf.schema import ServerConfig, StudentConfig
-from evaluation.generators.response_log import Keep, Thing, seed_of
+from evaluation.generators.response_log import SaveResponses, Subject, response_seed
 from evaluation.generators.response_schema import schema
 from models.student.generation import THOUGHT, GeneratedText, response_token_limit
 from models.student.prompts import Clip, Sample
@@ -36,9 +36,9 @@ async def say(
     cfg: StudentConfig,
     seed: int,
     mode: str,
-    sample_of: Callable[[Thing], Sample],
-    things: list[Thing],
-    keep: Keep,
+    sample_of: Callable[[Subject], Sample],
+    things: list[Subject],
+    keep: SaveResponses,
 ) -> None:
     """Have a served model answer in `mode`, as `sample_of` shows and asks each.
 
@@ -55,11 +55,11 @@ async def say(
         request = request_of(cfg, mode, first.clip)
         async with Client(server, request, chat_of(blank(first))) as client:
 
-            async def ask(thing: Thing) -> None:
+            async def ask(thing: Subject) -> None:
                 chat, clip = await loop.run_in_executor(desk, _shown, sample_of, thing)
                 own = request_of(cfg, mode, clip)
                 if cfg.temperature:
-                    own["seed"] = seed_of(seed, thing, mode)
+                    own["seed"] = response_seed(seed, thing, mode)
                 try:
                     [reply] = await client.ask(chat, **own)
                 except UnansweredError as fault:
@@ -72,7 +72,7 @@ async def say(
             await in_lanes(things, server.concurrency, ask)
 
 
-def _shown(sample_of: Callable[[Thing], Sample], thing: Thing) -> tuple[Chat, Clip | None]:
+def _shown(sample_of: Callable[[Subject], Sample], thing: Subject) -> tuple[Chat, Clip | None]:
     sample = sample_of(thing)
     return chat_of(sample), sample.clip
 

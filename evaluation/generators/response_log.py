@@ -17,14 +17,14 @@ from data.records import FrameRef, RetrievalQuery, SelectionItem
 from evaluation.generators.response_schema import Record, parse, read_record
 from models.student.generation import GeneratedText
 
-Thing = SelectionItem | RetrievalQuery | FrameRef
+Subject = SelectionItem | RetrievalQuery | FrameRef
 """What a model is asked about."""
-Keep = Callable[[list[tuple[Thing, GeneratedText]]], None]
+SaveResponses = Callable[[list[tuple[Subject, GeneratedText]]], None]
 """Takes what was said to some things as soon as it is there."""
-Say = Callable[[list[Thing], Keep], None]
+Respond = Callable[[list[Subject], SaveResponses], None]
 """Has a model answer and keeps what it says."""
 
-RECORDS = ("record", "constrained")
+RECORD_MODES = ("record", "constrained")
 """Modes in which the structured record is asked for."""
 
 
@@ -50,7 +50,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Told:
+class FreeTextResponse:
     """What a model said where no letter is asked for, about the query or frame of that name."""
 
     item_id: str
@@ -59,13 +59,13 @@ class Told:
     cut: bool
 
 
-Kept = Answer | Told
+Response = Answer | FreeTextResponse
 
 
-def judge(item: SelectionItem, mode: str, written: GeneratedText) -> Answer:
+def score_response(item: SelectionItem, mode: str, written: GeneratedText) -> Answer:
     """What a text says to an item, and whether that is right."""
     choice = parse(written.text, cut=written.cut)
-    valid = read_record(written.text) is not None if mode in RECORDS else None
+    valid = read_record(written.text) is not None if mode in RECORD_MODES else None
     return Answer(
         item.item_id,
         mode,
@@ -78,12 +78,12 @@ def judge(item: SelectionItem, mode: str, written: GeneratedText) -> Answer:
     )
 
 
-def as_told(thing: Thing, mode: str, written: GeneratedText) -> Told:
+def free_text_response(thing: Subject, mode: str, written: GeneratedText) -> FreeTextResponse:
     """A text as it was written, which nothing judges."""
-    return Told(thing.name, mode, written.text, written.cut)
+    return FreeTextResponse(thing.name, mode, written.text, written.cut)
 
 
-class AnswerLog:
+class ResponseLog:
     """The answers in a file, one JSON line each, by what they are answers to.
 
     `asked` says it of each mode, in plain values: the model's revision, the items, the prompt, how
@@ -96,8 +96,8 @@ class AnswerLog:
         self,
         path: Path,
         asked: dict[str, dict[str, Any]],
-        things: Sequence[Thing],
-        judged: Callable[[Thing, str, GeneratedText], Kept] = judge,
+        things: Sequence[Subject],
+        judged: Callable[[Subject, str, GeneratedText], Response] = score_response,
     ) -> None:
         self._path = path
         self.keys = {mode: _key(mode, what) for mode, what in asked.items()}
@@ -124,7 +124,7 @@ class AnswerLog:
             self.append([a for a in found if (a.item_id, a.mode) not in self.answers])
         return len(self.answers) - before
 
-    def _read(self, path: Path) -> list[tuple[Kept | None, dict[str, Any]]]:
+    def _read(self, path: Path) -> list[tuple[Response | None, dict[str, Any]]]:
         """The objects in a file's lines, each with the answer where it is one to what is asked.
         What a kill tore is left out: that is asked again."""
         found = []
@@ -142,7 +142,7 @@ class AnswerLog:
     def _bears_key(self, row: dict[str, Any]) -> bool:
         return row["mode"] in self.keys and row["key"] == self.keys[row["mode"]]
 
-    def append(self, answers: list[Kept]) -> None:
+    def append(self, answers: list[Response]) -> None:
         self._write([json.dumps({**asdict(a), "key": self.keys[a.mode]}) for a in answers])
         self.answers |= {(a.item_id, a.mode): a for a in answers}
 
@@ -158,14 +158,14 @@ def _key(mode: str, asked: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps([mode, asked], sort_keys=True).encode()).hexdigest()[:16]
 
 
-def ask_all(
-    things: Sequence[Thing], mode: str, say: Say, log: AnswerLog, unit: str = "item"
-) -> list[Kept]:
+def collect_responses(
+    things: Sequence[Subject], mode: str, say: Respond, log: ResponseLog, unit: str = "item"
+) -> list[Response]:
     """What is said to each in `mode`; what the log holds is not asked."""
     waiting = [t for t in things if (t.name, mode) not in log.answers]
     with tqdm(total=len(things), initial=len(things) - len(waiting), desc=mode, unit=unit) as bar:
 
-        def keep(said: list[tuple[Thing, GeneratedText]]) -> None:
+        def keep(said: list[tuple[Subject, GeneratedText]]) -> None:
             log.append([log.judged(thing, mode, written) for thing, written in said])
             bar.update(len(said))
 
@@ -174,7 +174,7 @@ def ask_all(
     return [log.answers[t.name, mode] for t in things]
 
 
-def seed_of(seed: int, thing: Thing, mode: str) -> int:
+def response_seed(seed: int, thing: Subject, mode: str) -> int:
     """The seed (32 bits) of the answer that is drawn for a thing in a mode."""
     digest = hashlib.sha256(f"{seed} {mode} {thing.name}".encode()).digest()
     return int.from_bytes(digest[:4], "big")

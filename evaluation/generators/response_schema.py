@@ -14,7 +14,7 @@ from typing import Any
 from jsonschema import Draft202012Validator
 
 from data.records import LETTERS
-from models.student.answer_parser import parse
+from models.student.answer_parser import parse_choice
 
 AMBIGUITY = ("none", "some", "high")
 """How hard the candidates are to tell apart."""
@@ -89,7 +89,7 @@ def read_record(raw: str) -> Record | None:
     """The record in a model's output, where it is valid: the one that holds a choice, JSON that
     has every field as the schema has it, and one letter that nothing contradicts. What stands
     around it does not count."""
-    choice = parse(raw)
+    choice = parse_choice(raw)
     if choice.record is None or choice.letter is None:
         return None
     try:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data.records import FAMILIES
-from evaluation.metrics.intervals import Interval, wilson
+from evaluation.metrics.intervals import Interval, wilson_interval
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Accuracy:
     micro: Interval
 
 
-def accuracy_by(groups: Sequence[str], correct: Sequence[float]) -> dict[str, Interval]:
+def accuracy_by_group(groups: Sequence[str], correct: Sequence[float]) -> dict[str, Interval]:
     """Accuracy of each group of items, in order of name.
 
     Args:
@@ -36,14 +36,14 @@ def accuracy_by(groups: Sequence[str], correct: Sequence[float]) -> dict[str, In
     return {str(g): _interval(correct[groups == g]) for g in np.unique(groups)}
 
 
-def accuracy_table(families: Sequence[str], correct: Sequence[float]) -> Accuracy:
+def accuracy_by_family(families: Sequence[str], correct: Sequence[float]) -> Accuracy:
     """Accuracy by family, their plain mean (macro) over the families present, and over all items
     (micro).
 
     Raises:
         ValueError: no items, not one credit an item, or a family that does not exist.
     """
-    found = accuracy_by(families, correct)
+    found = accuracy_by_group(families, correct)
     if not found or set(found) - set(FAMILIES):
         raise ValueError(f"families {sorted(found)}: expected some of {', '.join(FAMILIES)}")
     ordered = {f: found[f] for f in FAMILIES if f in found}
@@ -53,5 +53,5 @@ def accuracy_table(families: Sequence[str], correct: Sequence[float]) -> Accurac
 
 def _interval(correct: np.ndarray) -> Interval:
     return Interval(
-        float(correct.mean()), *wilson(float(correct.sum()), len(correct)), len(correct)
+        float(correct.mean()), *wilson_interval(float(correct.sum()), len(correct)), len(correct)
     )

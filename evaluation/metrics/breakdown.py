@@ -11,9 +11,9 @@ import numpy as np
 
 from data.records import RetrievalQuery, SelectionItem
 from data.tracks.selection.time import CELLS
-from evaluation.metrics.accuracy import accuracy_by, accuracy_table
+from evaluation.metrics.accuracy import accuracy_by_family, accuracy_by_group
 from evaluation.metrics.intervals import Interval, SceneBootstrap, macro_by_scene
-from evaluation.metrics.ranking import expected_hits, query_measures, summary
+from evaluation.metrics.ranking import expected_hits, query_metrics, summary
 from evaluation.reporting.rows import RECALLS, RetrievalRow, SelectionRow
 from evaluation.retrieval.exact_search import Ranks
 
@@ -34,15 +34,17 @@ def selection_row(
     families = [i.family for i in items]
     macro = macro_by_scene(credits, families, [i.scene_id for i in items], seed)
     timed = [(i, credit) for i, credit in zip(items, credits, strict=True) if i.family == "time"]
-    horizons = accuracy_by([f"{CELLS[i.subtype]} s" for i, _ in timed], [c for _, c in timed])
-    accuracy = accuracy_table(families, credits)
+    horizons = accuracy_by_group([f"{CELLS[i.subtype]} s" for i, _ in timed], [c for _, c in timed])
+    accuracy = accuracy_by_family(families, credits)
     told = (macro, horizons, suite, control)
     return SelectionRow.of(benchmark, name, mode, accuracy, parse_rate, *told)
 
 
-def by_subtype(items: Sequence[SelectionItem], credits: Sequence[float]) -> dict[str, Interval]:
+def accuracy_by_subtype(
+    items: Sequence[SelectionItem], credits: Sequence[float]
+) -> dict[str, Interval]:
     """Accuracy of each cell, named `family/subtype`."""
-    return accuracy_by([f"{i.family}/{i.subtype}" for i in items], credits)
+    return accuracy_by_group([f"{i.family}/{i.subtype}" for i in items], credits)
 
 
 def retrieval_rows(
@@ -55,7 +57,7 @@ def retrieval_rows(
         scenes = SceneBootstrap([queries[k].scene_id for k in of], seed)
         for k, width in enumerate(ranks.widths):
             counts = (ranks.greater[k, of], ranks.tied[k, of], ranks.found[k, of])
-            each = query_measures(*counts, ranks.frames, RECALLS)
+            each = query_metrics(*counts, ranks.frames, RECALLS)
             found = [_measured(measure, values, scenes) for measure, values in each.items()]
             sizes = (len(of), ranks.frames)
             cost = (ranks.bytes and ranks.bytes[k], ranks.seconds and ranks.seconds[k])
@@ -63,7 +65,7 @@ def retrieval_rows(
     return rows
 
 
-def ranks_apart(
+def compare_retrievers(
     ranked: Mapping[str, Ranks], queries: Sequence[RetrievalQuery], seed: int
 ) -> list[dict[str, Any]]:
     """The first of some retrievers less each other one, at every width, over the same queries:
@@ -75,7 +77,7 @@ def ranks_apart(
     for right, other in others:
         for k, width in enumerate(one.widths):
             each = [
-                query_measures(r.greater[k], r.tied[k], r.found[k], r.frames, RECALLS)
+                query_metrics(r.greater[k], r.tied[k], r.found[k], r.frames, RECALLS)
                 for r in (one, other)
             ]
             names = [*(f"recall@{k}" for k in RECALLS), "mrr"]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from data.records import LETTERS
-from evaluation.metrics.intervals import Interval, wilson
+from evaluation.metrics.intervals import Interval, wilson_interval
 
 BINS = 10
 """Bins of equal width that confidences are sorted into."""
@@ -43,7 +43,9 @@ class Calibration:
         return cls(**{**told, "bins": bins})
 
 
-def calibration(confidence: Sequence[float], correct: Sequence[float]) -> Calibration | None:
+def measure_calibration(
+    confidence: Sequence[float], correct: Sequence[float]
+) -> Calibration | None:
     """How reported confidences go with what is right; None of no answers.
 
     Args:
@@ -62,7 +64,7 @@ def calibration(confidence: Sequence[float], correct: Sequence[float]) -> Calibr
     bins = []
     for k in np.unique(of):
         mean, hits = told[of == k].mean(), right[of == k]
-        accuracy = Interval(hits.mean(), *wilson(hits.sum(), len(hits)), len(hits))
+        accuracy = Interval(hits.mean(), *wilson_interval(hits.sum(), len(hits)), len(hits))
         bins.append(Bin(float(k / BINS), float((k + 1) / BINS), float(mean), accuracy))
     gaps = [b.accuracy.n * abs(b.confidence - b.accuracy.value) for b in bins]
     brier = float(((told - right) ** 2).mean())
@@ -70,7 +72,7 @@ def calibration(confidence: Sequence[float], correct: Sequence[float]) -> Calibr
 
 
 @dataclass(frozen=True)
-class Positions:
+class PositionBias:
     """Which letters a model chose and which were right, as counts in their order, and how often it
     was right where each was; of all items, those without a choice among them. `chi_square` and `p`
     hold what it chose against how often each was right: a small p says that it favours a position.
@@ -83,7 +85,7 @@ class Positions:
     p: float | None
 
 
-def positions(chosen: Sequence[str | None], right: Sequence[str]) -> Positions:
+def measure_position_bias(chosen: Sequence[str | None], right: Sequence[str]) -> PositionBias:
     """How a model's letters go with the right ones, an item each.
 
     Raises:
@@ -96,7 +98,7 @@ def positions(chosen: Sequence[str | None], right: Sequence[str]) -> Positions:
     mine, theirs = ({x: letters.count(x) for x in LETTERS} for letters in (own, list(right)))
     hits = {x: sum(c == r == x for c, r in pairs) for x in LETTERS}
     if not own or not all(theirs.values()):
-        return Positions(mine, theirs, hits, None, None)
+        return PositionBias(mine, theirs, hits, None, None)
     expected = np.array([theirs[x] for x in LETTERS]) * len(own) / len(pairs)
     test = chisquare([mine[x] for x in LETTERS], expected)
-    return Positions(mine, theirs, hits, float(test.statistic), float(test.pvalue))
+    return PositionBias(mine, theirs, hits, float(test.statistic), float(test.pvalue))

@@ -18,7 +18,7 @@ class Interval:
     n: int
 
 
-def wilson(successes: float, n: int) -> tuple[float, float]:
+def wilson_interval(successes: float, n: int) -> tuple[float, float]:
     """The 95% Wilson interval of `successes` out of `n`; (0, 1) where n is 0."""
     # Imported here: it takes longer to load than all else that a command needs for its --help.
     from statsmodels.stats.proportion import proportion_confint

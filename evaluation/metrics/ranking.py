@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import digamma
 
 
-def gold_scores(scores: np.ndarray, gold: np.ndarray) -> np.ndarray:
+def target_scores(scores: np.ndarray, gold: np.ndarray) -> np.ndarray:
     """The fp32 scores (queries,) of the gold columns; NaN where there is none.
 
     Args:
@@ -44,7 +44,7 @@ def _columns(gold: Sequence[float | None] | np.ndarray) -> np.ndarray:
     return told.astype(np.int64)
 
 
-def compare(scores: np.ndarray, gold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def count_above_and_equal(scores: np.ndarray, gold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """How many columns score above, and exactly as, each query's gold score.
 
     The sums over blocks of columns are those of the whole matrix, which is how a database is ranked
@@ -65,13 +65,13 @@ def compare(scores: np.ndarray, gold: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return (scores > gold).sum(1), (scores == gold).sum(1)
 
 
-def ranks_of(scores: np.ndarray, gold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def count_ranks(scores: np.ndarray, gold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Frames strictly above the gold frame, and other frames tied with it: two (queries,) arrays.
 
     Both are 0 for a query without a gold score; `gold_scores` says which those are (NaN).
     Arguments and errors are those of `gold_scores`.
     """
-    greater, equal = compare(scores, gold_scores(scores, gold))
+    greater, equal = count_above_and_equal(scores, target_scores(scores, gold))
     return greater, np.maximum(equal - 1, 0)
 
 
@@ -85,7 +85,7 @@ def expected_hits(greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, k: i
     return np.where(valid, hits, 0.0)
 
 
-def metrics_from_counts(
+def ranking_metrics(
     greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, frames: int, ks: Sequence[int]
 ) -> dict[str, float]:
     """Means over all queries, misses among them.
@@ -104,11 +104,11 @@ def metrics_from_counts(
     Raises:
         ValueError: no query at all.
     """
-    each = query_measures(greater, tied, valid, frames, ks)
+    each = query_metrics(greater, tied, valid, frames, ks)
     return {name: float(summary(name)(values)) for name, values in each.items()}
 
 
-def query_measures(
+def query_metrics(
     greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, frames: int, ks: Sequence[int]
 ) -> dict[str, np.ndarray]:
     """Each query's part (queries,) in the measures that `metrics_from_counts` sums up, by name.
@@ -133,11 +133,13 @@ def summary(measure: str) -> Callable[[np.ndarray], float]:
     return np.median if measure == "median_rank" else np.mean
 
 
-def rank_metrics(scores: np.ndarray, gold: np.ndarray, ks: Sequence[int]) -> dict[str, float]:
+def ranking_metrics_of_scores(
+    scores: np.ndarray, gold: np.ndarray, ks: Sequence[int]
+) -> dict[str, float]:
     """`metrics_from_counts` of one score matrix (queries, frames) and its gold columns (queries,).
 
     A gold column that is negative, NaN or None, or a NaN gold score, is a miss. Scores are compared
     in fp32. Errors are those of `gold_scores`, and ValueError where there is no query.
     """
-    valid = ~np.isnan(gold_scores(scores, gold))
-    return metrics_from_counts(*ranks_of(scores, gold), valid, np.shape(scores)[1], ks)
+    valid = ~np.isnan(target_scores(scores, gold))
+    return ranking_metrics(*count_ranks(scores, gold), valid, np.shape(scores)[1], ks)

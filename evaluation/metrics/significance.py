@@ -17,7 +17,7 @@ NAMED = 3
 
 
 @dataclass(frozen=True)
-class Paired:
+class PairedComparison:
     """Two ways of answering the same `n` items, called `left` and `right`; in shares.
 
     `of` says which items: those of a family, or all. `difference` is the left accuracy less the
@@ -41,13 +41,13 @@ class Paired:
     p: float | None = None
 
 
-def compare(
+def compare_runs(
     items: Sequence[SelectionItem],
     left: Mapping[str, float],
     right: Mapping[str, float],
     names: tuple[str, str],
     seed: int,
-) -> list[Paired]:
+) -> list[PairedComparison]:
     """Hold two runs against each other on items that both answered: by family and their macro,
     where there are several, and over all.
 
@@ -60,7 +60,7 @@ def compare(
         UserError: one answered items that the other did not.
         KeyError: neither answered one of `items`.
     """
-    same_items(left, right, names)
+    check_same_items(left, right, names)
     credits = np.array([(left[i.item_id], right[i.item_id]) for i in items], float)
     families = np.array([i.family for i in items])
     scenes = np.array([i.scene_id for i in items])
@@ -74,18 +74,18 @@ def compare(
     return [*found, _paired(names, "all", credits, together, scenes, seed)]
 
 
-def anchors(
+def compare_anchors(
     items: Sequence[SelectionItem], credits: Mapping[str, float], seed: int
-) -> list[Paired]:
+) -> list[PairedComparison]:
     """Hold the two questions of matched-anchor pairs against each other, that which names the event
     (left) and that which names the time (right); `credits` is each item's by its id."""
     matched = pairs(items)
     left = {by_event.item_id: credits[by_event.item_id] for by_event, _ in matched}
     right = {by_event.item_id: credits[by_time.item_id] for by_event, by_time in matched}
-    return compare([by_event for by_event, _ in matched], left, right, ("event", "time"), seed)
+    return compare_runs([by_event for by_event, _ in matched], left, right, ("event", "time"), seed)
 
 
-def same_items(
+def check_same_items(
     left: Mapping[str, float], right: Mapping[str, float], names: tuple[str, str]
 ) -> None:
     """
@@ -112,12 +112,12 @@ def _paired(
     families: np.ndarray,
     scenes: np.ndarray,
     seed: int,
-) -> Paired:
+) -> PairedComparison:
     apart = credits[:, 0] - credits[:, 1]
     means = np.mean([credits[families == f].mean(axis=0) for f in np.unique(families)], axis=0)
     found = macro_by_scene(apart, families, scenes, seed)
     told = (*map(float, means), found.value, found.low, found.high, len(credits))
-    return Paired(*names, of, *told, *(() if of == "macro" else _mcnemar(apart)))
+    return PairedComparison(*names, of, *told, *(() if of == "macro" else _mcnemar(apart)))
 
 
 def _mcnemar(apart: np.ndarray) -> tuple[int, int, float]:

@@ -14,9 +14,9 @@ from conf.schema import SelectCommand
 from data.records import SelectionItem
 from data.tracks.controls import MATCHED
 from evaluation.generators.response_log import Answer
-from evaluation.metrics.breakdown import by_subtype, selection_row
-from evaluation.metrics.calibration import Calibration, calibration, positions
-from evaluation.metrics.significance import Paired, anchors, compare
+from evaluation.metrics.breakdown import accuracy_by_subtype, selection_row
+from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
+from evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
 from evaluation.reporting import figures, paper, tables
 
 log = logging.getLogger(__name__)
@@ -53,9 +53,11 @@ def write_report(
             metrics |= {f"{mode}_{f}": found.value for f, found in row.families.items()}
             metrics |= {f"{mode}_macro": row.macro, f"{mode}_micro": row.micro.value}
             metrics[f"{mode}_parse_rate"] = parsed
-    subtypes = {w: by_subtype(items, [a.right for a in said]) for w, said in told.items()}
+    subtypes = {w: accuracy_by_subtype(items, [a.right for a in said]) for w, said in told.items()}
     truth = [i.letter for i in items]
-    letters = {w: positions([a.letter for a in said], truth) for w, said in told.items()}
+    letters = {
+        w: measure_position_bias([a.letter for a in said], truth) for w, said in told.items()
+    }
     reasons = {w: readings(said) for w, said in told.items()}
     confidences = {w: found for w, said in told.items() if (found := reported(said))}
     apart = differences(given, items, cfg)
@@ -99,14 +101,14 @@ def readings(given: list[Answer]) -> dict[str, int]:
 
 def reported(given: list[Answer]) -> Calibration | None:
     """How the confidence of valid records goes with what is right."""
-    return calibration(
+    return measure_calibration(
         [a.record.confidence for a in given if a.valid], [a.right for a in given if a.valid]
     )
 
 
 def differences(
     given: Given, items: list[SelectionItem], cfg: SelectCommand
-) -> list[tuple[str, list[Paired]]]:
+) -> list[tuple[str, list[PairedComparison]]]:
     """By how the items were asked: what they were answered as they are less what they were under a
     control, and what the event's questions of matched-anchor pairs were less the time's."""
     credits = {asked: {a.item_id: float(a.right) for a in said} for asked, said in given.items()}
@@ -114,7 +116,7 @@ def differences(
     for (mode, control), own in credits.items():
         if control is not None:
             names = ("as they are", control)
-            found.append((mode, compare(items, credits[mode, None], own, names, cfg.seed)))
+            found.append((mode, compare_runs(items, credits[mode, None], own, names, cfg.seed)))
         if cfg.suite == MATCHED:
-            found.append((way(mode, control), anchors(items, own, cfg.seed)))
+            found.append((way(mode, control), compare_anchors(items, own, cfg.seed)))
     return found

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from data.records import FAMILIES, LETTERS
-from evaluation.metrics.calibration import Calibration, Positions
+from evaluation.metrics.calibration import Calibration, PositionBias
 from evaluation.metrics.intervals import Interval
-from evaluation.metrics.significance import Paired
+from evaluation.metrics.significance import PairedComparison
 from evaluation.reporting import paper
 from evaluation.reporting.rows import RECALLS, SIMILARITY, RetrievalRow, SelectionRow
 from evaluation.reporting.table import Table
@@ -79,7 +79,7 @@ def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> Table:
     return Table("subtypes", "Selection accuracy by subtype (%)", head, {"": rows})
 
 
-def paired_table(found: Sequence[tuple[str, Sequence[Paired]]]) -> Table:
+def paired_table(found: Sequence[tuple[str, Sequence[PairedComparison]]]) -> Table:
     """What two ways of answering the same items are apart, by how these were asked."""
     parts = {
         f"{way}: {of[0].left} (left) less {of[0].right} (right)": [
@@ -96,7 +96,7 @@ def paired_table(found: Sequence[tuple[str, Sequence[Paired]]]) -> Table:
     return Table("paired", caption, [*head, "p", "Items"], parts, (note,))
 
 
-def apart_table(found: Sequence[Sequence[Paired]]) -> Table:
+def apart_table(found: Sequence[Sequence[PairedComparison]]) -> Table:
     """What models are apart over all items, a line each under the model it is held against."""
     parts: dict[str, list[list[str]]] = {}
     for of in found:
@@ -113,7 +113,7 @@ def apart_table(found: Sequence[Sequence[Paired]]) -> Table:
 _MCNEMAR = "p is McNemar's exact test of the two, which takes the items of a scene for independent."
 
 
-def _apart(p: Paired) -> list[str]:
+def _apart(p: PairedComparison) -> list[str]:
     return [
         f"{100 * p.difference:+.1f}",
         f"{100 * p.low:+.1f} to {100 * p.high:+.1f}",
@@ -123,7 +123,7 @@ def _apart(p: Paired) -> list[str]:
     ]
 
 
-def position_table(found: dict[str, Positions]) -> Table:
+def position_table(found: dict[str, PositionBias]) -> Table:
     """Of each mode: which letters were chosen, which were right, and how often the model was right
     where each was."""
     cells = []
@@ -223,7 +223,7 @@ def retrieval_references(rows: Sequence[paper.RetrievalReference]) -> list[list[
 
 
 def ranks_apart_table(apart: Sequence[dict[str, Any]]) -> Table:
-    """What `evaluation.metrics.breakdown.ranks_apart` tells: under the retrievers' names two lines
+    """What `evaluation.metrics.breakdown.compare_retrievers` tells: under the retrievers' names two lines
     a width,
     the second with the intervals."""
     parts: dict[str, list[list[str]]] = {}

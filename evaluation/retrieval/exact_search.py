@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from evaluation.metrics.ranking import compare
+from evaluation.metrics.ranking import count_above_and_equal
 
 GRID = 2.0**26
 """Steps of a unit vector's entries."""
@@ -140,7 +140,7 @@ def exact_ranks(
         for start in range(0, len(asked), QUERIES):
             some = slice(start, start + QUERIES)
             for k, scores in enumerate(block_scores(queries[some], shown)):
-                counts[:, k, some] += compare(scores, gold[k][some])
+                counts[:, k, some] += count_above_and_equal(scores, gold[k][some])
     greater, equal = counts[:, ::-1]
     # The target itself is among those that score as it does.
     found = np.ones(greater.shape, bool)

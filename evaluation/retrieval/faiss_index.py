@@ -22,7 +22,7 @@ import numpy as np
 
 from conf.errors import UserError
 from conf.runs import held, write_json
-from evaluation.embedders.cache import Embeddings
+from evaluation.embedders.cache import EmbeddingCache
 from evaluation.reporting.rows import RECALLS
 from evaluation.retrieval.exact_search import Cut, Ranks, block_scores, least_of_top
 
@@ -37,7 +37,7 @@ COMPARED = 200
 
 
 @dataclass(frozen=True)
-class Found:
+class IndexResult:
     """What an index of one width gave: the frames by number, best first, -1 where it ran out, and
     their scores, both (queries, depth); the index's size and how long it took to ask."""
 
@@ -59,7 +59,7 @@ def import_faiss() -> ModuleType:
 def approximate_ranks(
     asked: np.ndarray,
     targets: Sequence[str],
-    shown: Embeddings,
+    shown: EmbeddingCache,
     names: Sequence[str],
     widths: Sequence[int],
     probes: int,
@@ -90,8 +90,8 @@ def approximate_ranks(
 
 
 def search(
-    shown: Embeddings, names: Sequence[str], asked: np.ndarray, width: int, probes: int
-) -> Found:
+    shown: EmbeddingCache, names: Sequence[str], asked: np.ndarray, width: int, probes: int
+) -> IndexResult:
     """Ask an index of `width` for the frames nearest to each query, `probes` lists each. The index
     is kept beside the embeddings.
 
@@ -124,7 +124,7 @@ def search(
     index.nprobe = probes
     start = time.perf_counter()
     scores, frames = index.search(_unit(asked[:, :width]), min(DEPTH, len(names)))
-    return Found(frames, scores, path.stat().st_size, time.perf_counter() - start)
+    return IndexResult(frames, scores, path.stat().st_size, time.perf_counter() - start)
 
 
 def _is_there(path: Path, built_for: dict) -> bool:
@@ -176,7 +176,7 @@ def _build(
 
 
 def _units(
-    shown: Embeddings, names: Sequence[str], width: int
+    shown: EmbeddingCache, names: Sequence[str], width: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     for numbers, rows in shown.parts(names):
         yield numbers, _unit(rows[:, :width])
@@ -189,7 +189,7 @@ def _unit(rows: np.ndarray) -> np.ndarray:
 
 
 def ranks_of_found(
-    found: Sequence[Found], targets: np.ndarray, widths: Sequence[int], frames: int
+    found: Sequence[IndexResult], targets: np.ndarray, widths: Sequence[int], frames: int
 ) -> Ranks:
     """Ranks (widths, queries) among what an index of each width gave, by its own scores.
 
@@ -212,9 +212,9 @@ def ranks_of_found(
 
 
 def recall_against_exact(
-    found: Sequence[Found],
+    found: Sequence[IndexResult],
     asked: np.ndarray,
-    shown: Embeddings,
+    shown: EmbeddingCache,
     names: Sequence[str],
     widths: Sequence[int],
     ks: Sequence[int],

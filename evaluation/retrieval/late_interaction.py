@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from evaluation.embedders.cache import filled_up
-from evaluation.metrics.ranking import compare
+from evaluation.metrics.ranking import count_above_and_equal
 from evaluation.retrieval.exact_search import FP32, Ranks
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def late_ranks(
         for start in range(0, len(asked), at_once):
             some = slice(start, start + at_once)
             scores = block_scores(whole(asked[some], width), shown)
-            counts[:, 0, some] += compare(scores, gold[some])
+            counts[:, 0, some] += count_above_and_equal(scores, gold[some])
     greater, equal = counts
     # The target itself is among those that score as it does.
     found = np.ones(greater.shape, bool)

@@ -9,13 +9,16 @@ import numpy as np
 
 from conf.schema import RetrieverConfig
 from data.records import LETTERS, SelectionItem
-from evaluation.embedders.cache import Embeddings
-from evaluation.metrics.ranking import expected_hits, gold_scores, ranks_of
+from evaluation.embedders.cache import EmbeddingCache
+from evaluation.metrics.ranking import count_ranks, expected_hits, target_scores
 from evaluation.retrieval.exact_search import Cut, pair_scores
 
 
 def candidate_scores(
-    items: Sequence[SelectionItem], asked: Embeddings, shown: Embeddings, preset: RetrieverConfig
+    items: Sequence[SelectionItem],
+    asked: EmbeddingCache,
+    shown: EmbeddingCache,
+    preset: RetrieverConfig,
 ) -> np.ndarray:
     """(items, candidates) fp32 scores at the widest width, the ones that retrieval ranks by: equal
     embeddings tie to the last bit."""
@@ -40,8 +43,8 @@ def credits(scores: np.ndarray, answers: Sequence[int]) -> np.ndarray:
     """(items,) 1 where the right candidate scores highest, 1/m where it is one of m that do, else
     0, as where its score is NaN."""
     answers = np.asarray(answers)
-    greater, tied = ranks_of(scores, answers)
-    return expected_hits(greater, tied, ~np.isnan(gold_scores(scores, answers)), 1)
+    greater, tied = count_ranks(scores, answers)
+    return expected_hits(greater, tied, ~np.isnan(target_scores(scores, answers)), 1)
 
 
 def told(name: str, items: Sequence[SelectionItem], scores: np.ndarray) -> list[str]:

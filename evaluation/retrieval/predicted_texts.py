@@ -17,10 +17,15 @@ from conf.runs import held
 from conf.schema import StudentConfig, TwoStageCommand
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
-from evaluation.generators.model_source import Asked, SampleOf, known_by
-from evaluation.generators.response_log import AnswerLog, Told, as_told, ask_all
+from evaluation.generators.model_source import Generator, SampleOf, response_settings
+from evaluation.generators.response_log import (
+    FreeTextResponse,
+    ResponseLog,
+    collect_responses,
+    free_text_response,
+)
 from evaluation.retrieval.image_server import short_hash
-from models.student.answer_parser import without_thought
+from models.student.answer_parser import strip_thought
 from teacher.sections import SECTIONS, parts
 
 TEXTS = "texts"
@@ -67,13 +72,13 @@ def modes_of(routes: Sequence[str]) -> list[str]:
 def write_texts(
     cfg: TwoStageCommand,
     student: StudentConfig,
-    model: Asked,
+    model: Generator,
     sample_of: SampleOf,
     modes: Sequence[str],
     queries: Sequence[RetrievalQuery],
     database: Sequence[FrameRef],
     store: Store,
-) -> dict[str, list[Told]]:
+) -> dict[str, list[FreeTextResponse]]:
     """What a model writes of every query, or in captions of every frame, by mode; what it has
     written before is read.
 
@@ -81,24 +86,24 @@ def write_texts(
         UserError: another process has it write, or it cannot be asked.
     """
     known = {
-        mode: known_by(mode, "", student, cfg.seed, model.revision, store.identity, None)
+        mode: response_settings(mode, "", student, cfg.seed, model.revision, store.identity, None)
         for mode in modes
     }
     folder = store.folder / TEXTS / short_hash(json.dumps(model.revision, sort_keys=True))
     folder.mkdir(parents=True, exist_ok=True)
     busy = f"{folder} is being written by another process; run this again when it is done"
     with held(folder, busy):
-        log = AnswerLog(folder / "texts.jsonl", known, [*queries, *database], as_told)
+        log = ResponseLog(folder / "texts.jsonl", known, [*queries, *database], free_text_response)
         written = {}
         for mode in modes:
             things, unit = (database, "frame") if mode == "caption" else (queries, "query")
             # Scene by scene, so that a scene's frames are decoded once.
             ordered = sorted(things, key=lambda t: (t.scene_id, t.name))
-            written[mode] = ask_all(ordered, mode, model.say(mode, sample_of), log, unit)
+            written[mode] = collect_responses(ordered, mode, model.say(mode, sample_of), log, unit)
         return written
 
 
-def texts_of(written: Sequence[Told]) -> Texts:
+def texts_of(written: Sequence[FreeTextResponse]) -> Texts:
     return {told.item_id: foreseen(told.text) for told in written}
 
 
@@ -110,7 +115,7 @@ def foreseen(text: str) -> str:
 
 
 def _said(text: str) -> str:
-    return (without_thought(text) or "").strip()
+    return (strip_thought(text) or "").strip()
 
 
 def _sections(said: str) -> list[str]:
@@ -119,7 +124,7 @@ def _sections(said: str) -> list[str]:
     return [section for section in told if section]
 
 
-def counts(written: Sequence[Told]) -> dict[str, int]:
+def counts(written: Sequence[FreeTextResponse]) -> dict[str, int]:
     """How many texts there are, how many are empty or cut off, and of how many the sections that
     tell the future are matched alone."""
     said = [_said(told.text) for told in written]

@@ -16,7 +16,7 @@ from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
 from data.tracks.retrieval.checks import check_test
-from evaluation.embedders.cache import Embeddings
+from evaluation.embedders.cache import EmbeddingCache
 from evaluation.reporting import figures, paper, tables
 from evaluation.reporting.rows import RetrievalRow
 from evaluation.reporting.table import Table
@@ -25,14 +25,14 @@ from evaluation.retrieval.exact_search import Ranks, exact_ranks
 log = logging.getLogger(__name__)
 
 
-def standard_test(store: Store) -> tuple[list[RetrievalQuery], list[FrameRef]]:
+def load_standard_test(store: Store) -> tuple[list[RetrievalQuery], list[FrameRef]]:
     """The queries and the database. Errors are those of `check_test`."""
     queries, database = store.standard_test(), store.database("test")
     check_test(store, queries, database)
     return queries, database
 
 
-def in_parts(shown: Embeddings, names: Sequence[str]) -> Iterator[np.ndarray]:
+def in_parts(shown: EmbeddingCache, names: Sequence[str]) -> Iterator[np.ndarray]:
     """The embeddings of `names`, in no order, a file at a time, with how many are through."""
     with tqdm(total=len(names), desc="ranking", unit="frame", leave=False) as bar:
         for numbers, rows in shown.parts(names):
@@ -40,7 +40,7 @@ def in_parts(shown: Embeddings, names: Sequence[str]) -> Iterator[np.ndarray]:
             bar.update(len(numbers))
 
 
-def ranks_of(
+def rank_targets(
     preset: RetrieverConfig,
     asked: np.ndarray,
     targets: np.ndarray,

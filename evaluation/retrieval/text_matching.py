@@ -15,11 +15,11 @@ from data.records import FrameRef, RetrievalQuery
 from data.render.frame_cache import Frames
 from data.store import Store
 from evaluation.embedders.embed import Embedder, embed_frames, embed_images, embed_texts
-from evaluation.metrics.ranking import query_measures
+from evaluation.metrics.ranking import query_metrics
 from evaluation.retrieval.exact_search import Ranks
 from evaluation.retrieval.image_server import draw
 from evaluation.retrieval.predicted_texts import TEXTS, Route, Texts
-from evaluation.retrieval.standard_test import in_parts, ranks_of
+from evaluation.retrieval.standard_test import in_parts, rank_targets
 
 
 def ranks(
@@ -63,11 +63,11 @@ def ranks(
         shown = embed_texts(matcher, told, store, batch)
         goals = shown.rows([captions[target] for target in targets])
         # Frames of one caption tie, and each of them counts.
-        found = ranks_of(preset, asked, goals, [shown.rows(told)])
+        found = rank_targets(preset, asked, goals, [shown.rows(told)])
     else:
         frames = Frames(store, preset.image_size)
         shown = embed_frames(matcher, database, store, frames, batch)
-        found = ranks_of(preset, asked, shown.rows(targets), in_parts(shown, names))
+        found = rank_targets(preset, asked, shown.rows(targets), in_parts(shown, names))
     return with_misses(found, np.array(there), len(names))
 
 
@@ -90,7 +90,7 @@ def matched(
     """What was matched for each query, and its target's rank at the widest width: the database's
     size where it was not found."""
     counts = (found.greater[0], found.tied[0], found.found[0])
-    places = query_measures(*counts, found.frames, ())["median_rank"]
+    places = query_metrics(*counts, found.frames, ())["median_rank"]
     return [
         {"query_id": q.query_id, "route": route, "text": texts[q.name], "rank": float(place)}
         for q, place in zip(queries, places, strict=True)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from data.records import FAMILIES, LETTERS
-from evaluation.metrics.accuracy import accuracy_table
+from evaluation.metrics.accuracy import accuracy_by_family
 from evaluation.study.votes import Vote
 
 
@@ -112,7 +112,7 @@ def seconds(votes: Sequence[Vote]) -> dict[str, dict[str, float | int]]:
 
 
 def _accuracy(votes: Sequence[Vote]) -> dict[str, Any]:
-    found = accuracy_table([vote.family for vote in votes], [vote.right for vote in votes])
+    found = accuracy_by_family([vote.family for vote in votes], [vote.right for vote in votes])
     return asdict(found)
 
 
@@ -121,7 +121,7 @@ def _majority_accuracy(by_item: Mapping[str, Sequence[Vote]]) -> dict[str, Any]:
     families = [of[0].family for of in by_item.values()]
     right = [decided[item] == of[0].answer for item, of in by_item.items()]
     undecided = sum(choice is None for choice in decided.values())
-    return {**asdict(accuracy_table(families, right)), "undecided": undecided}
+    return {**asdict(accuracy_by_family(families, right)), "undecided": undecided}
 
 
 def _counts(items: Sequence[Sequence[int]]) -> np.ndarray:

@@ -25,7 +25,7 @@ class Reason(StrEnum):
 
 
 @dataclass(frozen=True)
-class Choice:
+class ParsedAnswer:
     """The chosen letter, upper case, or None; and what was wrong, None where nothing was. `record`
     is the text of the one record that was read, where there was one that is JSON."""
 
@@ -103,7 +103,7 @@ _SECOND_THOUGHT = re.compile(
 """The line after the answer's, which may take it back."""
 
 
-def parse(raw: str, letters: str = LETTERS, cut: bool = False) -> Choice:
+def parse_choice(raw: str, letters: str = LETTERS, cut: bool = False) -> ParsedAnswer:
     """Reads an output: a structured record, prose that ends in "Answer: B", or a lone letter.
 
     Only what follows the last `</think>` counts. Where a chat template opens `<think>` itself, put
@@ -117,29 +117,29 @@ def parse(raw: str, letters: str = LETTERS, cut: bool = False) -> Choice:
         cut: whether the model was stopped before its output's end, so that the last word may be a
             part of one.
     """
-    text = without_thought(_UNSEEN.sub("", unicodedata.normalize("NFKC", raw)))
+    text = strip_thought(_UNSEEN.sub("", unicodedata.normalize("NFKC", raw)))
     if text is None:
-        return Choice(None, Reason.CUT_OFF)
+        return ParsedAnswer(None, Reason.CUT_OFF)
     found, prose, flag, whole = _records(text)
     if found:
         choice = _agree([_read(value, letters) for value in found])
         record = whole[0] if len(whole) == 1 and flag is None else None
         return replace(choice, reason=choice.reason or flag, record=record)
     if flag is Reason.CUT_OFF:
-        return Choice(None, flag)
+        return ParsedAnswer(None, flag)
     choice = _told(prose, letters, cut)
     if choice.reason is Reason.NO_ANSWER and cut:
-        return Choice(None, Reason.CUT_OFF)
+        return ParsedAnswer(None, Reason.CUT_OFF)
     return choice
 
 
-def without_thought(text: str) -> str | None:
+def strip_thought(text: str) -> str | None:
     """What follows an output's last thought; None where one is not closed."""
     said = _THOUGHT_ENDS.split(text)[-1]
     return None if _THOUGHT_OPENS.search(said) else said
 
 
-def _told(prose: str, letters: str, cut: bool) -> Choice:
+def _told(prose: str, letters: str, cut: bool) -> ParsedAnswer:
     """What a text without a record chooses."""
     if cut:
         # The last word goes on as one that says nothing.
@@ -149,22 +149,22 @@ def _told(prose: str, letters: str, cut: bool) -> Choice:
         return _lone(prose, letters)
     choice = _agree([_read(line["value"], letters) for line in lines])
     if choice.reason is Reason.NO_ANSWER and not lines[-1]["value"].strip():
-        return Choice(None, Reason.CUT_OFF)
+        return ParsedAnswer(None, Reason.CUT_OFF)
     if choice.letter:
         return _kept(choice, prose[lines[-1].end() :], letters)
     return choice
 
 
-def _kept(choice: Choice, after: str, letters: str) -> Choice:
+def _kept(choice: ParsedAnswer, after: str, letters: str) -> ParsedAnswer:
     """A choice, unless the next line takes it back, alone or for another letter. What is explained
     below is no part of the answer."""
     thought = _SECOND_THOUGHT.match(after.strip().partition("\n")[0])
     if not (thought["taken_back"] or thought["denied"]):
         return choice
     if thought["denied"] or not thought["rest"].strip():
-        return Choice(None, Reason.REFUSAL)
+        return ParsedAnswer(None, Reason.REFUSAL)
     instead = _read(thought["rest"], letters).letter
-    return Choice(None, Reason.SEVERAL) if instead not in (None, choice.letter) else choice
+    return ParsedAnswer(None, Reason.SEVERAL) if instead not in (None, choice.letter) else choice
 
 
 def _records(text: str) -> tuple[list[str], str, Reason | None, list[str]]:
@@ -253,12 +253,12 @@ def _is_json(text: str) -> bool:
     return True
 
 
-def _agree(choices: list[Choice]) -> Choice:
+def _agree(choices: list[ParsedAnswer]) -> ParsedAnswer:
     """What several statements come to. One that says nothing takes nothing from the others."""
     spoken = {c for c in choices if c.reason is not Reason.NO_ANSWER}
     if not spoken:
-        return Choice(None, Reason.NO_ANSWER)
-    return spoken.pop() if len(spoken) == 1 else Choice(None, Reason.SEVERAL)
+        return ParsedAnswer(None, Reason.NO_ANSWER)
+    return spoken.pop() if len(spoken) == 1 else ParsedAnswer(None, Reason.SEVERAL)
 
 
 def _bare(value: str) -> str:
@@ -268,22 +268,22 @@ def _bare(value: str) -> str:
     return " ".join(value.split())
 
 
-def _read(value: str, letters: str) -> Choice:
+def _read(value: str, letters: str) -> ParsedAnswer:
     """The letter that a short statement chooses."""
     value = _bare(value)
     if not value:
-        return Choice(None, Reason.NO_ANSWER)
+        return ParsedAnswer(None, Reason.NO_ANSWER)
     if value.lower() in _DECLINES:
-        return Choice(None, Reason.REFUSAL)
+        return ParsedAnswer(None, Reason.REFUSAL)
     one, named = _ONE.fullmatch(value), _letters_named(value)
     if len(named | {one["letter"].upper()} if one else named) > 1:
-        return Choice(None, Reason.SEVERAL)
+        return ParsedAnswer(None, Reason.SEVERAL)
     if one:
         letter = one["letter"].upper()
         if _DENIAL.search(one["rest"]):
-            return Choice(None, Reason.REFUSAL)
-        return Choice(letter) if letter in letters else Choice(None, Reason.BAD_LETTER)
-    return Choice(None, Reason.REFUSAL if _REFUSAL.search(value) else Reason.NO_ANSWER)
+            return ParsedAnswer(None, Reason.REFUSAL)
+        return ParsedAnswer(letter) if letter in letters else ParsedAnswer(None, Reason.BAD_LETTER)
+    return ParsedAnswer(None, Reason.REFUSAL if _REFUSAL.search(value) else Reason.NO_ANSWER)
 
 
 def _letters_named(value: str) -> set[str]:
@@ -296,13 +296,13 @@ def _letters_named(value: str) -> set[str]:
     return {*_STANDALONE.findall(value), *map(str.upper, _SMALL.findall(value))}
 
 
-def _lone(text: str, letters: str) -> Choice:
+def _lone(text: str, letters: str) -> ParsedAnswer:
     """The answer of a text that is nothing but a letter, such as "(B)" or "Option b"."""
     value = _bare(text)
     if len(value.split()) > 5:
         refused = _REFUSAL.search(value)
-        return Choice(None, Reason.REFUSAL if refused else Reason.NO_ANSWER)
+        return ParsedAnswer(None, Reason.REFUSAL if refused else Reason.NO_ANSWER)
     choice, one = _read(value, letters), _ONE.fullmatch(value)
     if choice.letter and one["rest"].strip(" .,;!?。"):
-        return Choice(None, Reason.NO_ANSWER)
+        return ParsedAnswer(None, Reason.NO_ANSWER)
     return choice

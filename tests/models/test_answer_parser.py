@@ -3,7 +3,7 @@ import random
 
 import pytest
 
-from models.student.answer_parser import Choice, Reason, parse
+from models.student.answer_parser import ParsedAnswer, Reason, parse_choice
 
 NO, CUT, SEV, REF, BAD, MAL = Reason
 
@@ -166,18 +166,18 @@ CASES = [
 
 @pytest.mark.parametrize(("raw", "letter", "reason"), CASES)
 def test_outputs(raw, letter, reason):
-    assert parse(raw) == Choice(letter, reason)
-    assert parse(raw).letter == letter
+    assert parse_choice(raw) == ParsedAnswer(letter, reason)
+    assert parse_choice(raw).letter == letter
 
 
 def test_only_offered_letters_count():
-    assert parse("Answer: D", letters="ABC") == Choice(None, BAD)
-    assert parse("Answer: C", letters="ABC").letter == "C"
+    assert parse_choice("Answer: D", letters="ABC") == ParsedAnswer(None, BAD)
+    assert parse_choice("Answer: C", letters="ABC").letter == "C"
 
 
 @pytest.mark.parametrize("stop", range(len(FULL)))
 def test_a_record_cut_anywhere_gives_its_choice_or_none(stop):
-    choice = parse(FULL[:stop])
+    choice = parse_choice(FULL[:stop])
     stands = stop >= FULL.index(",")
     assert choice.letter == ("B" if stands else None)
     assert choice.reason in ((CUT,) if stands else (CUT, NO))
@@ -201,7 +201,7 @@ def test_no_output_raises_or_leaves_the_letters():
         for _ in range(rng.randint(1, 6)):
             at = rng.randint(0, len(text))
             text[at : at + rng.randint(0, 3)] = rng.choice(pieces)
-        choice = parse("".join(text))
+        choice = parse_choice("".join(text))
         assert choice.letter in (*"ABCD", None)
         assert choice.letter or choice.reason
 
@@ -210,4 +210,4 @@ def test_no_output_raises_or_leaves_the_letters():
     "unit", ["{", '{"a":', '{"choice":', "\n", "[", '"', "Answer:", "best ", "- "]
 )
 def test_long_output_is_read_in_linear_time(unit):
-    assert parse(unit * 20_000).letter is None
+    assert parse_choice(unit * 20_000).letter is None

@@ -14,7 +14,7 @@ from transformers import ProcessorMixin
 
 from conf.schema import StudentConfig
 from models.memory import explain_out_of_memory
-from models.student.answer_parser import parse
+from models.student.answer_parser import parse_choice
 from models.student.collator import Collator
 from models.student.generation import GeneratedText, generate, response_token_limit
 from train.common.journal import WRITTEN
@@ -85,7 +85,7 @@ def _row(
 ) -> dict[str, Any]:
     """One line of samples.jsonl; `answer` is the right letter, as it stands in the response that
     is held out, and null where none is asked for."""
-    choice = parse(written.text, cut=written.cut)
+    choice = parse_choice(written.text, cut=written.cut)
     return {
         "step": step,
         "mode": mode,
@@ -93,5 +93,5 @@ def _row(
         "text": written.text,
         "letter": choice.letter,
         "reason": None if choice.letter else choice.reason and str(choice.reason),
-        "answer": parse(response).letter,
+        "answer": parse_choice(response).letter,
     }

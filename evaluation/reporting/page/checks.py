@@ -12,7 +12,7 @@ import numpy as np
 from conf.errors import UserError
 from data.store import Store, open_store
 from data.tracks.controls import MATCHED
-from evaluation.metrics.significance import Paired
+from evaluation.metrics.significance import PairedComparison
 from evaluation.reporting.page import item_browser, plots
 from evaluation.reporting.page.comparisons import apart
 from evaluation.reporting.page.run_responses import (
@@ -41,7 +41,7 @@ class Browser:
     frames: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     confusions: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    apart: dict[str, list[list[Paired]]] = field(default_factory=dict)
+    apart: dict[str, list[list[PairedComparison]]] = field(default_factory=dict)
 
 
 def browser_of(choices: Sequence[Measured], stores: Path, bound: int, seed: int) -> Browser:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 from data.records import SelectionItem
-from evaluation.metrics.significance import Paired, compare
+from evaluation.metrics.significance import PairedComparison, compare_runs
 from evaluation.reporting.page.paper_tables import ABLATED, REGIMES
 from evaluation.reporting.page.run_responses import Said, Scored
 from evaluation.reporting.page.run_rows import Measured
@@ -17,7 +17,7 @@ def apart(
     answered: Mapping[str, tuple[Measured, Mapping[str, Said | Scored]]],
     items: Mapping[str, SelectionItem],
     seed: int,
-) -> list[list[Paired]]:
+) -> list[list[PairedComparison]]:
     """The models of each pair, item by item: by family, their macro, and over all.
 
     Args:
@@ -36,7 +36,7 @@ def apart(
             )
         asked = [item for name, item in items.items() if name in credits[0]]
         if asked:
-            found.append(compare(asked, *credits, (one, other), seed))
+            found.append(compare_runs(asked, *credits, (one, other), seed))
     return found
 
 

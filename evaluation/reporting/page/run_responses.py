@@ -9,10 +9,10 @@ from functools import cached_property
 
 from conf.errors import UserError
 from data.records import LETTERS
-from evaluation.metrics.significance import same_items
+from evaluation.metrics.significance import check_same_items
 from evaluation.reporting.page.run_rows import Measured
 from evaluation.reporting.page.runs import Finished, json_lines, unreadable
-from models.student.answer_parser import Choice, Reason, parse
+from models.student.answer_parser import ParsedAnswer, Reason, parse_choice
 
 Asked = tuple[str, str | None]
 """How items were asked: the mode, or the embedder that chose, and the control by which they were
@@ -27,8 +27,8 @@ class Said:
     cut: bool
 
     @cached_property
-    def choice(self) -> Choice:
-        return parse(self.text, cut=self.cut)
+    def choice(self) -> ParsedAnswer:
+        return parse_choice(self.text, cut=self.cut)
 
     def credit(self, letter: str) -> float:
         """What it is worth where `letter` is right."""
@@ -49,9 +49,9 @@ class Scored:
         return ", ".join(f"{letter} {s}" for letter, s in told.items())
 
     @property
-    def choice(self) -> Choice:
+    def choice(self) -> ParsedAnswer:
         nearest = self._nearest
-        return Choice(nearest) if len(nearest) == 1 else Choice(None, Reason.SEVERAL)
+        return ParsedAnswer(nearest) if len(nearest) == 1 else ParsedAnswer(None, Reason.SEVERAL)
 
     def credit(self, letter: str) -> float:
         """A tie among m is worth 1/m."""
@@ -134,7 +134,7 @@ def check_same_items(rows: Sequence[Measured], ids: Sequence[Mapping[str, object
         names = (str(rows[j].run.folder), str(m.run.folder))
         try:
             if ids[j] is not None and ids[k] is not None:
-                same_items(ids[j], ids[k], names)
+                check_same_items(ids[j], ids[k], names)
             elif rows[j].row.n != m.row.n:
                 told = f"{names[0]} and {names[1]} answered {rows[j].row.n:,} and {m.row.n:,} items"
                 raise UserError(f"{told}: compare runs of the same items")

@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from evaluation.metrics.calibration import Calibration, Positions
+from evaluation.metrics.calibration import Calibration, PositionBias
 from evaluation.metrics.intervals import Interval
-from evaluation.metrics.significance import Paired
+from evaluation.metrics.significance import PairedComparison
 from evaluation.reporting import figures, paper, tables
 from evaluation.reporting.page import paper_tables as shaped
 from evaluation.reporting.page import plots
@@ -49,7 +49,7 @@ def sections_of(
     ranks: Sequence[Measured],
     runs: Sequence[Finished],
     confusions: Mapping[str, Mapping[str, np.ndarray]],
-    apart: Mapping[str, Sequence[Sequence[Paired]]],
+    apart: Mapping[str, Sequence[Sequence[PairedComparison]]],
     folder: Path,
 ) -> list[Section]:
     """Every section that has a table, in the paper's order.
@@ -98,7 +98,7 @@ def zero_shot(
 def distillation(
     choices: Sequence[Measured],
     ranks: Sequence[Measured],
-    apart: Mapping[str, Sequence[Sequence[Paired]]],
+    apart: Mapping[str, Sequence[Sequence[PairedComparison]]],
     folder: Path,
 ) -> Section:
     section = Section("Distillation")
@@ -142,7 +142,9 @@ def ablation(choices: Sequence[Measured]) -> Section:
 
 
 def transfer(
-    choices: Sequence[Measured], apart: Mapping[str, Sequence[Sequence[Paired]]], folder: Path
+    choices: Sequence[Measured],
+    apart: Mapping[str, Sequence[Sequence[PairedComparison]]],
+    folder: Path,
 ) -> Section:
     """Students on benchmarks that they were not trained on, and the models that they began from."""
     section = Section("Transfer")
@@ -165,7 +167,7 @@ def transfer(
 
 
 def _add_apart(
-    section: Section, benchmark: str, apart: Mapping[str, Sequence[Sequence[Paired]]]
+    section: Section, benchmark: str, apart: Mapping[str, Sequence[Sequence[PairedComparison]]]
 ) -> None:
     """Add what the benchmark's models are apart, and folded away the same by family."""
     if found := apart.get(benchmark):
@@ -181,11 +183,13 @@ def controls(choices: Sequence[Measured], runs: Sequence[Finished]) -> Section:
         UserError: what a run reports is of another version.
     """
     section = Section("Controls")
-    apart: dict[tuple[Path, str, str, str], list[Paired]] = {}
+    apart: dict[tuple[Path, str, str, str], list[PairedComparison]] = {}
     for run in runs:
         for told in run.report.get("controls", []):
             try:
-                pair = Paired(**{key: value for key, value in told.items() if key != "mode"})
+                pair = PairedComparison(
+                    **{key: value for key, value in told.items() if key != "mode"}
+                )
                 ways = [told["mode"]] if run.kind == "similarity" else [_model(run), told["mode"]]
             except (KeyError, TypeError) as error:
                 raise unreadable(run.folder) from error
@@ -257,7 +261,7 @@ def _intervals(told: Mapping[str, Any]) -> dict[str, Interval]:
 def _details(rows: Sequence[Measured], cells: Mapping[str, Mapping[str, Interval]]) -> list[Table]:
     """The tables of what runs report of their models besides their rows."""
     readings = _told(rows, "readings", dict)
-    letters = _told(rows, "positions", lambda of: Positions(**of))
+    letters = _told(rows, "positions", lambda of: PositionBias(**of))
     sure = _told(rows, "calibration", Calibration.from_dict)
     told = [tables.subtype_table(cells)] if cells else []
     told += [tables.reading_table(readings)] if readings else []

@@ -15,7 +15,7 @@ import pytest
 from conf.errors import UserError
 from conf.runs import held
 from evaluation.embedders import cache
-from evaluation.embedders.cache import Embeddings
+from evaluation.embedders.cache import EmbeddingCache
 
 ABOUT = {"weights": "ab12", "image_size": 96}
 THINGS = {f"scene-{k:03d}/{k}": k for k in range(2500)}
@@ -35,8 +35,8 @@ class Model:
         return rows
 
 
-def filled(folder: Path) -> Embeddings:
-    kept = Embeddings(folder, "frame", ABOUT)
+def filled(folder: Path) -> EmbeddingCache:
+    kept = EmbeddingCache(folder, "frame", ABOUT)
     kept.complete(THINGS, Model(), 64)
     return kept
 
@@ -45,7 +45,7 @@ def test_they_are_read_back_byte_for_byte_and_made_once(tmp_path) -> None:
     model = Model()
     expected = Model()(list(THINGS.values()))
     for _ in range(2):
-        kept = Embeddings(tmp_path, "frame", ABOUT)
+        kept = EmbeddingCache(tmp_path, "frame", ABOUT)
         kept.complete(THINGS, model, 64)
         assert kept.rows(list(THINGS)).tobytes() == expected.tobytes()
         assert kept.width == 8
@@ -66,7 +66,7 @@ def test_parts_hold_each_asked_one_once(tmp_path) -> None:
 def test_a_slow_model_loses_no_more_than_a_batch(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(cache, "SECONDS", -1)
     model = Model(bad=(70,))
-    kept = Embeddings(tmp_path, "frame", ABOUT)
+    kept = EmbeddingCache(tmp_path, "frame", ABOUT)
     with pytest.raises(UserError, match="scene-070/70"):
         kept.complete(THINGS, model, 16)
     again = Model()
@@ -78,7 +78,7 @@ def test_only_what_is_new_is_embedded(tmp_path) -> None:
     filled(tmp_path)
     model = Model()
     more = {"new/1": 9001, **THINGS, "new/2": 9002}
-    kept = Embeddings(tmp_path, "frame", ABOUT)
+    kept = EmbeddingCache(tmp_path, "frame", ABOUT)
     kept.complete(more, model, 64)
     assert model.asked == [9001, 9002]
     assert np.array_equal(kept.rows(["new/2", "new/1", "new/2"]), Model()([9002, 9001, 9002]))
@@ -88,7 +88,7 @@ def test_only_what_is_new_is_embedded(tmp_path) -> None:
 def test_what_was_made_by_another_is_not_taken(tmp_path, changed) -> None:
     filled(tmp_path)
     model = Model()
-    Embeddings(tmp_path, "frame", ABOUT | changed).complete({"scene-000/0": 0}, model, 64)
+    EmbeddingCache(tmp_path, "frame", ABOUT | changed).complete({"scene-000/0": 0}, model, 64)
     assert model.asked == [0]
 
 
@@ -113,7 +113,7 @@ def test_a_killed_embedding_goes_on(tmp_path) -> None:
     ended = subprocess.run(command, capture_output=True, env={**os.environ, "PYTHONPATH": path[1]})
     assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
     model = Model()
-    kept = Embeddings(tmp_path, "frame", ABOUT)
+    kept = EmbeddingCache(tmp_path, "frame", ABOUT)
     (torn := kept.folder / "00002.npy").write_bytes(b"half a part")
     kept.complete(THINGS, model, 64)
     assert model.asked == list(THINGS.values())[2 * cache.PART :]
@@ -143,10 +143,10 @@ def test_a_damaged_part_is_told_and_made_again(tmp_path, damage, caplog) -> None
 
 
 def test_an_embedding_that_is_not_finite_is_named_and_not_kept(tmp_path) -> None:
-    kept = Embeddings(tmp_path, "frame", ABOUT)
+    kept = EmbeddingCache(tmp_path, "frame", ABOUT)
     with pytest.raises(UserError, match=r"embedding of frame scene-700/700 is not finite"):
         kept.complete(THINGS, Model(bad=(700,)), 64)
-    queries = Embeddings(tmp_path, "query", ABOUT)
+    queries = EmbeddingCache(tmp_path, "query", ABOUT)
     with pytest.raises(UserError, match=r"query scene-003/3, and of 1 more is not finite"):
         queries.complete(THINGS, Model(bad=(3, 9)), 64)
     model = Model()

@@ -15,7 +15,7 @@ from evaluation.generators.response_schema import (
     read_record,
     schema,
 )
-from models.student.answer_parser import Reason, parse
+from models.student.answer_parser import Reason, parse_choice
 
 NO, CUT, SEV, REF, BAD, MAL = Reason
 
@@ -175,15 +175,15 @@ OUTPUTS = [
 
 @pytest.mark.parametrize(("raw", "letter", "reason"), OUTPUTS)
 def test_outputs(raw, letter, reason):
-    found = parse(raw)
+    found = parse_choice(raw)
     assert (found.letter, found.reason) == (letter, reason)
-    assert parse(raw).letter == letter
+    assert parse_choice(raw).letter == letter
 
 
 @pytest.mark.parametrize(("raw", "letter", "reason"), OUTPUTS)
 def test_space_around_an_output_says_nothing(raw, letter, reason):
     for around in (f"\n{raw}", f"{raw}\n", f" \t{raw}  \n\n"):
-        assert parse(around).letter == letter
+        assert parse_choice(around).letter == letter
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_space_around_an_output_says_nothing(raw, letter, reason):
     ],
 )
 def test_the_last_word_of_what_was_stopped_is_no_choice(raw, letter):
-    found = parse(raw, cut=True)
+    found = parse_choice(raw, cut=True)
     assert found.letter == letter
     assert letter or found.reason is CUT
 
@@ -215,7 +215,7 @@ def test_no_letter_comes_from_texts_that_state_none():
         raw = rng.choice(
             [prose, json.dumps(value), f"{json.dumps(value)} {prose}", f"<think>{FULL}"]
         )
-        assert parse(raw).letter is None, raw
+        assert parse_choice(raw).letter is None, raw
 
 
 def test_a_choice_is_read_from_whatever_else_a_record_holds():
@@ -223,12 +223,12 @@ def test_a_choice_is_read_from_whatever_else_a_record_holds():
     for _ in range(300):
         record = random_record(rng)
         raw = json.dumps(asdict(record), indent=rng.choice([None, 1, 4]))
-        assert parse(raw).letter == record.forced_choice
+        assert parse_choice(raw).letter == record.forced_choice
         assert read_record(raw) == record
         # Dumped and read again it is the same, and so is the choice.
         assert read_record(json.dumps(asdict(read_record(raw)))) == record
         stop = rng.randrange(len(raw))
-        assert parse(raw[:stop]).letter in (record.forced_choice, None)
+        assert parse_choice(raw[:stop]).letter in (record.forced_choice, None)
 
 
 def random_record(rng: random.Random) -> Record:
@@ -262,7 +262,7 @@ def test_a_record_is_valid_as_its_schema_says():
         raw = json.dumps(value)
         found = read_record(raw)
         assert (found is not None) == validator.is_valid(value)
-        assert found is None or parse(raw).letter == found.forced_choice
+        assert found is None or parse_choice(raw).letter == found.forced_choice
         valid += found is not None
     assert 0 < valid < len(changed)
 
@@ -300,11 +300,11 @@ def test_the_prompt_the_schema_and_the_record_have_one_order():
 @pytest.mark.parametrize("before", ["", "{", '{"choice": '])
 def test_an_output_of_any_length_is_read_in_linear_time(before, unit):
     raw = f"{before}{unit * (20_000 // len(unit))}}}"
-    assert parse(raw).letter is None or unit in ('{"choice":"B"} ', "A", "A, ")
+    assert parse_choice(raw).letter is None or unit in ('{"choice":"B"} ', "A", "A, ")
 
 
 def test_a_megabyte_of_prose_with_one_answer_is_read():
     prose = "The red cube moves steadily toward the east, and candidate B is late. " * 15_000
-    assert parse(f"{prose}\nAnswer: B").letter == "B"
-    assert parse(f"{prose}{FULL}").letter == "C"
-    assert parse(prose).letter is None
+    assert parse_choice(f"{prose}\nAnswer: B").letter == "B"
+    assert parse_choice(f"{prose}{FULL}").letter == "C"
+    assert parse_choice(prose).letter is None

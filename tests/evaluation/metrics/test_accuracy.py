@@ -6,15 +6,15 @@ import pytest
 import pytrec_eval
 import torch
 
-from evaluation.metrics.accuracy import accuracy_by, accuracy_table
-from evaluation.metrics.intervals import SceneBootstrap, macro_by_scene, wilson
+from evaluation.metrics.accuracy import accuracy_by_family, accuracy_by_group
+from evaluation.metrics.intervals import SceneBootstrap, macro_by_scene, wilson_interval
 from evaluation.metrics.ranking import (
-    compare,
+    count_above_and_equal,
+    count_ranks,
     expected_hits,
-    gold_scores,
-    metrics_from_counts,
-    rank_metrics,
-    ranks_of,
+    ranking_metrics,
+    ranking_metrics_of_scores,
+    target_scores,
 )
 from tests.evaluation.metrics.resampled import interval
 
@@ -42,7 +42,7 @@ def test_ties_are_the_mean_over_every_order():
     rng = np.random.default_rng(0)
     for _ in range(12):
         row, gold = rng.integers(3, size=6), int(rng.integers(6))
-        found = rank_metrics(row[None], np.array([gold]), KS)
+        found = ranking_metrics_of_scores(row[None], np.array([gold]), KS)
         for key, value in enumerated(row, gold, KS).items():
             assert found[key] == pytest.approx(value)
 
@@ -52,7 +52,7 @@ def test_without_ties_it_is_sorting():
     scores = rng.permuted(np.tile(np.arange(50.0), (30, 1)), axis=1)
     gold = rng.integers(50, size=30)
     ranks = np.array([list(np.argsort(-s)).index(g) + 1 for s, g in zip(scores, gold, strict=True)])
-    found = rank_metrics(scores, gold, KS)
+    found = ranking_metrics_of_scores(scores, gold, KS)
     assert found["mrr"] == pytest.approx((1 / ranks).mean())
     assert found["median_rank"] == np.median(ranks)
     assert found["tie_rate"] == 0
@@ -61,7 +61,7 @@ def test_without_ties_it_is_sorting():
 
 
 def test_a_constant_scorer_gets_chance():
-    found = rank_metrics(np.zeros((5, 200)), np.arange(5), KS)
+    found = ranking_metrics_of_scores(np.zeros((5, 200)), np.arange(5), KS)
     for k in KS:
         assert found[f"recall@{k}"] == pytest.approx(k / 200)
     assert found["mrr"] == pytest.approx(sum(1 / i for i in range(1, 201)) / 200)
@@ -75,7 +75,9 @@ def test_order_of_frames_and_queries_does_not_matter():
     rows = np.random.default_rng(3).permutation(len(gold))
     shuffled = scores[rows][:, columns]
     moved = np.argsort(columns)[gold[rows]]
-    assert rank_metrics(shuffled, moved, KS) == pytest.approx(rank_metrics(scores, gold, KS))
+    assert ranking_metrics_of_scores(shuffled, moved, KS) == pytest.approx(
+        ranking_metrics_of_scores(scores, gold, KS)
+    )
 
 
 @pytest.mark.parametrize("block", [1, 7, 30])
@@ -83,21 +85,19 @@ def test_blocks_of_frames_and_queries_equal_the_whole(block):
     scores, gold = tied_scores()
     scores[3, 4] = np.nan
     gold[5] = -1
-    own = gold_scores(scores, gold)
-    counts = [compare(scores[:, i : i + block], own) for i in range(0, 30, block)]
+    own = target_scores(scores, gold)
+    counts = [count_above_and_equal(scores[:, i : i + block], own) for i in range(0, 30, block)]
     greater = sum(g for g, _ in counts)
     tied = np.maximum(sum(e for _, e in counts) - 1, 0)
-    by_frame = metrics_from_counts(greater, tied, ~np.isnan(own), 30, KS)
-    parts = [ranks_of(scores[i : i + block], gold[i : i + block]) for i in range(0, 40, block)]
-    by_query = metrics_from_counts(
-        *map(np.concatenate, zip(*parts, strict=True)), gold >= 0, 30, KS
-    )
-    assert by_frame == by_query == rank_metrics(scores, gold, KS)
+    by_frame = ranking_metrics(greater, tied, ~np.isnan(own), 30, KS)
+    parts = [count_ranks(scores[i : i + block], gold[i : i + block]) for i in range(0, 40, block)]
+    by_query = ranking_metrics(*map(np.concatenate, zip(*parts, strict=True)), gold >= 0, 30, KS)
+    assert by_frame == by_query == ranking_metrics_of_scores(scores, gold, KS)
 
 
 def test_nan_and_missing_queries_are_misses_that_count():
     scores = np.array([[3.0, 2, 1], [np.nan, 2, 1], [3, 2, 1], [np.nan, 2, np.nan]])
-    found = rank_metrics(scores, np.array([0, 0, -1, 1]), [1, 3])
+    found = ranking_metrics_of_scores(scores, np.array([0, 0, -1, 1]), [1, 3])
     assert found == {
         "recall@1": 0.5,
         "recall@3": 0.5,
@@ -108,35 +108,35 @@ def test_nan_and_missing_queries_are_misses_that_count():
 
 
 def test_all_nan_scores_tie_with_nothing():
-    found = rank_metrics(np.full((2, 4), np.nan), np.array([0, 1]), [1])
+    found = ranking_metrics_of_scores(np.full((2, 4), np.nan), np.array([0, 1]), [1])
     assert found == {"recall@1": 0.0, "mrr": 0.0, "median_rank": 4.0, "tie_rate": 0.0}
 
 
 @pytest.mark.parametrize("missing", [-1, np.nan, None])
 def test_a_missing_query_is_a_miss_however_it_is_told(missing):
     scores = [[0.5, 0.1], [0.5, 0.1]]
-    found = rank_metrics(scores, [0, missing], [1])
-    assert found == rank_metrics(scores, np.array([0, -1]), [1])
+    found = ranking_metrics_of_scores(scores, [0, missing], [1])
+    assert found == ranking_metrics_of_scores(scores, np.array([0, -1]), [1])
     assert found["recall@1"] == found["mrr"] == 0.5
     # Nor is there a frame to find in an empty database.
-    assert rank_metrics(np.zeros((1, 0)), [missing], [1])["recall@1"] == 0
+    assert ranking_metrics_of_scores(np.zeros((1, 0)), [missing], [1])["recall@1"] == 0
 
 
 @pytest.mark.parametrize("gold", [[0.5, 1], [True, False], [np.inf, 0]])
 def test_a_column_that_is_no_number_of_one_is_refused(gold):
     with pytest.raises(ValueError, match="whole numbers"):
-        rank_metrics(np.zeros((2, 3)), gold, [1])
+        ranking_metrics_of_scores(np.zeros((2, 3)), gold, [1])
 
 
 def test_scores_are_compared_in_fp32():
     scores = np.array([[0.5, 0.5 + 1e-12, 0.1]])
-    assert rank_metrics(scores, np.array([0]), [1])["tie_rate"] == 1
+    assert ranking_metrics_of_scores(scores, np.array([0]), [1])["tie_rate"] == 1
 
 
 def test_tensors_are_read():
     scores, gold = tied_scores()
-    tensors = rank_metrics(torch.from_numpy(scores), torch.from_numpy(gold), KS)
-    assert tensors == rank_metrics(scores, gold, KS)
+    tensors = ranking_metrics_of_scores(torch.from_numpy(scores), torch.from_numpy(gold), KS)
+    assert tensors == ranking_metrics_of_scores(scores, gold, KS)
 
 
 @pytest.mark.parametrize(
@@ -145,14 +145,14 @@ def test_tensors_are_read():
 )
 def test_wrong_shapes_are_refused(shape, gold):
     with pytest.raises(ValueError, match=r"expected|past|no queries"):
-        rank_metrics(np.zeros(shape), gold, KS)
+        ranking_metrics_of_scores(np.zeros(shape), gold, KS)
 
 
 def test_credit_of_four_candidates():
     scores = np.array([[1, 0, 0, 0], [1, 1, 0, 0], [1, 1, 1, 1], [0, 1, 1, 0], [np.nan, 0, 0, 0]])
     answer = np.zeros(5, int)
-    valid = ~np.isnan(gold_scores(scores, answer))
-    credit = expected_hits(*ranks_of(scores, answer), valid, 1)
+    valid = ~np.isnan(target_scores(scores, answer))
+    credit = expected_hits(*count_ranks(scores, answer), valid, 1)
     assert credit.tolist() == [1, 0.5, 0.25, 0, 0]
 
 
@@ -164,7 +164,7 @@ def test_ranks_without_ties_are_those_of_an_independent_library():
     asked = {f"q{i}": {f"f{g}": 1} for i, g in enumerate(gold)}
     judge = pytrec_eval.RelevanceEvaluator(asked, {"recall.1,10,50", "recip_rank"})
     expected = judge.evaluate(run).values()
-    found = rank_metrics(scores, gold, (1, 10, 50))
+    found = ranking_metrics_of_scores(scores, gold, (1, 10, 50))
     for k in (1, 10, 50):
         assert found[f"recall@{k}"] == pytest.approx(np.mean([q[f"recall_{k}"] for q in expected]))
     ranks = np.array([1 / q["recip_rank"] for q in expected])
@@ -177,30 +177,30 @@ def test_wilson_is_its_formula(successes, n):
     z, p = 1.959963984540054, successes / n
     centre = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
-    assert wilson(successes, n) == pytest.approx((centre - half, centre + half), abs=1e-12)
+    assert wilson_interval(successes, n) == pytest.approx((centre - half, centre + half), abs=1e-12)
 
 
 def test_wilson_of_nothing_is_everything():
-    assert wilson(0, 0) == (0, 1)
+    assert wilson_interval(0, 0) == (0, 1)
 
 
 def test_accuracy_by_family():
     families = ["time", "event", "window", "window", "window", "event"]
-    found = accuracy_table(families, [0, 1, True, True, 0.5, 0])
+    found = accuracy_by_family(families, [0, 1, True, True, 0.5, 0])
     assert list(found.families) == ["event", "time", "window"]
     assert [i.value for i in found.families.values()] == pytest.approx([1 / 2, 0, 2.5 / 3])
     assert [i.n for i in found.families.values()] == [2, 1, 3]
     assert found.macro == pytest.approx((1 / 2 + 2.5 / 3) / 3)
     assert (found.micro.value, found.micro.n) == (pytest.approx(3.5 / 6), 6)
-    assert (found.micro.low, found.micro.high) == wilson(3.5, 6)
+    assert (found.micro.low, found.micro.high) == wilson_interval(3.5, 6)
 
 
 def test_macro_is_over_the_families_present():
-    assert accuracy_table(["time", "event"], [1, 0]).macro == 0.5
+    assert accuracy_by_family(["time", "event"], [1, 0]).macro == 0.5
 
 
 def test_groups_of_any_name():
-    found = accuracy_by(["b", "a", "b"], [1, 1, 0])
+    found = accuracy_by_group(["b", "a", "b"], [1, 1, 0])
     assert {k: (v.value, v.n) for k, v in found.items()} == {"a": (1, 1), "b": (0.5, 2)}
 
 
@@ -209,7 +209,7 @@ def test_groups_of_any_name():
 )
 def test_wrong_tables_are_refused(families, correct):
     with pytest.raises(ValueError, match=r"families|groups"):
-        accuracy_table(families, correct)
+        accuracy_by_family(families, correct)
 
 
 def test_bootstrap_draws_whole_scenes():
@@ -252,7 +252,7 @@ def test_a_macro_is_the_mean_of_its_families_means(items):
         return np.mean([rows[rows[:, 0] == f, 1].astype(float).mean() for f in set(rows[:, 0])])
 
     found = macro_by_scene(credits, families, scenes, seed=7)
-    assert found.value == pytest.approx(accuracy_table(families, credits).macro)
+    assert found.value == pytest.approx(accuracy_by_family(families, credits).macro)
     assert found.n == items
     table = np.stack([families, credits.astype(str)], axis=1)
     drawn = interval(table, scenes, macro, seed=7)

@@ -12,8 +12,8 @@ from scipy.stats import binomtest
 from conf.errors import UserError
 from data.records import FAMILIES, Candidate, SelectionItem
 from data.tracks.controls import MATCHED
-from evaluation.metrics.accuracy import accuracy_table
-from evaluation.metrics.significance import Paired, anchors, compare
+from evaluation.metrics.accuracy import accuracy_by_family
+from evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
 from evaluation.reporting.tables import paired_table
 
 NAMES = ("one", "two")
@@ -39,10 +39,10 @@ def drawn(items, seed: int, share: float = 0.5) -> dict[str, float]:
 
 def test_differences_are_those_of_the_accuracies(items) -> None:
     left, right = drawn(items, 0, 0.7), drawn(items, 1, 0.4)
-    found = {p.of: p for p in compare(items, left, right, NAMES, seed=0)}
+    found = {p.of: p for p in compare_runs(items, left, right, NAMES, seed=0)}
     assert list(found) == [*FAMILIES, "macro", "all"]
     one, two = (
-        accuracy_table([i.family for i in items], [of[i.item_id] for i in items])
+        accuracy_by_family([i.family for i in items], [of[i.item_id] for i in items])
         for of in (left, right)
     )
     for name, p in found.items():
@@ -61,7 +61,7 @@ def test_differences_are_those_of_the_accuracies(items) -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_the_test_is_a_fair_coins(items, seed) -> None:
     left, right = drawn(items, seed), drawn(items, seed + 100, 0.3 + 0.1 * seed)
-    for p in compare(items, left, right, NAMES, seed=0):
+    for p in compare_runs(items, left, right, NAMES, seed=0):
         if p.of == "macro":
             continue
         of = [i.item_id for i in items if p.of in (i.family, "all")]
@@ -73,8 +73,8 @@ def test_the_test_is_a_fair_coins(items, seed) -> None:
 
 def test_sides_are_alike(items) -> None:
     left, right = drawn(items, 0, 0.7), drawn(items, 1)
-    there = compare(items, left, right, NAMES, seed=3)
-    back = compare(items, right, left, NAMES[::-1], seed=3)
+    there = compare_runs(items, left, right, NAMES, seed=3)
+    back = compare_runs(items, right, left, NAMES[::-1], seed=3)
     for p, q in zip(there, back, strict=True):
         assert (p.left, p.only_left, p.p) == (q.right, q.only_right, q.p)
         assert (p.difference, p.low, p.high) == pytest.approx((-q.difference, -q.high, -q.low))
@@ -82,7 +82,7 @@ def test_sides_are_alike(items) -> None:
 
 def test_a_run_is_not_apart_from_itself(items) -> None:
     credits = drawn(items, 0)
-    for p in compare(items, credits, credits, NAMES, seed=0):
+    for p in compare_runs(items, credits, credits, NAMES, seed=0):
         assert (p.difference, p.low, p.high) == (0, 0, 0)
         assert p.of == "macro" or (p.only_left, p.only_right, p.p) == (0, 0, 1)
 
@@ -102,7 +102,7 @@ def test_items_of_a_scene_say_no_more_than_the_scene(items) -> None:
             {f"{i.item_id}-{copy}": of[i.item_id] for i in alone for copy in range(scenes)}
             for of in (left, right)
         ]
-        p = compare(copies, *sides, NAMES, seed=0)[-1]
+        p = compare_runs(copies, *sides, NAMES, seed=0)[-1]
         widths.append(p.high - p.low)
     assert widths[1] == pytest.approx(widths[0])
     apart = np.array([left[i.item_id] - right[i.item_id] for i in items])
@@ -113,7 +113,7 @@ def test_ties_count_for_the_side_with_more_credit(items) -> None:
     few = [item for item in items if item.family == "time"][:3]
     left = dict(zip([i.item_id for i in few], (0.5, 1.0, 0.25), strict=True))
     right = dict(zip([i.item_id for i in few], (0.0, 0.5, 1.0), strict=True))
-    [p] = compare(few, left, right, NAMES, seed=0)
+    [p] = compare_runs(few, left, right, NAMES, seed=0)
     assert (p.of, p.only_left, p.only_right, p.n) == ("all", 2, 1, 3)
     assert p.difference == pytest.approx((0.5 + 0.5 - 0.75) / 3)
 
@@ -121,7 +121,7 @@ def test_ties_count_for_the_side_with_more_credit(items) -> None:
 def test_runs_over_other_items_are_refused_with_the_difference(items) -> None:
     left, right = drawn(items[:40], 0), drawn(items[2:41], 0)
     with pytest.raises(UserError) as told:
-        compare(items[:40], left, right, ("select/a", "select/b"), seed=0)
+        compare_runs(items[:40], left, right, ("select/a", "select/b"), seed=0)
     assert str(told.value) == (
         "select/a and select/b answered different items, 2 only in select/a (such as event-0, "
         "time-1) and 1 only in select/b (such as time-40): compare runs of the same benchmark, "
@@ -132,7 +132,7 @@ def test_runs_over_other_items_are_refused_with_the_difference(items) -> None:
 def test_anchors_hold_the_questions_of_a_pair_against_each_other(benchmark_store) -> None:
     matched = benchmark_store.selection(suite=MATCHED)
     by_family = {i.item_id: float(i.family == "event") for i in matched}
-    [p] = anchors(matched[::-1], by_family, seed=0)
+    [p] = compare_anchors(matched[::-1], by_family, seed=0)
     assert (p.left, p.right, p.n) == ("event", "time", len(matched) // 2)
     assert (p.left_accuracy, p.right_accuracy, p.difference) == (1, 0, 1)
     assert (p.only_left, p.only_right) == (p.n, 0)
@@ -140,8 +140,10 @@ def test_anchors_hold_the_questions_of_a_pair_against_each_other(benchmark_store
 
 
 def test_what_is_apart_is_json_and_fits_a_page(items) -> None:
-    found = compare(items, drawn(items, 0), drawn(items, 1), ("as they are", "shuffled_prefix"), 0)
-    assert [Paired(**asdict(p)) for p in found] == found
+    found = compare_runs(
+        items, drawn(items, 0), drawn(items, 1), ("as they are", "shuffled_prefix"), 0
+    )
+    assert [PairedComparison(**asdict(p)) for p in found] == found
     table = str(paired_table([("reasoning", found), ("answer, candidate_only", found)]))
     assert max(map(len, table.splitlines())) <= 100
     assert table.count("\nmacro ") == 2

@@ -26,7 +26,7 @@ from conf.schema import (
     TeacherConfig,
 )
 from evaluation import report, retrieve, select
-from evaluation.generators.response_log import AnswerLog
+from evaluation.generators.response_log import ResponseLog
 from models import loading
 from models.retriever import embedder
 from models.trained_runs import check_unseen, resolve_model, trained_settings
@@ -107,7 +107,7 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
     log.write_text(torn)
     heads = [json.loads(line) for line in whole.splitlines()[:2]]
     known = {head["mode"]: head["asked"] for head in heads}
-    assert 0 < len(AnswerLog(log, known, micro_store.selection("test")).answers) < 16
+    assert 0 < len(ResponseLog(log, known, micro_store.selection("test")).answers) < 16
     select.main.__wrapped__(asked, run)
     assert (run.folder / "report.json").read_text() == told
     assert log.read_text().startswith(f"{torn}\n")
@@ -118,7 +118,7 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
     items = micro_store.selection("test")
     edited = whole.replace('"right": false', '"right": true').splitlines()
     log.write_text("\n".join([*edited[:4], "{", *edited[5:]]) + "\n")
-    kept = AnswerLog(log, known, items).answers
+    kept = ResponseLog(log, known, items).answers
     assert len(kept) == 15
     rights = {i.item_id: i.letter for i in items}
     assert all(a.right == (a.letter == rights[a.item_id]) for a in kept.values())
@@ -126,7 +126,7 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
 
     # Answers of other weights are not taken for these.
     others = {mode: {**what, "model": "another"} for mode, what in known.items()}
-    assert not AnswerLog(log, others, items).answers
+    assert not ResponseLog(log, others, items).answers
 
     # A base is asked for the record; drawn answers are the same after a kill.
     drawn = replace(
@@ -171,7 +171,7 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
     assert "answer loss" in text
     assert "untrained small" in text
     shown = (page.folder / "report.html").read_text()
-    assert all(f'"id":"{item.item_id}"' in shown for item in select.spread(items, 8, 0))
+    assert all(f'"id":"{item.item_id}"' in shown for item in select.limit_items(items, 8, 0))
 
 
 def test_a_model_that_is_no_run_is_named(tmp_path) -> None:
@@ -266,7 +266,7 @@ def test_a_report_of_another_version_is_named(tmp_path) -> None:
 
 def test_a_limit_spreads_over_the_families(micro_store) -> None:
     items = micro_store.selection()
-    few = select.spread(items, 6, seed=0)
+    few = select.limit_items(items, 6, seed=0)
     assert sorted(i.family for i in few) == ["event"] * 2 + ["time"] * 2 + ["window"] * 2
-    assert select.spread(items, 6, seed=0) == few
-    assert select.spread(items, None, seed=0) == items
+    assert select.limit_items(items, 6, seed=0) == few
+    assert select.limit_items(items, None, seed=0) == items

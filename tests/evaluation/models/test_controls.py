@@ -14,7 +14,7 @@ from conf.errors import UserError
 from conf.schema import BenchmarkConfig, SelectCommand, ServerConfig, StudentConfig
 from data.tracks.controls import MATCHED, pairs
 from evaluation import select
-from evaluation.generators.response_log import judge
+from evaluation.generators.response_log import score_response
 from evaluation.reporting.rows import SelectionRow
 from evaluation.reporting.selection_results import write_report
 from models.student.generation import GeneratedText
@@ -48,7 +48,7 @@ def test_a_prefix_is_worth_what_its_items_lose_without_it(
     server = talking(says)
     cfg = command(server, control="candidate_only", limit=12)
     metrics = select.main.__wrapped__(cfg, Run("x", tmp_path))
-    items = select.chosen_items(micro_store, None, 12, 0)
+    items = select.select_items(micro_store, None, 12, 0)
     plain, control = (sum(i.letter == x for i in items) for x in "CB")
     told = json.loads((tmp_path / "report.json").read_text())
     name = micro_store.name
@@ -105,7 +105,7 @@ def test_the_questions_of_a_pair_are_held_against_each_other(benchmark_store, tm
     said = {"event": "Answer: A", "time": "Answer: B"}
     given = {
         ("answer", control): [
-            judge(i, "answer", GeneratedText(said[i.family], False)) for i in items
+            score_response(i, "answer", GeneratedText(said[i.family], False)) for i in items
         ]
         for control in (None, "candidate_only")
     }
@@ -130,10 +130,10 @@ def test_the_questions_of_a_pair_are_held_against_each_other(benchmark_store, tm
 def test_a_limit_keeps_pairs_whole(benchmark_store) -> None:
     items = benchmark_store.selection(suite=MATCHED)
     assert len(items) == 2 * len(pairs(items))
-    few = select.spread(items, 3, 0)
+    few = select.limit_items(items, 3, 0)
     [(by_event, by_time)] = pairs(few)
     assert few == [by_event, by_time]
-    assert sorted(select.spread(items, len(items), 0), key=items.index) == items
+    assert sorted(select.limit_items(items, len(items), 0), key=items.index) == items
 
 
 def test_a_limit_that_leaves_no_pair_is_told() -> None:
@@ -146,4 +146,4 @@ def test_a_limit_that_leaves_no_pair_is_told() -> None:
 @pytest.mark.parametrize(("suite", "hint"), [("physion", "measure on$"), (MATCHED, "has pairs by")])
 def test_a_suite_that_a_benchmark_lacks_is_told(micro_store, suite, hint) -> None:
     with pytest.raises(UserError, match=f"has no test items of the {suite} suite to .*{hint}"):
-        select.chosen_items(micro_store, suite, None, 0)
+        select.select_items(micro_store, suite, None, 0)

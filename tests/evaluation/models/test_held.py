@@ -10,9 +10,9 @@ import pytest
 from conf.entry import Run
 from conf.schema import ArchitectureConfig, LoraConfig, SelectCommand, StudentConfig
 from evaluation import select
-from evaluation.generators.response_log import AnswerLog
+from evaluation.generators.response_log import ResponseLog
 from evaluation.generators.response_schema import schema
-from models.student.answer_parser import parse
+from models.student.answer_parser import parse_choice
 
 SMALL = ArchitectureConfig(
     hidden=64, layers=1, heads=2, kv_heads=2, feed_forward=64,
@@ -38,7 +38,7 @@ def test_a_random_model_writes_records_and_nothing_else(
     held = [row for row in rows if row["mode"] == "constrained" and "text" in row]
     assert len(held) == 4
     for row in held:
-        assert parse(row["text"]).letter == row["letter"]
+        assert parse_choice(row["text"]).letter == row["letter"]
         # A random model may fill the texts to their ends, and with what JSON would escape.
         if not row["cut"]:
             record = json.loads(row["text"], strict=False)
@@ -49,11 +49,11 @@ def test_a_random_model_writes_records_and_nothing_else(
 def test_answers_are_only_ever_added(micro_store, tmp_path) -> None:
     """What a kill tore stays, ended; what is asked otherwise later comes after it."""
     path, items = tmp_path / "answers.jsonl", micro_store.selection("test")[:2]
-    AnswerLog(path, {"answer": {"seed": 0}}, items)
+    ResponseLog(path, {"answer": {"seed": 0}}, items)
     torn = path.read_bytes() + b'{"item_id": "to'
     path.write_bytes(torn)
-    AnswerLog(path, {"answer": {"seed": 1}}, items)
+    ResponseLog(path, {"answer": {"seed": 1}}, items)
     assert path.read_bytes().startswith(torn + b"\n{")
     whole = path.read_bytes()
-    AnswerLog(path, {"answer": {"seed": 0}}, items)
+    ResponseLog(path, {"answer": {"seed": 0}}, items)
     assert path.read_bytes() == whole

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from sentence_transformers.util.similarity import maxsim
 
-from evaluation.embedders.cache import Embeddings, filled_up
-from evaluation.metrics.ranking import ranks_of
+from evaluation.embedders.cache import EmbeddingCache, filled_up
+from evaluation.metrics.ranking import count_ranks
 from evaluation.retrieval import late_interaction
 from evaluation.retrieval.late_interaction import late_ranks, pair_scores
 
@@ -59,7 +59,7 @@ def test_ranks_are_those_of_the_librarys_scores(asked, shown) -> None:
     pairs = np.array(list(pair_scores(rows_of(asked), frames[GOLD], WIDTH)))[:, 0]
     np.testing.assert_allclose(pairs, scores[np.arange(20), GOLD], rtol=1e-6, atol=1e-5)
     found = ranks(asked, shown)
-    greater, _ = ranks_of(scores, GOLD)
+    greater, _ = count_ranks(scores, GOLD)
     # fp32 cannot tell a frame from its own copies.
     assert (found.greater[0] <= greater).all()
     assert (found.greater[0] + found.tied[0] >= greater).all()
@@ -115,7 +115,7 @@ def test_sums_of_as_many_vectors_as_there_may_be_are_exact() -> None:
 
 def test_rows_of_several_lengths_come_back_from_disk_filled_up(tmp_path, asked) -> None:
     things = {f"q{k}": v.reshape(1, -1) for k, v in enumerate(asked)}
-    kept = Embeddings(tmp_path, "query", {"made by": "hand"})
+    kept = EmbeddingCache(tmp_path, "query", {"made by": "hand"})
     kept.complete(dict(list(things.items())[:7]), filled_up, 3)
     kept.complete(things, filled_up, 3)
     assert np.array_equal(kept.rows(list(things)), rows_of(asked))

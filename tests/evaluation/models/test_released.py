@@ -28,7 +28,7 @@ from data.records import FPS, FRAMES, LETTERS, FrameRef, shown_frames
 from data.render.frame_cache import Frames
 from evaluation import retrieve, similarity
 from evaluation.embedders.base import released_encoder
-from evaluation.embedders.dual_encoder import unit
+from evaluation.embedders.dual_encoder import unit_rows
 from evaluation.embedders.embed import EMBEDDINGS
 from evaluation.embedders.languagebind import LanguageBindVideo, spread
 from evaluation.retrieval import nearest_candidate
@@ -109,8 +109,8 @@ def test_a_query_is_the_sum_of_its_prefix_and_its_question(
     with torch.no_grad():
         # The model's own forward gives unit embeddings.
         found = model(**given)
-    prefix = unit(found.image_embeds.mean(0, keepdim=True).numpy())
-    asked = unit(prefix + found.text_embeds.numpy())
+    prefix = unit_rows(found.image_embeds.mean(0, keepdim=True).numpy())
+    asked = unit_rows(prefix + found.text_embeds.numpy())
     made = encoder(preset)
     np.testing.assert_allclose(made.queries([query], frames), asked, atol=1e-4)
     np.testing.assert_allclose(made.texts([query.question]), found.text_embeds, atol=1e-4)
@@ -161,7 +161,7 @@ def test_vlm2vec_reads_bare_media_at_flat_positions(presets, frames, micro_store
     flat = torch.arange(inputs["input_ids"].shape[1]).expand(3, 1, -1)
     with torch.no_grad():
         found = model(**inputs, position_ids=flat, output_hidden_states=True)
-    last = unit(found.hidden_states[-1][:, -1].numpy())
+    last = unit_rows(found.hidden_states[-1][:, -1].numpy())
     made = encoder(preset)
     np.testing.assert_allclose(made.queries([query], frames), last, atol=1e-4)
 
@@ -172,7 +172,7 @@ def test_vlm2vec_reads_bare_media_at_flat_positions(presets, frames, micro_store
     flat = torch.arange(image["input_ids"].shape[1]).expand(3, 1, -1)
     with torch.no_grad():
         found = model(**image, position_ids=flat, output_hidden_states=True)
-    last = unit(found.hidden_states[-1][:, -1].numpy())
+    last = unit_rows(found.hidden_states[-1][:, -1].numpy())
     frame = FrameRef(query.scene_id, shown[0])
     np.testing.assert_allclose(made.frames([frame], frames), last, atol=1e-4)
 

@@ -31,7 +31,7 @@ from data.store import open_store
 from evaluation import retrieve
 from evaluation.embedders import base
 from evaluation.embedders.embed import EMBEDDINGS, embed_frames, embed_queries, embedders
-from evaluation.metrics.ranking import metrics_from_counts, rank_metrics
+from evaluation.metrics.ranking import ranking_metrics, ranking_metrics_of_scores
 from models.retriever import embedder
 
 CFG = RetrieverConfig(
@@ -134,7 +134,7 @@ def test_it_is_measured_once_and_read_back(world, tmp_path, micro_store) -> None
         own = [line for line in kept if line["by"] == of["left"]]
         before, tied = (np.array([line[w][k] for line in own]) for w in ("before", "tied"))
         every_found = np.ones(len(own), bool)
-        counted = metrics_from_counts(before, tied, every_found, len(database), [1])
+        counted = ranking_metrics(before, tied, every_found, len(database), [1])
         assert counted["mrr"] == pytest.approx(sides[0]["mrr"]["value"])
     assert [of["width"] for of in first["apart"]] == CFG.widths
     for picture in ("retrieval.png", "builders.png"):
@@ -168,7 +168,7 @@ def test_one_of_many_vectors_is_measured_by_late_interaction(
     shown = model.encode_document([embedder.frame_input(f, frames) for f in database])
     gold = np.array([database.index(q.target) for q in queries])
     row = first["rows"][0]
-    plain = rank_metrics(model.similarity(asked, shown).numpy(), gold, [1])
+    plain = ranking_metrics_of_scores(model.similarity(asked, shown).numpy(), gold, [1])
     assert row["mrr"]["value"] == pytest.approx(plain["mrr"], rel=0.01)
     assert row["bytes"] == sum(v.numel() for v in shown) * 4
     names = dict.fromkeys((row["name"], row["width"]) for row in first["rows"])

@@ -18,9 +18,9 @@ from conf.errors import UserError
 from conf.schema import SelectCommand, ServerConfig, StudentConfig
 from data.render.frame_cache import Frames
 from evaluation import select
-from evaluation.generators.model_source import known_by, model_served, shown
+from evaluation.generators.model_source import model_served, response_settings, shown
 from evaluation.generators.openai_server import revision, say, written
-from evaluation.generators.response_log import AnswerLog, ask_all, judge
+from evaluation.generators.response_log import ResponseLog, collect_responses, score_response
 from evaluation.generators.response_schema import instruction, schema
 from teacher.servers.replies import CUT_OFF, Reply
 from tests.evaluation.generators.test_response_schema import FULL
@@ -44,8 +44,8 @@ def at(*servers, **changes) -> ServerConfig:
     return ServerConfig(url=[s.url for s in servers], model="served", **settings)
 
 
-def opened(tmp_path, items, **known) -> AnswerLog:
-    return AnswerLog(tmp_path / "answers.jsonl", {"record": known, "answer": known}, items)
+def opened(tmp_path, items, **known) -> ResponseLog:
+    return ResponseLog(tmp_path / "answers.jsonl", {"record": known, "answer": known}, items)
 
 
 def asker(server, frames, cfg=STUDENT, mode="record", control=None, seed=0):
@@ -56,7 +56,7 @@ def asker(server, frames, cfg=STUDENT, mode="record", control=None, seed=0):
 def test_the_same_frames_and_times_are_sent(items, frames, talking, tmp_path) -> None:
     server = talking(lambda _: FULL)
     log = opened(tmp_path, items)
-    given = ask_all(items, "record", asker(at(server, concurrency=1), frames), log)
+    given = collect_responses(items, "record", asker(at(server, concurrency=1), frames), log)
     assert [a.letter for a in given] == ["C"] * 8
     assert [a.right for a in given] == [i.letter == "C" for i in items]
     assert {a.valid for a in given} == {True}
@@ -90,7 +90,7 @@ def test_a_model_is_held_to_the_schema_and_draws_by_seeds(items, frames, talking
     for seed in (0, 0, 1):
         held = asker(at(server), frames, THINKING, "constrained", seed=seed)
         held(items[:2], said.extend)
-    answers = [judge(item, "constrained", found) for item, found in said]
+    answers = [score_response(item, "constrained", found) for item, found in said]
     assert [(a.letter, a.valid) for a in answers] == [("C", True)] * 6
     format_ = server.asked[0]["response_format"]
     assert format_["json_schema"]["schema"] == schema()
@@ -133,7 +133,7 @@ def test_a_thought_is_no_answer(reply, thinking, text, items) -> None:
     found = written(reply, thinking)
     assert found.text == text
     assert found.cut == (reply.flaw == CUT_OFF)
-    letter = judge(items[0], "answer", found).letter
+    letter = score_response(items[0], "answer", found).letter
     assert letter == (None if "</think>" not in text and thinking else text[-1])
 
 
@@ -152,7 +152,7 @@ def test_hostile_answers_are_kept_and_read(items, frames, talking, tmp_path) -> 
     )
     server = talking(lambda _: next(hostile))
     log = opened(tmp_path, items)
-    given = ask_all(items, "record", asker(at(server, concurrency=1), frames), log)
+    given = collect_responses(items, "record", asker(at(server, concurrency=1), frames), log)
     assert [a.letter for a in given] == [None, None, "B", None, None, None, None, "C"]
     assert given[4].reason == "cut off"
     again = opened(tmp_path, items).answers
@@ -166,12 +166,12 @@ def test_a_server_that_dies_costs_no_answer(items, frames, talking, tmp_path) ->
     with pytest.raises(
         UserError, match=r"no server of server\.url could be asked .* it goes on with"
     ):
-        ask_all(items, "record", dying, log)
+        collect_responses(items, "record", dying, log)
     kept = (tmp_path / "answers.jsonl").read_text()
     assert len(log.answers) == 3
     second = talking(lambda _: FULL)
     log = opened(tmp_path, items)
-    assert len(ask_all(items, "record", asker(at(second), frames), log)) == 8
+    assert len(collect_responses(items, "record", asker(at(second), frames), log)) == 8
     assert len(second.asked) == 5
     assert (tmp_path / "answers.jsonl").read_text().startswith(kept)
 
@@ -238,13 +238,13 @@ def test_a_server_is_given_its_key(items, frames, talking, tmp_path, monkeypatch
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
     for ask in (
         lambda: revision(at(server)),
-        lambda: ask_all(items, "record", asker(at(server), frames), log),
+        lambda: collect_responses(items, "record", asker(at(server), frames), log),
     ):
         with pytest.raises(UserError, match=f"{server.url} .*no such key.*OPENAI_API_KEY"):
             ask()
     monkeypatch.setenv("OPENAI_API_KEY", "secret")
     assert revision(at(server))["root"] == "weights"
-    given = ask_all(items, "record", asker(at(server), frames), log)
+    given = collect_responses(items, "record", asker(at(server), frames), log)
     assert [a.letter for a in given] == ["C"] * 8
 
 
@@ -269,14 +269,14 @@ def test_adapters_over_another_rounding_are_told(talking, tmp_path, caplog) -> N
 
 def test_answers_to_other_questions_stay_and_do_not_count(items, tmp_path) -> None:
     path, [item, *_] = tmp_path / "answers.jsonl", items
-    first = AnswerLog(path, {"record": {"seed": 0}}, items)
-    first.append([judge(item, "record", written(Reply(FULL), False))])
-    assert AnswerLog(path, {"record": {"seed": 0}}, items).answers == first.answers
-    assert not AnswerLog(path, {"record": {"seed": 1}}, items).answers
-    assert not AnswerLog(path, {"answer": {"seed": 0}}, items).answers
+    first = ResponseLog(path, {"record": {"seed": 0}}, items)
+    first.append([score_response(item, "record", written(Reply(FULL), False))])
+    assert ResponseLog(path, {"record": {"seed": 0}}, items).answers == first.answers
+    assert not ResponseLog(path, {"record": {"seed": 1}}, items).answers
+    assert not ResponseLog(path, {"answer": {"seed": 0}}, items).answers
     # A line that was torn ends there, the others stay.
     path.write_text(path.read_text() + '{"item_id": "')
-    assert AnswerLog(path, {"record": {"seed": 0}}, items).answers == first.answers
+    assert ResponseLog(path, {"record": {"seed": 0}}, items).answers == first.answers
     assert path.read_text().endswith('{"item_id": "\n')
 
 
@@ -293,7 +293,7 @@ def test_what_an_answer_depends_on_is_its_key() -> None:
     def known(
         mode="record", regime="cot", cfg=STUDENT, seed=0, rev="a", benchmark="b", control=None
     ):
-        return known_by(mode, regime, cfg, seed, {"weights": rev}, benchmark, control)
+        return response_settings(mode, regime, cfg, seed, {"weights": rev}, benchmark, control)
 
     assert known() == known(seed=1)
     other = [

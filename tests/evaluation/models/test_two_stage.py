@@ -36,10 +36,10 @@ from evaluation import two_stage
 from evaluation.embedders.base import released_encoder
 from evaluation.embedders.embed import embed_queries, embedders, untrained_embedder
 from evaluation.metrics.breakdown import retrieval_rows
-from evaluation.metrics.ranking import query_measures, rank_metrics
+from evaluation.metrics.ranking import query_metrics, ranking_metrics_of_scores
 from evaluation.retrieval import text_matching
 from evaluation.retrieval.predicted_texts import ROUTES, foreseen
-from evaluation.retrieval.standard_test import ranks_of, standard_test
+from evaluation.retrieval.standard_test import load_standard_test, rank_targets
 from models import loading
 from tests.evaluation.models import released
 from train.student import dataset
@@ -80,7 +80,7 @@ def store(tmp_path, micro_store) -> Store:
 @pytest.fixture
 def ranks(store, clip, tmp_path) -> Callable[..., text_matching.Ranks]:
     """Ranks of the standard test by texts of its queries, and of frames."""
-    queries, database = standard_test(store)
+    queries, database = load_standard_test(store)
     matcher = untrained_embedder(clip, "fp32", tmp_path)
 
     def rank(route: str, said: list[str], captions: list[str] = (), **images):
@@ -110,13 +110,13 @@ def test_the_foreseen_state_is_matched(text, state) -> None:
 
 
 def test_texts_rank_by_their_scores_and_a_missing_one_is_a_miss(ranks, store, clip) -> None:
-    queries, database = standard_test(store)
+    queries, database = load_standard_test(store)
     said = [f"The scene after {q.question} {k}" for k, q in enumerate(queries)]
     found = ranks("predict_image", said)
     encoder = released_encoder(clip, "fp32", Path("unused"))
     scores = encoder.texts(said) @ encoder.frames(database, Frames(store, clip.image_size)).T
     gold = np.array([database.index(q.target) for q in queries])
-    plain = rank_metrics(scores, gold, [10])
+    plain = ranking_metrics_of_scores(scores, gold, [10])
     row = retrieval_rows("micro", "x", found, queries, 0)[0]
     assert row.mrr.value == pytest.approx(plain["mrr"], rel=0.01)
     assert row.median_rank.value == pytest.approx(plain["median_rank"], abs=1)
@@ -126,14 +126,14 @@ def test_texts_rank_by_their_scores_and_a_missing_one_is_a_miss(ranks, store, cl
     assert (missing.greater[:, 1:-1] == found.greater[:, 1:-1]).all()
     less = retrieval_rows("micro", "x", missing, queries, 0)[0]
     assert (less.queries, less.frames) == (len(queries), len(database))
-    lost = query_measures(found.greater[0], found.tied[0], found.found[0], len(database), [1])
+    lost = query_metrics(found.greater[0], found.tied[0], found.found[0], len(database), [1])
     assert less.mrr.value == pytest.approx(lost["mrr"][1:-1].sum() / len(queries))
     with pytest.raises(UserError, match=r"predict -> image: nothing was written"):
         ranks("predict_image", [""] * len(queries))
 
 
 def test_repeating_the_question_ranks_as_seeing_no_prefix(ranks, store, clip, tmp_path) -> None:
-    queries, database = standard_test(store)
+    queries, database = load_standard_test(store)
     frames, names = Frames(store, clip.image_size), [f.name for f in database]
     [embedder] = embedders(None, clip, "fp32", store, tmp_path)
     encoder = embedder.load()
@@ -142,7 +142,7 @@ def test_repeating_the_question_ranks_as_seeing_no_prefix(ranks, store, clip, tm
     asked = embed_queries(blind, queries, store, frames, 16).rows([q.name for q in queries])
     shown = encoder.frames(database, frames)
     targets = shown[[names.index(q.target.name) for q in queries]]
-    direct = ranks_of(clip, asked, targets, [shown])
+    direct = rank_targets(clip, asked, targets, [shown])
     found = ranks("predict_image", [q.question for q in queries])
     for a, b in zip(
         retrieval_rows("micro", "x", found, queries, 0),
@@ -154,7 +154,7 @@ def test_repeating_the_question_ranks_as_seeing_no_prefix(ranks, store, clip, tm
 
 
 def test_captions_match_by_their_words(ranks, store) -> None:
-    queries, database = standard_test(store)
+    queries, database = load_standard_test(store)
     captions = [f"Frame {f.name}." for f in database]
     said = [f"Frame {q.target.name}." for q in queries]
     found = ranks("predict_caption", said, captions)
@@ -171,7 +171,7 @@ def test_captions_match_by_their_words(ranks, store) -> None:
 
 
 def test_a_drawn_target_is_found_first_and_drawn_once(ranks, store, talking) -> None:
-    queries, _ = standard_test(store)
+    queries, _ = load_standard_test(store)
     pixels = Frames(store)
 
     def paint(request) -> bytes:
@@ -198,7 +198,7 @@ def test_a_drawn_target_is_found_first_and_drawn_once(ranks, store, talking) -> 
 
 
 def test_what_is_drawn_is_kept_when_the_server_fails(ranks, store, talking) -> None:
-    queries, _ = standard_test(store)
+    queries, _ = load_standard_test(store)
     said = [f"Frame {q.name}" for q in queries]
     buffer = io.BytesIO()
     Image.new("RGB", (8, 8), "gray").save(buffer, "PNG")
@@ -264,7 +264,7 @@ def test_a_student_writes_once_for_every_matcher(world, store, micro, clip, tmp_
     routes = ["cot_text", "predict_caption", "predict_image"]
     asked = {"model": str(folder), "routes": routes}
     metrics, report = world(**asked)
-    queries, database = standard_test(store)
+    queries, database = load_standard_test(store)
     assert set(metrics) == {
         f"{r}_{m}" for r in routes for m in ("recall@1", "recall@10", "recall@50", "mrr",
                                              "median_rank")
@@ -315,7 +315,7 @@ def test_texts_are_kept_when_the_server_dies(world, store, talking) -> None:
     kept = log_of(store).read_text()
     server = talking(say)
     _, report = world("two", server=at(server), routes=["cot_text", "predict_image"])
-    queries, _ = standard_test(store)
+    queries, _ = load_standard_test(store)
     assert len(server.asked) == 2 * len(queries) - 5
     assert log_of(store).read_text().startswith(kept)
     assert report["texts"]["rationale"]["  prediction and outcome alone"] == len(queries)

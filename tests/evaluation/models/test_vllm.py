@@ -20,7 +20,7 @@ from evaluation.generators.model_source import shown
 from evaluation.generators.openai_server import chat_of, request_of
 from evaluation.generators.response_schema import schema
 from models import loading
-from models.student.answer_parser import Reason, parse
+from models.student.answer_parser import Reason, parse_choice
 from models.student.collator import Collator, encode
 from tests.teacher.serving import Serving
 from train.student import dataset
@@ -121,7 +121,7 @@ def test_a_served_model_is_measured_by_records(server, cfg, micro, micro_store, 
     # A random model may fill the texts to their ends; what it chooses stands before.
     assert served["constrained_parse_rate"] == 1
     for row in held:
-        found = parse(row["text"])
+        found = parse_choice(row["text"])
         assert found.letter == row["letter"]
         assert row["valid"] or (row["cut"] and found.reason is Reason.CUT_OFF)
         names = [f'"{name}"' for name in schema()["properties"] if f'"{name}"' in row["text"]]

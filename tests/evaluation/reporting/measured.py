@@ -27,14 +27,14 @@ from conf.schema.training import SftTrainConfig
 from data.records import SelectionItem
 from data.store import Store
 from evaluation import report
-from evaluation.metrics.accuracy import accuracy_by, accuracy_table
-from evaluation.metrics.breakdown import ranks_apart, recall_curves, retrieval_rows
-from evaluation.metrics.calibration import positions
+from evaluation.metrics.accuracy import accuracy_by_family, accuracy_by_group
+from evaluation.metrics.breakdown import compare_retrievers, recall_curves, retrieval_rows
+from evaluation.metrics.calibration import measure_position_bias
 from evaluation.reporting.rows import SIMILARITY, SelectionRow
 from evaluation.retrieval import nearest_candidate
 from evaluation.retrieval.exact_search import Ranks
-from evaluation.select import spread
-from models.student.answer_parser import parse
+from evaluation.select import limit_items
+from models.student.answer_parser import parse_choice
 
 STUDENT = StudentConfig(name="small")
 Say = Callable[[SelectionItem], str]
@@ -91,14 +91,14 @@ def select_run(
         benchmark=benchmark, student=STUDENT, store=str(store.folder.parent),
         model=None if model is None else f"{root}/sft/{model}", suite=suite,
     )  # fmt: skip
-    chosen = [parse(say(item)).letter for item in items]
+    chosen = [parse_choice(say(item)).letter for item in items]
     credits = [float(c == item.letter) for c, item in zip(chosen, items, strict=True)]
-    accuracy = accuracy_table([i.family for i in items], credits)
+    accuracy = accuracy_by_family([i.family for i in items], credits)
     parsed = sum(c is not None for c in chosen)
     name = model or "small base"
     row = SelectionRow.of(store.name, name, mode, accuracy, parsed / len(items), suite=suite)
-    cells = accuracy_by([f"{i.family}/{i.subtype}" for i in items], credits)
-    letters = positions(chosen, [i.letter for i in items])
+    cells = accuracy_by_group([f"{i.family}/{i.subtype}" for i in items], credits)
+    letters = measure_position_bias(chosen, [i.letter for i in items])
     report = {
         "build": store.identity,
         "asked": [[mode, None, "k1"]],
@@ -127,7 +127,7 @@ def similarity_run(
 ) -> Path:
     """A run of evaluation.similarity in which what is `untrained` gives every item's candidates
     these scores; `model` is a run of train.contrastive, which always chooses the right one."""
-    items = spread(store.selection("test"), limit, 0)
+    items = limit_items(store.selection("test"), limit, 0)
     settings = SimilarityCommand(
         benchmark=benchmark, retriever=RetrieverConfig(name=name), limit=limit,
         model=None if model is None else f"{root}/contrastive/{model}",
@@ -139,9 +139,9 @@ def similarity_run(
     rows, told, lines = [], {}, []
     for title, of in scores.items():
         credits = nearest_candidate.credits(of, answers)
-        accuracy = accuracy_table([i.family for i in items], credits)
+        accuracy = accuracy_by_family([i.family for i in items], credits)
         rows.append(SelectionRow.of(store.name, title, SIMILARITY, accuracy, None))
-        cells = accuracy_by([f"{i.family}/{i.subtype}" for i in items], credits)
+        cells = accuracy_by_group([f"{i.family}/{i.subtype}" for i in items], credits)
         told[title] = {cell: vars(found) for cell, found in cells.items()}
         lines += nearest_candidate.told(title, items, of)
     report = {"build": store.identity, "rows": [r.to_dict() for r in rows], "subtypes": told}
@@ -171,7 +171,7 @@ def retrieve_run(
     told = {"build": store.identity, "curves": curves, "indexes": []}
     report = {"rows": [r.to_dict() for r in rows], **told}
     if kind == "retrieve":
-        report["apart"] = ranks_apart(found, queries, 0)
+        report["apart"] = compare_retrievers(found, queries, 0)
     settings = RetrieveCommand(
         benchmark=benchmark, retriever=RetrieverConfig(name="small"),
         model=f"{root}/contrastive/{name}",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.metrics.ranking import ranks_of
+from evaluation.metrics.ranking import count_ranks
 from evaluation.retrieval import exact_search
 from evaluation.retrieval.exact_search import (
     Cut,
@@ -60,7 +60,7 @@ def test_ranks_are_those_of_a_plain_table() -> None:
     gold = np.random.default_rng(2).integers(300, size=40)
     found = exact_ranks(asked, shown[gold], [shown], WIDTHS)
     for k, width in enumerate(WIDTHS):
-        greater, tied = ranks_of(cosines(asked, shown, width), gold)
+        greater, tied = count_ranks(cosines(asked, shown, width), gold)
         # fp32 cannot tell a few pairs apart that double precision can.
         assert np.abs(found.greater[k] - greater).max() <= 1
         assert (found.greater[k] + found.tied[k] >= greater).all()

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from conf.errors import UserError
-from evaluation.embedders.cache import Embeddings
+from evaluation.embedders.cache import EmbeddingCache
 from evaluation.retrieval import faiss_index
 from evaluation.retrieval.exact_search import exact_ranks
-from evaluation.retrieval.faiss_index import Found, approximate_ranks, ranks_of_found
+from evaluation.retrieval.faiss_index import IndexResult, approximate_ranks, ranks_of_found
 
 WIDTHS = [32, 8]
 NAMES = [f"scene/{k}" for k in range(900)]
@@ -26,8 +26,8 @@ ASKED = VECTORS[:40] + 0.3 * np.random.default_rng(1).standard_normal((40, 32), 
 EVERY = 10**6
 
 
-def embeddings(folder: Path, model: str = "one") -> Embeddings:
-    kept = Embeddings(folder, "frame", {"weights": model})
+def embeddings(folder: Path, model: str = "one") -> EmbeddingCache:
+    kept = EmbeddingCache(folder, "frame", {"weights": model})
     kept.complete(dict(zip(NAMES, range(900), strict=True)), lambda some: VECTORS[some], 64)
     return kept
 
@@ -104,7 +104,7 @@ def test_a_damaged_index_is_named(tmp_path) -> None:
 def test_ranks_are_counted_among_what_was_found() -> None:
     frames = np.array([[7, 3, 5, -1], [7, 3, 5, 2], [7, 3, -1, -1]])
     scores = np.array([[0.9, 0.8, 0.8, -9], [0.9, 0.8, 0.8, 0.1], [0.9, 0.8, -9, -9]])
-    found = ranks_of_found([Found(frames, scores, 0, 0)], np.array([5, 7, 4]), [8], 900)
+    found = ranks_of_found([IndexResult(frames, scores, 0, 0)], np.array([5, 7, 4]), [8], 900)
     assert found.greater.tolist() == [[1, 0, 0]]
     assert found.tied.tolist() == [[1, 0, 0]]
     assert found.found.tolist() == [[True, True, False]]

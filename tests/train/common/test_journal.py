@@ -26,7 +26,7 @@ from conf.errors import UserError
 from conf.schema import SftCommand
 from evaluation.generators import local
 from evaluation.generators.model_source import shown
-from evaluation.generators.response_log import AnswerLog, ask_all
+from evaluation.generators.response_log import ResponseLog, collect_responses
 from models import loading
 from models.student.prompts import conversation
 from train import sft
@@ -89,12 +89,12 @@ def test_what_is_written_is_what_the_evaluation_reads(
         written = {r["sample"].removesuffix(f" ({mode})"): r for r in rows if r["mode"] == mode}
         assert len(written) == 2
         asked = [items[item_id] for item_id in written]
-        log = AnswerLog(tmp_path / f"{mode}.jsonl", {mode: {}}, asked)
+        log = ResponseLog(tmp_path / f"{mode}.jsonl", {mode: {}}, asked)
         sample_of = partial(shown, "cot", frames, settings.student, None, mode)
         answer = partial(
             local.say, model, processor, settings.student, "fp32", 2, 0, mode, sample_of
         )
-        given = ask_all(asked, mode, answer, log)
+        given = collect_responses(asked, mode, answer, log)
         for answer in given:
             row = written[answer.item_id]
             assert row["text"] == answer.text

@@ -10,7 +10,7 @@ from conf.schema import SftTrainConfig, TeacherConfig
 from conf.schema.training import REGIMES
 from data.records import LETTERS
 from data.store import Store
-from models.student.answer_parser import parse
+from models.student.answer_parser import parse_choice
 from models.student.prompts import answer_line, instruction, response
 from teacher.narrate import ensure_rationales
 from teacher.predicates import predicates_of
@@ -60,7 +60,7 @@ def test_both_modes_are_trained_and_answer_alike(micro_store, regime) -> None:
     assert all(told(s) == answer_line(s.item.letter) for s in answers.values())
     assert {i.item_id for i in micro_store.selection("train")} == answers.keys()
     for s in asked["reasoning"]:
-        assert parse(told(s)).letter == answers[s.item.item_id].item.letter
+        assert parse_choice(told(s)).letter == answers[s.item.item_id].item.letter
         assert instruction(s.mode, regime) != instruction("answer", regime)
 
 
@@ -76,7 +76,7 @@ def test_what_is_supervised_is_right_in_every_epochs_order(micro_store) -> None:
             item = shown.item
             assert item.candidates[item.answer] == right
             assert sorted(item.candidates, key=repr) == sorted(s.item.candidates, key=repr)
-            assert parse(told(shown)).letter == LETTERS[item.candidates.index(right)]
+            assert parse_choice(told(shown)).letter == LETTERS[item.candidates.index(right)]
             orders.add(tuple(s.item.candidates.index(c) for c in item.candidates))
             if s.mode == "reasoning":
                 predicates = predicates_of(
