@@ -31,6 +31,11 @@ from conf.keys import dict_above, has_key, keys, keys_like, nearest
 
 OWN_NAMES = {"train.export": "export_model", "evaluation.study.export": "export_study"}
 """Commands that do not go by the last part of their name, because data.export does."""
+REMOVED_KEYS: dict[str, str] = {
+    "shown": "use examples instead",
+    "cards": "use gpus instead",
+}
+"""Keys that no longer exist, each with what to do instead; the error for the key ends with it."""
 OVERLAYS = ("exp", "sweep")
 """Groups that are laid over what a command has, as `+exp=cot`."""
 
@@ -192,6 +197,8 @@ def _override_problems(
         ]
     if has_key(schema, key) or key in OVERLAYS:
         return []
+    if key in REMOVED_KEYS:
+        return [f"{_typed_key(override)}: this key was removed; {REMOVED_KEYS[key]}"]
     guess = nearest(key, [*keys_like(schema, key), *OVERLAYS])
     hint = f", did you mean {'+' if guess in OVERLAYS else ''}{guess}?" if guess else ""
     return [f"{_typed_key(override)}: {command} has no such key{hint}"]
@@ -294,6 +301,8 @@ def _omegaconf_problem(error: OmegaConfBaseException, schema: type) -> str:
     text, key = str(error).partition("\n")[0], error.full_key
     if not isinstance(error, ConfigAttributeError | ConfigKeyError):
         return f"{key}: {text}" if key else text
+    if key in REMOVED_KEYS:
+        return f"{key}: this key was removed; {REMOVED_KEYS[key]}"
     guess = None if dict_above(schema, key) else nearest(key, keys(schema))
     return f"{key}: no such key{f', did you mean {guess}?' if guess else ''}"
 

@@ -24,7 +24,7 @@ from omegaconf import DictConfig
 from conf.compose import preflight, register, short, strict
 from conf.errors import SettingsError, UserError
 from conf.help import help_text
-from conf.runs import Run, held, open_run, rank, ranks, run_name, write_json
+from conf.runs import Run, lock_folder, open_run, rank, run_name, world_size, write_json
 
 Metrics = dict[str, float]
 Main = Callable[[Any, Run], Metrics | None]
@@ -75,7 +75,7 @@ def _start(name: str, schema: type, main: Main) -> None:
         return
     if not (args.hydra_help or args.info or args.shell_completion):
         sweep = args.multirun or "hydra.mode=MULTIRUN" in args.overrides
-        if sweep and ranks() > 1:
+        if sweep and world_size() > 1:
             raise UserError("a sweep starts processes of its own: start it with python, not ranks")
         preflight(name, schema, args.overrides, sweep)
 
@@ -113,7 +113,7 @@ def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None
         f"{run.folder} is in use: another process of this command writes there. Wait for it, or "
         "choose another folder with run=NAME"
     )
-    with held(run.folder, in_use):
+    with lock_folder(run.folder, in_use):
         open_run(run, asdict(settings), name, overrides)
         metrics = main(settings, run)
         if metrics is not None:
@@ -144,7 +144,7 @@ def _sentences(folder: str = ".") -> Iterator[None]:
             raise
         _cannot_write(str(error.filename or folder), str(error.strerror))
     except Exception as error:
-        if ranks() > 1 and re.search(LEFT_ALONE, str(error)):
+        if world_size() > 1 and re.search(LEFT_ALONE, str(error)):
             _leave(1)
         if not _full(folder):
             raise
@@ -154,7 +154,7 @@ def _sentences(folder: str = ".") -> Iterator[None]:
 def _leave(code: int) -> NoReturn:
     """End at once where there are several ranks: an orderly end waits for what others still send,
     and it is by the end of one that the launcher knows to end all."""
-    if ranks() > 1:
+    if world_size() > 1:
         logging.shutdown()
         sys.stdout.flush()
         sys.stderr.flush()

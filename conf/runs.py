@@ -24,13 +24,22 @@ from conf.errors import SettingsError, UserError
 
 log = logging.getLogger(__name__)
 
-ELSEWHERE = ("run", "store", "checkpoints", "workers", "train.workers", "host", "port", "public")
+RESULT_NEUTRAL_KEYS = (
+    "run",
+    "store",
+    "checkpoints",
+    "workers",
+    "train.workers",
+    "host",
+    "port",
+    "public",
+)
 """Keys that say where and how fast a run goes, not what comes out of it."""
 
-OPENED = {"config.yaml", "run.json", "run.log", "output.log", "job.json"}
+BOOKKEEPING_FILES = {"config.yaml", "run.json", "run.log", "output.log", "job.json"}
 """Files of a run's folder before the command makes any."""
 
-TRAINERS = {"student": "sft", "retriever": "contrastive"}
+TRAINER_FOLDERS = {"student": "sft", "retriever": "contrastive"}
 """The folders of runs below checkpoints/, by what they train."""
 
 PACKAGES = (
@@ -63,12 +72,12 @@ def rank() -> int:
     return int(os.environ["RANK"]) if "LOCAL_RANK" in os.environ else 0
 
 
-def ranks() -> int:
+def world_size() -> int:
     """How many ranks a launcher started; 1 without one."""
     return int(os.environ["WORLD_SIZE"]) if "LOCAL_RANK" in os.environ else 1
 
 
-def ranks_here() -> int:
+def local_world_size() -> int:
     """How many of the ranks share this machine."""
     return int(os.environ.get("LOCAL_WORLD_SIZE", 1)) if "LOCAL_RANK" in os.environ else 1
 
@@ -79,7 +88,7 @@ def run_name(run: str | None, overrides: Sequence[str]) -> str:
         return run
     # Of two values of one key the later holds.
     told = sorted((o.lstrip("+") for o in overrides), key=_key)
-    told = [o for o in told if _key(o) not in ELSEWHERE]
+    told = [o for o in told if _key(o) not in RESULT_NEUTRAL_KEYS]
     # Only what can be typed after model= as it stands: "=" and "," mean something there.
     name = re.sub(r"[^A-Za-z0-9_.+-]", "-", "+".join(told)) or "default"
     if len(name) > 120:
@@ -92,34 +101,34 @@ def _key(override: str) -> str:
     return override.partition("=")[0]
 
 
-def run_below(run: str, folder: str) -> str:
+def resolve_run_name(run: str, folder: str) -> str:
     """The name of the run in `folder` that is given by its name or by its own folder."""
-    return os.path.relpath(run, folder) if is_below(run, folder) else os.path.normpath(run)
+    return os.path.relpath(run, folder) if is_inside(run, folder) else os.path.normpath(run)
 
 
-def is_below(path: str, folder: str) -> bool:
+def is_inside(path: str, folder: str) -> bool:
     return not os.path.relpath(path, folder).startswith("..")
 
 
-def runs_of(checkpoints: str, product: str) -> str:
+def runs_folder(checkpoints: str, product: str) -> str:
     """The folder of the runs that train a product, student or retriever."""
-    return f"{checkpoints}/{TRAINERS.get(product, product)}"
+    return f"{checkpoints}/{TRAINER_FOLDERS.get(product, product)}"
 
 
-def is_name(run: str) -> bool:
+def is_run_name(run: str) -> bool:
     """Whether a run's name leads to a folder below another one; a sweep's job is SWEEP/NUMBER."""
     return not os.path.isabs(run) and run.split(os.sep)[0] not in (".", "..")
 
 
-def finished(run: Run) -> dict[str, float] | None:
+def finished_metrics(run: Run) -> dict[str, float] | None:
     """The metrics of a run that has ended; None while there is something left to do."""
     path = run.folder / "metrics.json"
     return json.loads(path.read_text()) if path.exists() else None
 
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
-OmegaConf.register_new_resolver("run_below", run_below, replace=True)
-OmegaConf.register_new_resolver("runs_of", runs_of, replace=True)
+OmegaConf.register_new_resolver("resolve_run_name", resolve_run_name, replace=True)
+OmegaConf.register_new_resolver("runs_folder", runs_folder, replace=True)
 
 
 def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[str]) -> None:
@@ -130,7 +139,7 @@ def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[s
     cannot be written.
     """
     if other := differences(run.folder, settings):
-        if {path.name for path in run.folder.iterdir()} - OPENED:
+        if {path.name for path in run.folder.iterdir()} - BOOKKEEPING_FILES:
             raise SettingsError(
                 f"{run.folder} holds a run with other settings: {'; '.join(other[:3])}. "
                 "Choose another folder with run=NAME, or delete this one."
@@ -145,7 +154,7 @@ def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[s
 
 
 @contextmanager
-def held(folder: Path, otherwise: str) -> Iterator[None]:
+def lock_folder(folder: Path, otherwise: str) -> Iterator[None]:
     """Hold a folder against other processes.
 
     Raises:
@@ -163,7 +172,7 @@ def held(folder: Path, otherwise: str) -> Iterator[None]:
         os.close(handle)
 
 
-def wait_to_hold(handle: int, busy: str) -> None:
+def wait_for_lock(handle: int, busy: str) -> None:
     """Hold an open file or folder against other processes, once the one that has it is done; `busy`
     says that one has. It is held until it is closed."""
     try:
@@ -184,7 +193,7 @@ def differences(folder: Path, settings: dict[str, Any]) -> list[str]:
     return [
         f"{key} is {_shown(there, key)} there and {_shown(now, key)} now"
         for key in sorted(there.keys() | now.keys())
-        if key not in ELSEWHERE and there.get(key, absent) != now.get(key, absent)
+        if key not in RESULT_NEUTRAL_KEYS and there.get(key, absent) != now.get(key, absent)
     ]
 
 
@@ -225,7 +234,7 @@ def _record(
         "command": command,
         "overrides": overrides,
         "seeds": {k: v for k, v in _flat(settings).items() if k.rpartition(".")[2] == "seed"},
-        "ranks": ranks(),
+        "ranks": world_size(),
         "git": _git(),
         "python": platform.python_version(),
         "platform": platform.platform(),

@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import held, write_text
+from conf.runs import lock_folder, write_text
 from conf.schema import ExportCommand
 from data.parallel import Workers
 from data.publish.columns import Rows, features
@@ -128,7 +128,7 @@ def export(store: Store, folder: Path, plan: dict[str, Any]) -> None:
     growing = folder.with_name(f".{folder.name}.partial")
     growing.mkdir(parents=True, exist_ok=True)
     busy = f"{folder} is being written by another process; run this again when it is done"
-    with held(growing, busy):
+    with lock_folder(growing, busy):
         _begin(growing, plan)
         columns = features(plan["images"])
         rows = Rows(store, plan["images"])

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from conf.errors import UserError
-from conf.runs import wait_to_hold
+from conf.runs import wait_for_lock
 from conf.schema import BenchmarkConfig
 from data.records import SPLITS
 from data.store import PLAN, write_atomically
@@ -31,7 +31,7 @@ def growing_folder(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | None]:
     plan = _plan(cfg)
     handle = os.open(growing, os.O_RDONLY)
     try:
-        wait_to_hold(handle, f"{folder} is being built by another process")
+        wait_for_lock(handle, f"{folder} is being built by another process")
         if folder.exists():
             shutil.rmtree(growing, ignore_errors=True)
             yield None

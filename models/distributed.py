@@ -8,7 +8,7 @@ from datetime import timedelta
 from typing import TypeVar
 
 from conf.errors import UserError
-from conf.runs import rank, ranks
+from conf.runs import rank, world_size
 
 PATIENCE = timedelta(days=30)
 """How long ranks wait while the main one builds and narrates."""
@@ -19,7 +19,7 @@ Made = TypeVar("Made")
 def from_main(make: Callable[[], Made]) -> Made:
     """What `make` gives on the main rank, on every one; the others wait for it as long as it takes.
     Alone, a process just makes it."""
-    if ranks() == 1:
+    if world_size() == 1:
         return make()
     import torch
     from accelerate import PartialState
@@ -40,11 +40,11 @@ def accumulation_steps(batch: int, micro_batch: int) -> int:
     Raises:
         UserError: they cannot all be full.
     """
-    at_once = micro_batch * ranks()
+    at_once = micro_batch * world_size()
     if batch % at_once:
         near = max(1, round(batch / at_once)) * at_once
         raise UserError(
-            f"train.batch={batch} cannot be split over {ranks()} ranks in micro-batches of "
+            f"train.batch={batch} cannot be split over {world_size()} ranks in micro-batches of "
             f"train.micro_batch={micro_batch}: set train.batch to a multiple of {at_once}, such as "
             f"{near}, or start another number of ranks"
         )
@@ -57,12 +57,12 @@ def per_rank_batch(batch: int) -> int:
     Raises:
         UserError: they cannot have equal parts.
     """
-    if batch % ranks():
+    if batch % world_size():
         raise UserError(
-            f"train.batch={batch} cannot be split over {ranks()} ranks: set it to a multiple of "
-            f"{ranks()}, or start another number of ranks"
+            f"train.batch={batch} cannot be split over {world_size()} ranks: set it to a multiple "
+            f"of {world_size()}, or start another number of ranks"
         )
-    return batch // ranks()
+    return batch // world_size()
 
 
 def is_sharded() -> bool:

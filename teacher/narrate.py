@@ -80,7 +80,7 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     narration = narrate_store(store, cfg.teacher)
     log.info(narration)
-    report = ensure_report(store, narration, cfg.shown, run.folder)
+    report = ensure_report(store, narration, cfg.examples, run.folder)
     return {
         "accepted": float(report["accepted"]),
         "answers": float(sum(report["asked"])),

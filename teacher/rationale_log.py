@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from conf.errors import UserError
-from conf.runs import wait_to_hold
+from conf.runs import wait_for_lock
 from data.records import Rationale
 from data.store import write_atomically
 from teacher.validation.validate import SECTIONS
@@ -37,7 +37,7 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.file = open(path, "ab+")  # noqa: SIM115  closed by __exit__
-        wait_to_hold(self.file.fileno(), f"{path} is being written by another process")
+        wait_for_lock(self.file.fileno(), f"{path} is being written by another process")
         self._end_torn_line()
         self.rationales = read_rationales(path)
 

@@ -177,10 +177,10 @@ def vllm_arguments(
         # Of a part of a prompt a token is drawn and taken back, which ends a server without a GPU
         # where a request has a seed of its own (vLLM 0.32): no prompt is read in parts.
         return [*arguments, "--no-enable-chunked-prefill"]
-    if (cfg.cards or 1) > machine.cards:
-        raise UserError(f"cards={cfg.cards}: vLLM finds {machine.cards} on this machine")
+    if (cfg.gpus or 1) > machine.cards:
+        raise UserError(f"gpus={cfg.gpus}: vLLM finds {machine.cards} on this machine")
     # A model's heads divide by powers of two.
-    cards = cfg.cards or 1 << (machine.cards.bit_length() - 1)
+    cards = cfg.gpus or 1 << (machine.cards.bit_length() - 1)
     arguments += ["--tensor-parallel-size", str(cards)]
     return [*arguments, "--gpu-memory-utilization", str(cfg.memory)]
 

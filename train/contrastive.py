@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from conf.entry import Run, command
-from conf.multirun.processes import keep_to_one_gpu
-from conf.runs import finished
+from conf.multirun.processes import restrict_to_one_gpu
+from conf.runs import finished_metrics
 from conf.schema import ContrastiveCommand
 from conf.trackers import check_trackers
 
@@ -21,12 +21,12 @@ log = logging.getLogger(__name__)
 
 @command("train.contrastive", ContrastiveCommand)
 def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
-    if (metrics := finished(run)) is not None:
+    if (metrics := finished_metrics(run)) is not None:
         log.info("%s is finished; delete it, or give run=NAME, to train anew", run.folder)
         return metrics
 
     check_trackers(cfg.train.report_to)
-    keep_to_one_gpu()
+    restrict_to_one_gpu()
 
     from models import distributed
 

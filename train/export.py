@@ -24,7 +24,7 @@ from pathlib import Path
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import held, run_below, runs_of, write_json, write_text
+from conf.runs import lock_folder, resolve_run_name, runs_folder, write_json, write_text
 from conf.schema import (
     ContrastiveCommand,
     ExportModelCommand,
@@ -117,8 +117,8 @@ def find(cfg: ExportModelCommand) -> Trained:
     """
     from models.trained_runs import trained_settings
 
-    runs = runs_of(cfg.checkpoints, cfg.product)
-    name = run_below(cfg.run, runs)
+    runs = runs_folder(cfg.checkpoints, cfg.product)
+    name = resolve_run_name(cfg.run, runs)
     folder = Path(runs) / name
     settings = trained_settings(folder, TRAINED_BY[cfg.product], cfg.product, "run")
     trained = Trained(name, folder, cfg.product, settings)
@@ -136,7 +136,7 @@ def renamed_when_whole(folder: Path) -> Iterator[Path]:
     disk left of an earlier one is thrown away."""
     partial = folder.with_name(f".{folder.name}.partial")
     partial.mkdir(exist_ok=True)
-    with held(partial, f"{folder} is being written by another process"):
+    with lock_folder(partial, f"{folder} is being written by another process"):
         for leftover in partial.iterdir():
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         try:

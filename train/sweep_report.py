@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from conf.errors import UserError
-from conf.multirun.summary import report
+from conf.multirun.summary import write_sweep_table
 
 
 def main() -> None:
@@ -20,7 +20,7 @@ def main() -> None:
         "sweep.csv and sweep.png are written anew",
     )
     try:
-        print(report(parser.parse_args().folder))
+        print(write_sweep_table(parser.parse_args().folder))
     except UserError as error:
         sys.exit(f"error: {error}")
     except OSError as error:

@@ -23,7 +23,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from conf.multirun.processes import LOOK_EVERY, end, start, visible_gpus
-from conf.multirun.summary import JOB_FILE, outcome, read_jobs, report
+from conf.multirun.summary import JOB_FILE, final_metrics, read_jobs, write_sweep_table
 from conf.runs import differences, run_name, write_json
 
 log = logging.getLogger(__name__)
@@ -161,7 +161,7 @@ def _ended(child: Child, code: int | None, seconds: float | None) -> None:
     _record(child, "done" if code == 0 else "failed", seconds)
     took = f" {'in' if code == 0 else 'after'} {seconds} s" if seconds is not None else ""
     if code == 0:
-        found = list(outcome(_metrics(child) or {}).items())[:3]
+        found = list(final_metrics(_metrics(child) or {}).items())[:3]
         told = "".join(f", {name} {value:.4g}" for name, value in found)
         log.info("%s: done%s%s", child.title, took, told)
         return
@@ -205,6 +205,6 @@ class TableCallback(Callback):
         jobs = read_jobs(folder)
         if not jobs:
             return
-        print(report(folder))
+        print(write_sweep_table(folder))
         if any(job.status == "failed" for job in jobs):
             sys.exit(1)

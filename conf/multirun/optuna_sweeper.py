@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 from conf.errors import SettingsError, UserError
 from conf.multirun.launcher import job_settings
 from conf.multirun.processes import visible_gpus
-from conf.multirun.summary import less_is_better, outcome
+from conf.multirun.summary import final_metrics, is_lower_better
 from conf.runs import differences
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ class OptunaSweeper(Sweeper):
         for trial, returned in zip(trials, returns, strict=True):
             # A failed job gets no value, so that the same command tries it again.
             if (metrics := returned.return_value) is not None:
-                self._tell(study, trial.number, outcome(metrics))
+                self._tell(study, trial.number, final_metrics(metrics))
 
     def _tell(self, study: Study, number: int, metrics: dict[str, float]) -> None:
         from optuna.trial import TrialState
@@ -191,7 +191,7 @@ def open_study(journal: Path, metric: str) -> Study:
         return optuna.create_study(
             storage=JournalStorage(JournalFileBackend(str(journal))),
             study_name="study",
-            direction="minimize" if less_is_better(metric) else "maximize",
+            direction="minimize" if is_lower_better(metric) else "maximize",
             load_if_exists=True,
         )
 

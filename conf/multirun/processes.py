@@ -36,7 +36,7 @@ def visible_gpus() -> list[str]:
     return [str(number) for number in range(count)]
 
 
-def keep_to_one_gpu() -> None:
+def restrict_to_one_gpu() -> None:
     """See the first GPU alone where no launcher has started several ranks: a trainer would spread
     each micro-batch over all of them, and train on more samples a step than the settings say.
 

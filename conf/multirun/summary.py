@@ -16,7 +16,7 @@ from conf.errors import UserError
 from conf.runs import write_text
 
 JOB_FILE = "job.json"
-AT_START = "_at_start"
+AT_START_SUFFIX = "_at_start"
 """End of the name of a metric measured before a run's first step."""
 LESS_IS_BETTER = r"loss|_rank$|set_aside|too_short|reject"
 
@@ -38,19 +38,19 @@ def read_jobs(folder: Path) -> list[Job]:
     for path in folder.glob(f"[0-9]*/{JOB_FILE}"):
         metrics = path.with_name("metrics.json")
         told = json.loads(path.read_text())
-        found = outcome(json.loads(metrics.read_text())) if metrics.exists() else {}
+        found = final_metrics(json.loads(metrics.read_text())) if metrics.exists() else {}
         jobs.append(
             Job(int(path.parent.name), **told, metrics=found if told["status"] == "done" else {})
         )
     return sorted(jobs, key=lambda job: job.number)
 
 
-def outcome(metrics: dict[str, float]) -> dict[str, float]:
+def final_metrics(metrics: dict[str, float]) -> dict[str, float]:
     """What a run came to: its metrics but those of its start, which jobs mostly share."""
-    return {name: value for name, value in metrics.items() if not name.endswith(AT_START)}
+    return {name: value for name, value in metrics.items() if not name.endswith(AT_START_SUFFIX)}
 
 
-def report(folder: Path) -> str:
+def write_sweep_table(folder: Path) -> str:
     """A sweep's table as text, which is also written as sweep.txt, beside sweep.csv and sweep.png.
 
     Raises UserError where no job has ended.
@@ -59,7 +59,7 @@ def report(folder: Path) -> str:
     if not jobs:
         raise UserError(f"{folder} holds no sweep with a job that has ended")
     metrics = sorted({name for job in jobs for name in job.metrics})
-    settings = varying([job.overrides for job in jobs])
+    settings = varying_overrides([job.overrides for job in jobs])
     rows = [
         {"job": job.number, **told, **job.metrics, "status": job.status, "seconds": job.seconds}
         for job, told in zip(jobs, settings, strict=True)
@@ -78,7 +78,7 @@ def report(folder: Path) -> str:
     return text
 
 
-def varying(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
+def varying_overrides(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
     """For each job the overrides, key to value, that not all jobs share."""
     told = [dict(o.lstrip("+").split("=", 1) for o in job if "=" in o) for job in jobs]
     keys = dict.fromkeys(key for job in told for key in job)
@@ -86,21 +86,21 @@ def varying(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
     return [{key: job[key] for key in differ if key in job} for job in told]
 
 
-def less_is_better(name: str) -> bool:
+def is_lower_better(name: str) -> bool:
     """Whether a metric is a loss, a rank or a count of what was refused."""
     return re.search(LESS_IS_BETTER, name) is not None
 
 
-def best(name: str, values: Sequence[float]) -> float | None:
+def best_value(name: str, values: Sequence[float]) -> float | None:
     """The best of a metric's values that are numbers."""
     finite = [value for value in values if math.isfinite(value)]
     if not finite:
         return None
-    return (min if less_is_better(name) else max)(finite)
+    return (min if is_lower_better(name) else max)(finite)
 
 
 def _text(rows: list[dict[str, Any]], columns: list[str], metrics: list[str]) -> str:
-    bests = {name: best(name, [row[name] for row in rows if name in row]) for name in metrics}
+    bests = {name: best_value(name, [row[name] for row in rows if name in row]) for name in metrics}
     cells = [columns]
     for row in rows:
         told = {key: _shown(row.get(key)) for key in columns}

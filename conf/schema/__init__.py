@@ -12,7 +12,7 @@ from conf.schema.benchmark import (
     SelectionConfig,
 )
 from conf.schema.commands import (
-    ENGINES,
+    PARALLEL_BACKENDS,
     BuildCommand,
     CommandConfig,
     ContrastiveCommand,
@@ -42,7 +42,7 @@ from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainCo
 from conf.schema.two_stage import MatcherConfig, TwoStageCommand
 
 __all__ = [
-    "ENGINES",
+    "PARALLEL_BACKENDS",
     "ArchitectureConfig",
     "BenchmarkConfig",
     "BuildCommand",

@@ -12,7 +12,7 @@ RENDERERS = ("bullet", "egl", "blender")
 SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
 STANDINS = ("movi_a", "physion")
 STANDIN_OBJECTS = 6
-LOOKS = 48
+DISTINCT_APPEARANCES = 48
 """Objects that can be told apart by their names: 3 shapes, 8 colours, 2 materials."""
 
 
@@ -124,11 +124,11 @@ class BenchmarkConfig:
                 "scenes of a release cannot be simulated again, set both of its quotas to 0"
             )
         problems += self._standin_problems()
-        if not 2 <= self.min_objects <= self.max_objects <= LOOKS:
+        if not 2 <= self.min_objects <= self.max_objects <= DISTINCT_APPEARANCES:
             problems.append(
                 f"benchmark.min_objects={self.min_objects} and "
-                f"benchmark.max_objects={self.max_objects}: need 2 <= min <= max <= {LOOKS}, as "
-                "no two objects of a scene look alike"
+                f"benchmark.max_objects={self.max_objects}: need 2 <= min <= max <= "
+                f"{DISTINCT_APPEARANCES}, because no two objects of a scene look alike"
             )
         if self.width < 48 or self.width * 2 != self.height * 3:
             problems.append(

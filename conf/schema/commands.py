@@ -7,7 +7,7 @@ from datetime import date
 
 from omegaconf import MISSING
 
-from conf.runs import TRAINERS, is_below, is_name, run_below, runs_of
+from conf.runs import TRAINER_FOLDERS, is_inside, is_run_name, resolve_run_name, runs_folder
 from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.checks import is_url, too_small
 from conf.schema.models import RetrieverConfig, StudentConfig
@@ -15,10 +15,10 @@ from conf.schema.servers import ServerConfig
 from conf.schema.teacher import TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
 
-EXPORTS = ("bf16", "fp32", "adapter")
-ASKED = ("reasoning", "answer", "record", "constrained")
-FRAMES_AHEAD = ("named", "all", "none")
-ENGINES = ("loky", "ray")
+EXPORT_FORMATS = ("bf16", "fp32", "adapter")
+RESPONSE_MODES = ("reasoning", "answer", "record", "constrained")
+PRERENDER_OPTIONS = ("named", "all", "none")
+PARALLEL_BACKENDS = ("loky", "ray")
 INDEXES = ("exact", "faiss")
 SUITES = (None, "matched_anchor")
 CONTROLS = ("candidate_only", "shuffled_prefix")
@@ -57,7 +57,7 @@ class BuildCommand(CommandConfig):
 
     def check(self) -> list[str]:
         problems = super().check() + too_small(self, "", {"frames_gb": 0})
-        for key, options in (("frames", FRAMES_AHEAD), ("parallel", ENGINES)):
+        for key, options in (("frames", PRERENDER_OPTIONS), ("parallel", PARALLEL_BACKENDS)):
             if getattr(self, key) not in options:
                 listed = f"{', '.join(options[:-1])} and {options[-1]}"
                 problems.append(f"{key}={getattr(self, key)}: the options are {listed}")
@@ -118,11 +118,11 @@ class GalleryCommand(CommandConfig):
 class NarrateCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     teacher: TeacherConfig = MISSING
-    shown: int = 20
+    examples: int = 20
     """Rationales on the report's page, beside their frames; chosen by `teacher.seed`."""
 
     def check(self) -> list[str]:
-        return super().check() + too_small(self, "", {"shown": 0})
+        return super().check() + too_small(self, "", {"examples": 0})
 
 
 @dataclass
@@ -137,7 +137,7 @@ class ServeCommand(CommandConfig):
     """Tokens that a prompt may have; with teacher.max_tokens it makes the model's context."""
     dtype: str = "auto"
     """Of weights and activations: auto, bfloat16, float16 or float32."""
-    cards: int | None = None
+    gpus: int | None = None
     """GPUs that share the model; null takes the largest power of two that the machine has."""
     memory: float = 0.9
     """Share of each GPU's memory."""
@@ -150,7 +150,7 @@ class ServeCommand(CommandConfig):
     """Folder of a student's adapters over the model; they are asked by the name `adapter`."""
 
     def check(self) -> list[str]:
-        least = {"prompt_tokens": 1, "cards": 1}
+        least = {"prompt_tokens": 1, "gpus": 1}
         problems = super().check() + too_small(self, "", least)
         if len(self.teacher.urls) != 1:
             problems.append(
@@ -188,16 +188,16 @@ class ExportModelCommand(CommandConfig):
 
     def check(self) -> list[str]:
         problems = super().check()
-        if self.product not in TRAINERS:
+        if self.product not in TRAINER_FOLDERS:
             problems.append(f"product={self.product}: the options are student and retriever")
-        if self.format not in EXPORTS:
+        if self.format not in EXPORT_FORMATS:
             problems.append(f"format={self.format}: the options are bf16, fp32 and adapter")
-        for other in TRAINERS:
-            if other != self.product and is_below(self.run, runs_of(self.checkpoints, other)):
+        for other in TRAINER_FOLDERS:
+            if other != self.product and is_inside(self.run, runs_folder(self.checkpoints, other)):
                 problems.append(f"run={self.run} trained a {other}: give product={other}")
                 return problems
-        runs = runs_of(self.checkpoints, self.product)
-        if not is_name(run_below(self.run, runs)):
+        runs = runs_folder(self.checkpoints, self.product)
+        if not is_run_name(resolve_run_name(self.run, runs)):
             problems.append(
                 f"run={self.run} is no run below {runs}: name one that is there, and give "
                 "checkpoints=FOLDER where the runs are elsewhere"
@@ -282,9 +282,9 @@ class SelectCommand(CommandConfig):
                 f"control={self.control}: the options are {', '.join(CONTROLS)} and null"
             )
         given = ["record"] if self.modes is None else self.modes
-        if not given or len(set(given)) < len(given) or set(given) - set(ASKED):
+        if not given or len(set(given)) < len(given) or set(given) - set(RESPONSE_MODES):
             problems.append(
-                f"modes={self.modes}: give one or more of {', '.join(ASKED)}, each once"
+                f"modes={self.modes}: give one or more of {', '.join(RESPONSE_MODES)}, each once"
             )
         return problems
 

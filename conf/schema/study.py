@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 from omegaconf import MISSING
 
-from conf.runs import is_name, run_below
+from conf.runs import is_run_name, resolve_run_name
 from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.checks import is_url, too_small
 from conf.schema.commands import CommandConfig
@@ -67,7 +67,7 @@ class ExportStudyCommand(CommandConfig):
     def check(self) -> list[str]:
         problems = super().check()
         runs = f"{self.checkpoints}/study"
-        if not is_name(run_below(self.run, runs)):
+        if not is_run_name(resolve_run_name(self.run, runs)):
             problems.append(
                 f"run={self.run} is no run below {runs}: name one that is there, and give "
                 "checkpoints=FOLDER where the runs are elsewhere"

@@ -26,7 +26,7 @@ import numpy as np
 from tqdm import tqdm
 
 from conf.errors import UserError
-from conf.runs import held, write_json
+from conf.runs import lock_folder, write_json
 from data.parallel import batched
 from data.store import digest, write_atomically
 
@@ -77,7 +77,7 @@ class EmbeddingCache:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
         busy = f"{self.folder} is being filled by another process; run this again when it is done"
-        with held(self.folder, busy):
+        with lock_folder(self.folder, busy):
             # Another process may have filled it since.
             self._clean(self._read())
             write_json(self.folder / ABOUT, self.about)

@@ -21,7 +21,7 @@ from types import ModuleType
 import numpy as np
 
 from conf.errors import UserError
-from conf.runs import held, write_json
+from conf.runs import lock_folder, write_json
 from evaluation.embedders.cache import EmbeddingCache
 from evaluation.reporting.rows import RECALLS
 from evaluation.retrieval.exact_search import Cut, Ranks, block_scores, least_of_top
@@ -108,7 +108,9 @@ def search(
     database = hashlib.sha256("\n".join(names).encode()).hexdigest()[:16]
     path = folder / f"{database}-{width}.faiss"
     built_for = {**shown.about, "database": database, "width": width, "faiss": faiss.__version__}
-    with held(folder, f"{folder} is in use by another process; run this again when it is done"):
+    with lock_folder(
+        folder, f"{folder} is in use by another process; run this again when it is done"
+    ):
         if not _is_there(path, built_for):
             log.info("building the index of width %d over %s frames", width, f"{len(names):,}")
             # Not kept by a name: read back below, it would be in memory twice.

@@ -13,7 +13,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from conf.runs import held
+from conf.runs import lock_folder
 from conf.schema import StudentConfig, TwoStageCommand
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
@@ -92,7 +92,7 @@ def write_texts(
     folder = store.folder / TEXTS / short_hash(json.dumps(model.revision, sort_keys=True))
     folder.mkdir(parents=True, exist_ok=True)
     busy = f"{folder} is being written by another process; run this again when it is done"
-    with held(folder, busy):
+    with lock_folder(folder, busy):
         log = ResponseLog(folder / "texts.jsonl", known, [*queries, *database], free_text_response)
         written = {}
         for mode in modes:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import run_below, write_text
+from conf.runs import resolve_run_name, write_text
 from conf.schema import ExportStudyCommand
 
 log = logging.getLogger(__name__)
@@ -24,7 +24,7 @@ def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
     from evaluation.study.votes import votes_of
 
     runs = Path(cfg.checkpoints) / "study"
-    path = runs / run_below(cfg.run, str(runs)) / storage.DATABASE
+    path = runs / resolve_run_name(cfg.run, str(runs)) / storage.DATABASE
     if not storage.begun(path):
         raise UserError(f"{path} is not there: begin a study with python -m evaluation.study")
     db = storage.open_study(path)

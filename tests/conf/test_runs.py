@@ -6,7 +6,7 @@ from itertools import permutations
 import pytest
 
 from conf.errors import SettingsError, UserError
-from conf.multirun.summary import best, report, varying
+from conf.multirun.summary import best_value, varying_overrides, write_sweep_table
 from conf.runs import Run, open_run, run_name
 
 SETTINGS = {"seed": 0, "run": None, "store": "store", "checkpoints": "c", "workers": 2, "x": 1.0}
@@ -70,18 +70,18 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
 
 def test_the_best_of_a_metric_goes_by_its_name():
     values = [2.0, 1.0, float("nan")]
-    assert best("eval_loss", values) == 1.0
-    assert best("median_rank", values) == 1.0
-    assert best("set_aside", values) == 1.0
-    assert best("accuracy", values) == 2.0
-    assert best("accuracy", [float("nan")]) is None
+    assert best_value("eval_loss", values) == 1.0
+    assert best_value("median_rank", values) == 1.0
+    assert best_value("set_aside", values) == 1.0
+    assert best_value("accuracy", values) == 2.0
+    assert best_value("accuracy", [float("nan")]) is None
 
 
 def test_only_what_varies_is_a_column():
     jobs = [["+exp=cot", "x=1", "y=3"], ["+exp=cot", "x=2", "y=3"]]
-    assert varying(jobs) == [{"x": "1"}, {"x": "2"}]
+    assert varying_overrides(jobs) == [{"x": "1"}, {"x": "2"}]
 
 
 def test_a_folder_without_a_sweep_is_told(tmp_path):
     with pytest.raises(UserError, match="holds no sweep"):
-        report(tmp_path)
+        write_sweep_table(tmp_path)

@@ -249,7 +249,10 @@ def test_a_failed_trial_is_tried_again(room):
 @pytest.mark.slow
 def test_an_unknown_metric_is_told_and_may_be_mended(room):
     wrong = toy(room, *SEARCH, "hydra.sweeper.metric=los", "run=s")
-    said = "error: hydra.sweeper.metric=los: a job of toy measures accuracy, loss here  [invalid-setting]\n"
+    said = (
+        "error: hydra.sweeper.metric=los: a job of toy measures accuracy, loss here"
+        "  [invalid-setting]\n"
+    )
     assert (wrong.returncode, wrong.stderr.endswith(said)) == (1, True)
     right = toy(room, *SEARCH, "hydra.sweeper.metric=loss", "run=s")
     assert right.returncode == 0

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from conf.errors import UserError
-from conf.schema import ENGINES
+from conf.schema import PARALLEL_BACKENDS
 from data.parallel import Workers
 
 
@@ -28,7 +28,7 @@ def die(number: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", PARALLEL_BACKENDS)
 def test_a_killed_workers_jobs_are_done_by_others(tmp_path, engine) -> None:
     jobs = {str(k): partial(square, k) for k in range(20)}
     jobs["7"] = partial(square, 7, tmp_path / "victim")

@@ -98,10 +98,10 @@ def test_cards_share_the_model_by_powers_of_two(there, used):
 
 
 def test_fewer_cards_can_be_asked_for_but_not_more():
-    told = flags(command(cards=1), 4)
+    told = flags(command(gpus=1), 4)
     assert told[told.index("--tensor-parallel-size") + 1] == "1"
-    with pytest.raises(UserError, match="cards=5: vLLM finds 4"):
-        flags(command(cards=5), 4)
+    with pytest.raises(UserError, match="gpus=5: vLLM finds 4"):
+        flags(command(gpus=5), 4)
 
 
 def test_a_cpu_server_runs_eagerly():

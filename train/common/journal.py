@@ -10,7 +10,7 @@ from transformers import ProgressCallback, TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.errors import UserError
-from conf.multirun.summary import AT_START
+from conf.multirun.summary import AT_START_SUFFIX
 from conf.runs import write_text
 from train.common.curves import curves_figure
 
@@ -134,6 +134,6 @@ def evaluated(folder: Path, best: int | None = None) -> dict[str, float]:
         for key, value in record.items():
             if key.startswith("eval_"):
                 name = key.removeprefix("eval_")
-                results.setdefault(f"{name}{AT_START}", value)
+                results.setdefault(f"{name}{AT_START_SUFFIX}", value)
                 results[name] = value
     return results

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from huggingface_hub import ModelCardData
 
-from conf.multirun.summary import AT_START
+from conf.multirun.summary import AT_START_SUFFIX
 from conf.schema import ContrastiveCommand, RetrieverConfig, SftCommand, StudentConfig
 from models.checks import BASE, is_hub_model
 from train.common.journal import BEST_STEP
@@ -151,7 +151,7 @@ def _kept(settings: Settings, metrics: dict[str, float]) -> str:
 
 def _curve(metrics: dict[str, float]) -> Iterable[tuple[str, str, str]]:
     for name, value in metrics.items():
-        if (start := metrics.get(f"{name}{AT_START}")) is not None:
+        if (start := metrics.get(f"{name}{AT_START_SUFFIX}")) is not None:
             yield name.replace("_", " "), _figure(start), _figure(value)
 
 

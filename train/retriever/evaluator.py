@@ -14,7 +14,7 @@ from sentence_transformers.sentence_transformer.evaluation import InformationRet
 from sentence_transformers.util import cos_sim
 from sentence_transformers.util.similarity import maxsim
 
-from conf.runs import ranks
+from conf.runs import world_size
 from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery
 from data.render.frame_cache import Frames
@@ -96,7 +96,7 @@ class Slice:
             UserError: one is no number.
         """
         title = query_title if encode_fn_name == "query" else frame_title
-        at_once = self.batch_size * ranks()
+        at_once = self.batch_size * world_size()
         rows: list[torch.Tensor] = []
         for start in range(0, len(named), at_once):
             some = named[start : start + at_once]

@@ -9,7 +9,7 @@ from sentence_transformers import MultiVectorEncoder
 from sentence_transformers.util.similarity import maxsim
 from torch.nn.functional import pad
 
-from conf.runs import ranks
+from conf.runs import world_size
 from train.retriever.loss import RankingLoss
 
 
@@ -32,6 +32,6 @@ class MultiVectorRankingLoss(RankingLoss):
 
     def joined(self, parts: list[torch.Tensor]) -> torch.Tensor:
         longest = torch.tensor(max(part.shape[1] for part in parts), device=parts[0].device)
-        if ranks() > 1:
+        if world_size() > 1:
             torch.distributed.all_reduce(longest, op=torch.distributed.ReduceOp.MAX)
         return torch.cat([pad(part, (0, 0, 0, int(longest) - part.shape[1])) for part in parts])

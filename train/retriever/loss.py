@@ -22,7 +22,7 @@ from sentence_transformers.sentence_transformer.losses import CachedMultipleNega
 from sentence_transformers.util import all_gather_with_grad, cos_sim
 from torch.nn.functional import cross_entropy
 
-from conf.runs import rank, ranks
+from conf.runs import rank, world_size
 from models.nonfinite_guard import check_finite
 from train.retriever.batches import Batch
 from train.retriever.inputs import RetrieverInputs
@@ -55,7 +55,7 @@ class RankingLoss(CachedMultipleNegativesRankingLoss):
             scale=scale,
             mini_batch_size=mini_batch,
             mini_batch_num_tokens=mini_batch_tokens,
-            gather_across_devices=ranks() > 1,
+            gather_across_devices=world_size() > 1,
         )
         self._inputs = inputs
         self._weighing = weighing
@@ -90,7 +90,7 @@ class RankingLoss(CachedMultipleNegativesRankingLoss):
         if not self._weighing.changes:
             return None
         documents = batch.documents()
-        if ranks() > 1:
+        if world_size() > 1:
             documents = gather_object(documents)
         start = rank() * len(batch.queries)
         own = range(start, start + len(batch.queries))

@@ -19,7 +19,7 @@ from torch import nn
 from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
 
 from conf.errors import UserError
-from conf.runs import ranks_here
+from conf.runs import local_world_size
 from conf.schema import SftTrainConfig
 from models.memory import available_bytes
 from models.student.collator import MEDIA, Collator
@@ -85,7 +85,9 @@ class Features:
     def of(cls, model: nn.Module, train: SftTrainConfig) -> Features:
         """For a student, in this rank's part of half of the machine's free memory."""
         base = model.get_base_model() if isinstance(model, peft.PeftModel) else model
-        return cls(base, train.precision, available_bytes(torch.device("cpu")) // 2 // ranks_here())
+        return cls(
+            base, train.precision, available_bytes(torch.device("cpu")) // 2 // local_world_size()
+        )
 
     def give(self, inputs: dict[str, Any]) -> None:
         """Put a batch's outputs, as `mm_encoder_outputs`, in the place of its pixels."""

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 
 from conf.errors import UserError
-from conf.multirun.summary import AT_START
+from conf.multirun.summary import AT_START_SUFFIX
 from evaluation.metrics.intervals import Interval
 from evaluation.reporting import paper
 from evaluation.reporting.page.run_rows import SUITES, Measured
@@ -213,7 +213,7 @@ def training_table(runs: Sequence[Finished]) -> Table | None:
                 f"{run.folder / 'metrics.json'} is damaged: delete it, and run its training "
                 "command again, which ends where it was"
             ) from error
-        starts = {name: metrics.get(f"{name}{AT_START}") for name in metrics}
+        starts = {name: metrics.get(f"{name}{AT_START_SUFFIX}") for name in metrics}
         parts[f"{run.kind}/{run.name}"] = [
             [name.replace("_", " "), f"{start:.3f}", f"{metrics[name]:.3f}"]
             for name, start in starts.items()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from conf.errors import UserError
-from conf.runs import held
+from conf.runs import lock_folder
 from evaluation.embedders import cache
 from evaluation.embedders.cache import EmbeddingCache
 
@@ -156,7 +156,7 @@ def test_an_embedding_that_is_not_finite_is_named_and_not_kept(tmp_path) -> None
 
 def test_two_processes_do_not_fill_one_folder(tmp_path) -> None:
     kept = filled(tmp_path)
-    with held(kept.folder, "unheard"):
+    with lock_folder(kept.folder, "unheard"):
         kept.complete(THINGS, Model(), 64)
         with pytest.raises(UserError, match="is being filled by another process"):
             kept.complete({"new/1": 1}, Model(), 64)

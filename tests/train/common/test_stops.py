@@ -115,5 +115,5 @@ def test_a_run_keeps_to_one_gpu_unless_ranks_were_started(monkeypatch, visible, 
     monkeypatch.delenv("LOCAL_RANK", raising=False)
     if rank is not None:
         monkeypatch.setenv("LOCAL_RANK", rank)
-    processes.keep_to_one_gpu()
+    processes.restrict_to_one_gpu()
     assert os.environ["CUDA_VISIBLE_DEVICES"] == kept

@@ -23,7 +23,7 @@ from transformers import (
 
 from conf.entry import Run
 from conf.errors import SettingsError, UserError
-from conf.runs import held, open_run
+from conf.runs import lock_folder, open_run
 from conf.schema import (
     LoraConfig,
     RetrieverConfig,
@@ -215,10 +215,10 @@ def test_a_mode_that_was_not_trained_is_told(trained, micro, tmp_path) -> None:
 
 
 def test_a_folder_is_one_process_s_at_a_time(tmp_path) -> None:
-    with held(tmp_path, "first"), pytest.raises(UserError, match="second"), \
-            held(tmp_path, "second"):  # fmt: skip
+    with lock_folder(tmp_path, "first"), pytest.raises(UserError, match="second"), \
+            lock_folder(tmp_path, "second"):  # fmt: skip
         pass
-    with held(tmp_path, "third"):
+    with lock_folder(tmp_path, "third"):
         pass
 
 

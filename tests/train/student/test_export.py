@@ -20,7 +20,7 @@ from safetensors.torch import load_file, save_file
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.runs import is_name, open_run, run_below
+from conf.runs import is_run_name, open_run, resolve_run_name
 from conf.schema import (
     ExportModelCommand,
     SelectCommand,
@@ -339,10 +339,12 @@ def test_a_run_goes_by_its_name_or_its_folder(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     for given in ("exp-cot", "exp-cot/", "checkpoints/sft/exp-cot", "./checkpoints/sft/exp-cot/",
                   str(tmp_path / "checkpoints" / "sft" / "exp-cot")):  # fmt: skip
-        assert run_below(given, "checkpoints/sft") == "exp-cot"
-    assert run_below("checkpoints/sft/lrs/0", "checkpoints/sft") == run_below("lrs/0", "x")
-    assert is_name("exp-cot")
-    assert is_name("lrs/0")
+        assert resolve_run_name(given, "checkpoints/sft") == "exp-cot"
+    assert resolve_run_name("checkpoints/sft/lrs/0", "checkpoints/sft") == resolve_run_name(
+        "lrs/0", "x"
+    )
+    assert is_run_name("exp-cot")
+    assert is_run_name("lrs/0")
     for given in ("/elsewhere/sft/exp-cot", "../sft/exp-cot", "checkpoints/sft", "."):
-        assert not is_name(run_below(given, "checkpoints/sft"))
+        assert not is_run_name(resolve_run_name(given, "checkpoints/sft"))
         assert ExportModelCommand(run=given).check()
