@@ -14,7 +14,7 @@ from conf.errors import UserError
 from conf.schema import TeacherConfig
 from data.records import LETTERS
 from teacher.numbers import WORDS, lexicon
-from teacher.validation.validate import SECTIONS, word_count
+from teacher.validation.validator import SECTIONS, word_count
 
 GRAMMAR_VERSION = "1"
 

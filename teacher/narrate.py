@@ -22,21 +22,21 @@ from conf.errors import UserError
 from conf.runs import write_json, write_text
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
-from teacher.narrator import narrate
-from teacher.predicates import predicates_of
+from teacher.narrator import write_rationale
+from teacher.predicates import extract_predicates
 from teacher.progress import Progress, kinds
 from teacher.rationale_log import Journal, save_accepted
 from teacher.report.summary import Summary, accepted_of, summarise
-from teacher.servers.replies import Reply
-from teacher.validation.verdict import Judge, signature
+from teacher.servers.responses import Response
+from teacher.validation.grader import RationaleGrader, signature
 
 if TYPE_CHECKING:
     from data.store import Store
-    from teacher.servers.narration import Job, Keep
+    from teacher.server_narrator import Job, Keep
 
 log = logging.getLogger(__name__)
 
-JOURNAL = "rationales.jsonl"
+JOURNAL_FILE = "rationales.jsonl"
 BATCH = 200
 """Lines of the built-in narrator between two waits for the disk."""
 
@@ -94,7 +94,7 @@ def ensure_report(store: Store, narration: Narration, shown: int, folder: Path) 
     """The figures of a folder's report.json, with `shown` rationales on report.html. Both are
     written anew where they are older than the last answer."""
     figures, page = folder / "report.json", folder / "report.html"
-    answered = (store.folder / JOURNAL).stat().st_mtime
+    answered = (store.folder / JOURNAL_FILE).stat().st_mtime
     if not page.exists() or page.stat().st_mtime < answered:
         from teacher.report.page import write_page
 
@@ -123,8 +123,8 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
             for good.
     """
     items = store.selection("train")
-    judge = Judge(cfg)
-    with Journal(store.folder / JOURNAL) as journal:
+    judge = RationaleGrader(cfg)
+    with Journal(store.folder / JOURNAL_FILE) as journal:
         check_items(journal, items)
         answers = defaultdict(list)
         for rationale in journal.rationales:
@@ -144,9 +144,9 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
             if cfg.url is None:
                 too_short = _narrate_all(jobs, store, judge, keep, progress)
             elif jobs:
-                from teacher.servers.narration import Asking
+                from teacher.server_narrator import ServerNarrator
 
-                too_short = asyncio.run(Asking(store, cfg, judge, keep, progress).run(jobs))
+                too_short = asyncio.run(ServerNarrator(store, cfg, judge, keep, progress).run(jobs))
         if cfg.fallback:
             aside = [item for item in items if _set_aside(answers[item.item_id], cfg)]
             keep([r for item in aside for r in _stand_in(item, store, judge)])
@@ -175,15 +175,15 @@ def _set_aside(given: list[Rationale], cfg: TeacherConfig) -> bool:
     return len(given) >= cfg.attempts and not any(r.accepted for r in given)
 
 
-def _stand_in(item: SelectionItem, store: Store, judge: Judge) -> list[Rationale]:
+def _stand_in(item: SelectionItem, store: Store, judge: RationaleGrader) -> list[Rationale]:
     """The built-in narrator's rationale for an item that was set aside, marked as such; none where
     it does not stand before the validator either."""
-    predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
+    predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
     cfg = judge.cfg
     if predicates is None:
         return []
     for attempt in range(cfg.attempts):
-        reply = Reply(narrate(predicates, item, cfg.seed, attempt))
+        reply = Response(write_rationale(predicates, item, cfg.seed, attempt))
         rationale = judge.judge(reply, predicates, item, cfg.attempts + attempt)
         if rationale.accepted:
             return [replace(rationale, fallback=True)]
@@ -191,7 +191,7 @@ def _stand_in(item: SelectionItem, store: Store, judge: Judge) -> list[Rationale
 
 
 def _narrate_all(
-    jobs: list[Job], store: Store, judge: Judge, keep: Keep, progress: Progress
+    jobs: list[Job], store: Store, judge: RationaleGrader, keep: Keep, progress: Progress
 ) -> int:
     """Narrate in item order without a server; gives the count of too short prefixes."""
     too_short, batch = 0, []
@@ -208,15 +208,15 @@ def _narrate_all(
     return too_short
 
 
-def _narrate_one(job: Job, store: Store, judge: Judge) -> list[Rationale]:
+def _narrate_one(job: Job, store: Store, judge: RationaleGrader) -> list[Rationale]:
     """An item's answers up to the accepted one or the last attempt; none for a short prefix."""
     item, first = job
-    predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
+    predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
     given: list[Rationale] = []
     if predicates is None:
         return given
     for attempt in range(first, judge.cfg.attempts):
-        reply = Reply(narrate(predicates, item, judge.cfg.seed, attempt))
+        reply = Response(write_rationale(predicates, item, judge.cfg.seed, attempt))
         given.append(judge.judge(reply, predicates, item, attempt))
         if given[-1].accepted:
             break

@@ -11,14 +11,14 @@ import numpy as np
 
 from data.records import Scene, SelectionItem
 from teacher.predicates import (
-    OUT,
+    OUT_OF_VIEW,
     CandidateFacts,
     Difference,
     Facts,
     Meeting,
     ObjectFacts,
     Predicates,
-    facts_of,
+    extract_facts,
 )
 
 NARRATOR_VERSION = "5"
@@ -30,7 +30,9 @@ BRIEF, SPARSE, FULL = (3, 1, 1, 1), (4, 1, 2, 1), (6, 4, 6, 2)
 rationale, where four candidates take the room, and else."""
 
 
-def narrate(predicates: Predicates, item: SelectionItem, seed: int, attempt: int = 0) -> str:
+def write_rationale(
+    predicates: Predicates, item: SelectionItem, seed: int, attempt: int = 0
+) -> str:
     """A rationale of 80 to 250 words; the same arguments give the same text."""
     text = _Voice(SPARSE, seed, item.item_id, attempt).rationale(predicates)
     if len(text.split()) > ROOM:
@@ -40,24 +42,24 @@ def narrate(predicates: Predicates, item: SelectionItem, seed: int, attempt: int
     return text
 
 
-def describe(scene: Scene, start: int, stop: int, target: int, seed: int) -> str | None:
+def write_description(scene: Scene, start: int, stop: int, target: int, seed: int) -> str | None:
     """What happens between the prefix [start, stop] and the target frame, without candidates;
     None if the prefix is too short to tell."""
-    facts = facts_of(scene, start, stop, target)
+    facts = extract_facts(scene, start, stop, target)
     if facts is None:
         return None
     return _Voice(FULL, seed, scene.scene_id, start, stop, target).description(facts)
 
 
-def matches(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:
+def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:
     """Whether each candidate matches the predicted state and why, a line a candidate; the same
     arguments give the same lines."""
-    voice, key = _Voice(SPARSE, item.item_id, "matches"), telling(predicates)
+    voice, key = _Voice(SPARSE, item.item_id, "matches"), most_discriminative_object(predicates)
     expected = {o.object: o.target_region for o in predicates.objects}
     return tuple(voice.match(c, key, expected) for c in predicates.candidates)
 
 
-def telling(predicates: Predicates) -> ObjectFacts:
+def most_discriminative_object(predicates: Predicates) -> ObjectFacts:
     """The object by whose place most candidates are told from the target; of several the first
     that the prediction is about. All candidates are compared by it, so that each is described
     before it is judged."""
@@ -101,7 +103,7 @@ class _Voice:
         return options[self.rng.integers(len(options))]
 
     def rationale(self, predicates: Predicates) -> str:
-        key = telling(predicates)
+        key = most_discriminative_object(predicates)
         return "\n".join(
             [
                 *self.opening(predicates, key),
@@ -137,7 +139,7 @@ class _Voice:
         return told
 
     def seen(self, o: ObjectFacts) -> str:
-        if o.sight == OUT:
+        if o.sight == OUT_OF_VIEW:
             return f"the {o.object} is out of view"
         if o.sight == "hidden":
             return f"the {o.object} is hidden {o.region}"
@@ -213,7 +215,7 @@ class _Voice:
         return told
 
     def expected(self, o: ObjectFacts) -> str:
-        if o.target_sight == OUT:
+        if o.target_sight == OUT_OF_VIEW:
             return f"the {o.object} will be out of view"
         if o.target_sight == "hidden":
             return f"the {o.object} will be hidden {o.target_region}"

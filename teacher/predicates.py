@@ -63,7 +63,7 @@ REGIONS = (
     ("near the left", "near the center", "near the right"),
     ("near the bottom-left", "near the bottom", "near the bottom-right"),
 )
-OUT = "out of view"
+OUT_OF_VIEW = "out of view"
 
 
 @dataclass(frozen=True)
@@ -89,11 +89,11 @@ class ObjectFacts:
 
     @property
     def enters(self) -> bool:
-        return self.sight == OUT != self.target_sight
+        return self.sight == OUT_OF_VIEW != self.target_sight
 
     @property
     def leaves(self) -> bool:
-        return self.sight != OUT == self.target_sight
+        return self.sight != OUT_OF_VIEW == self.target_sight
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class Predicates(Facts):
         return next(c.letter for c in self.candidates if c.agrees)
 
 
-def cut_of(scene: Scene, start: int, stop: int) -> int | None:
+def find_cut(scene: Scene, start: int, stop: int) -> int | None:
     """The frame that facts are taken at for the prefix [start, stop]: its end, or CUT_MARGIN
     frames before the first collision from there on; None if that leaves too short a prefix."""
     upcoming = [c.frame for c in scene.collisions if c.frame >= stop]
@@ -182,11 +182,11 @@ def cut_of(scene: Scene, start: int, stop: int) -> int | None:
     return cut if cut - start + 1 >= COURSE_FRAMES else None
 
 
-def facts_of(
+def extract_facts(
     scene: Scene, start: int, stop: int, target: int, moment: str = "at the target moment"
 ) -> Facts | None:
     """Facts for a prefix and a target frame; None if the cut leaves too short a prefix."""
-    cut = cut_of(scene, start, stop)
+    cut = find_cut(scene, start, stop)
     if cut is None:
         return None
     names = [o.phrase for o in scene.objects]
@@ -210,7 +210,7 @@ def facts_of(
     )
 
 
-def predicates_of(
+def extract_predicates(
     item: SelectionItem, scene: Scene, scene_of: Callable[[str], Scene]
 ) -> Predicates | None:
     """Predicates of an item; None if its prefix is too short after the cut.
@@ -220,7 +220,7 @@ def predicates_of(
     moment = {"future": "at the collision", "contact": "just after the collision"}.get(
         item.framing or "", "at the target moment"
     )
-    facts = facts_of(scene, item.prefix_start, item.prefix_stop, item.target_frame, moment)
+    facts = extract_facts(scene, item.prefix_start, item.prefix_stop, item.target_frame, moment)
     if facts is None:
         return None
     candidates = tuple(
@@ -280,10 +280,10 @@ def compass(delta: np.ndarray) -> str | None:
     return COMPASS[eighth % 8]
 
 
-def region_of(scene: Scene, frame: int, index: int) -> str:
+def object_region(scene: Scene, frame: int, index: int) -> str:
     """The cell of the 3x3 grid that an object's centre lies in, in words, or "out of view"."""
     if not scene.in_view[frame, index]:
-        return OUT
+        return OUT_OF_VIEW
     return _cell(scene, scene.image_positions[frame, index])
 
 
@@ -295,31 +295,33 @@ def _cell(scene: Scene, point: np.ndarray) -> str:
 
 def _sight(scene: Scene, frame: int, index: int) -> str:
     if not scene.in_view[frame, index]:
-        return OUT
+        return OUT_OF_VIEW
     return "shown" if scene.visible_fraction[frame, index] > SHOWN else "hidden"
 
 
 def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFacts:
     pixels = scene.image_positions[:, index] * VIEW / np.asarray(scene.image_size)
     sight, target_sight = _sight(scene, cut, index), _sight(scene, target, index)
-    speed = _speed(scene, index, cut) if sight != OUT else None
+    speed = _speed(scene, index, cut) if sight != OUT_OF_VIEW else None
     moving = speed not in (None, "stationary")
     travelled = pixels[target] - pixels[cut]
-    extent = _extent(travelled) if {sight, target_sight} != {OUT} else "unseen"
+    extent = _extent(travelled) if {sight, target_sight} != {OUT_OF_VIEW} else "unseen"
     return ObjectFacts(
         object=scene.objects[index].phrase,
-        region=region_of(scene, cut, index),
+        region=object_region(scene, cut, index),
         sight=sight,
         speed=speed,
-        heading=heading_of(scene, index, free_since(scene, index, cut), cut) if moving else None,
-        target_region=region_of(scene, target, index),
+        heading=object_heading(scene, index, free_since(scene, index, cut), cut)
+        if moving
+        else None,
+        target_region=object_region(scene, target, index),
         target_sight=target_sight,
         extent=extent,
         travel=None if extent in ("stays", "unseen") else compass(travelled),
     )
 
 
-def heading_of(scene: Scene, index: int, since: int, frame: int) -> str | None:
+def object_heading(scene: Scene, index: int, since: int, frame: int) -> str | None:
     """The compass word of the way that an object has gone since an earlier frame; None where it
     does not move."""
     if _speed(scene, index, frame) == "stationary":
@@ -403,8 +405,8 @@ def _displacement(
     wanted = scene.image_positions[target, i] * VIEW / np.asarray(scene.image_size)
     actual = other.image_positions[frame, j] * VIEW / np.asarray(other.image_size)
     distance = float(np.hypot(*(actual - wanted)))
-    region = region_of(other, frame, j)
-    if region != region_of(scene, target, i):
+    region = object_region(other, frame, j)
+    if region != object_region(scene, target, i):
         return Difference(name, "region", region=region), distance
     extent = "clearly" if distance >= CLEARLY else "slightly"
     return Difference(name, "displaced", heading=compass(actual - wanted), extent=extent), distance

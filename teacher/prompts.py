@@ -8,7 +8,7 @@ import json
 from conf.schema import TeacherConfig
 from data.records import SelectionItem
 from teacher.predicates import Predicates
-from teacher.validation.validate import SECTIONS
+from teacher.validation.validator import SECTIONS
 
 PROMPT_VERSION = "3"
 

@@ -15,7 +15,7 @@ from conf.errors import UserError
 from conf.runs import wait_for_lock
 from data.records import Rationale
 from data.store import write_atomically
-from teacher.validation.validate import SECTIONS
+from teacher.validation.validator import SECTIONS
 
 if TYPE_CHECKING:
     import pyarrow as pa

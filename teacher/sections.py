@@ -9,14 +9,14 @@ SECTIONS = ("Scene parse", "Motion analysis", "Prediction", "Candidate analysis"
 HEADING = re.compile(rf"^({'|'.join(SECTIONS)}|Answer):[ \t]*", re.MULTILINE)
 
 
-def parts(text: str) -> list[tuple[str, int, int]]:
+def split_sections(text: str) -> list[tuple[str, int, int]]:
     """Each heading of a text with the bounds of what stands below it, in order."""
     headings = list(HEADING.finditer(text))
     starts = [*(m.start() for m in headings), len(text)]
     return [(m[1], m.end(), starts[k + 1]) for k, m in enumerate(headings)]
 
 
-def without(text: str, section: str) -> str:
+def remove_section(text: str, section: str) -> str:
     """A text without one of its sections, heading and all."""
     for heading in HEADING.finditer(text):
         if heading[1] == section:

@@ -23,15 +23,15 @@ from benchmarks.experiments.mutations import KINDS, falsehoods, predicates_from
 from benchmarks.experiments.paraphrases import paraphrase
 from benchmarks.experiments.prose import EDITS
 from data.store import open_store
-from teacher.narrator import narrate
-from teacher.predicates import Predicates, predicates_of
-from teacher.validation.claims import find_claims
+from teacher.narrator import write_rationale
+from teacher.predicates import Predicates, extract_predicates
+from teacher.validation.claim_extraction import extract_claims
 
 MISSES_SHOWN = 6
 
 
 def is_contradicted(text: str, predicates: Predicates) -> bool:
-    return any(c.verdict == "contradicted" for c in find_claims(text, predicates))
+    return any(c.verdict == "contradicted" for c in extract_claims(text, predicates))
 
 
 class Tally:
@@ -63,13 +63,13 @@ def measure_narrator(folder: Path, limit: int | None) -> None:
     passed, caught, claims = Tally(), Tally(), Counter()
     seconds, narrated = 0.0, 0
     for item in store.selection("train")[:limit]:
-        predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
+        predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
         if predicates is None:
             continue
         rng = Random(item.item_id)
-        text = narrate(predicates, item, 0)
+        text = write_rationale(predicates, item, 0)
         begun = time.process_time()
-        found = find_claims(text, predicates)
+        found = extract_claims(text, predicates)
         seconds += time.process_time() - begun
         narrated += 1
         claims.update((c.kind, c.verdict) for c in found)
@@ -78,7 +78,7 @@ def measure_narrator(folder: Path, limit: int | None) -> None:
         told = paraphrase(text, rng)
         false = [
             f"{c} <- {sentence(told, c.span)}"
-            for c in find_claims(told, predicates)
+            for c in extract_claims(told, predicates)
             if c.verdict == "contradicted"
         ]
         passed.add("paraphrased", not false, f"{item.item_id}: {false}")
@@ -116,7 +116,7 @@ def measure_prose(path: Path) -> None:
     for line in path.read_text().splitlines():
         record = json.loads(line)
         predicates, text = predicates_from(record["predicates"]), record["text"]
-        found = find_claims(text, predicates)
+        found = extract_claims(text, predicates)
         claims.update((c.kind, c.verdict) for c in found)
         false = [f"{c} <- {sentence(text, c.span)}" for c in found if c.verdict == "contradicted"]
         passed.add("untouched", not false, f"{record['item_id']}: {false}")

@@ -10,7 +10,7 @@ from random import Random
 from typing import Any
 
 from data.records import COLORS, SelectionItem
-from teacher.narrator import narrate
+from teacher.narrator import write_rationale
 from teacher.predicates import (
     COMPASS,
     REGIONS,
@@ -75,11 +75,11 @@ def falsehoods(
     predicates: Predicates, item: SelectionItem, kind: str, rng: Random, seed: int = 0
 ) -> Iterator[tuple[str, Mutation]]:
     """Rationales that the built-in narrator tells of flipped facts, each of which it does tell."""
-    text = narrate(predicates, item, seed)
+    text = write_rationale(predicates, item, seed)
     options = mutations(predicates, kind, rng)
     rng.shuffle(options)
     for mutation in options:
-        false = narrate(mutation.predicates, item, seed)
+        false = write_rationale(mutation.predicates, item, seed)
         if false != text and mutation.is_told(false):
             yield false, mutation
 

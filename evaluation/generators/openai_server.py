@@ -20,10 +20,16 @@ from evaluation.generators.response_log import SaveResponses, Subject, response_
 from evaluation.generators.response_schema import schema
 from models.student.generation import THOUGHT, GeneratedText, response_token_limit
 from models.student.prompts import Clip, Sample
-from teacher.servers.client import Client, UnansweredError
-from teacher.servers.concurrency import in_lanes
-from teacher.servers.replies import CUT_OFF, Reply
-from teacher.servers.server import NO_REPLY, Chat, Request, api_key, locked
+from teacher.servers.concurrency import run_limited
+from teacher.servers.pool import NoResponseError, ServerPool
+from teacher.servers.responses import TRUNCATED, Response
+from teacher.servers.server import (
+    MALFORMED_RESPONSE_ERRORS,
+    Messages,
+    RequestFields,
+    authentication_error,
+    get_api_key,
+)
 
 ANY_SIZE = 1
 """Pixels that an image has at least; none is enlarged."""
@@ -53,7 +59,7 @@ async def say(
     with ThreadPoolExecutor(1) as desk:
         first = await loop.run_in_executor(desk, sample_of, things[0])
         request = request_of(cfg, mode, first.clip)
-        async with Client(server, request, chat_of(blank(first))) as client:
+        async with ServerPool(server, request, chat_of(blank(first))) as client:
 
             async def ask(thing: Subject) -> None:
                 chat, clip = await loop.run_in_executor(desk, _shown, sample_of, thing)
@@ -61,23 +67,23 @@ async def say(
                 if cfg.temperature:
                     own["seed"] = response_seed(seed, thing, mode)
                 try:
-                    [reply] = await client.ask(chat, **own)
-                except UnansweredError as fault:
+                    [reply] = await client.complete(chat, **own)
+                except NoResponseError as fault:
                     raise UserError(
                         f"{server.model} has no answer about {thing.name} ({fault}); once that is "
                         "mended, run the same command again, it goes on with what is answered"
                     ) from fault
                 keep([(thing, written(reply, opened))])
 
-            await in_lanes(things, server.concurrency, ask)
+            await run_limited(things, server.concurrency, ask)
 
 
-def _shown(sample_of: Callable[[Subject], Sample], thing: Subject) -> tuple[Chat, Clip | None]:
+def _shown(sample_of: Callable[[Subject], Sample], thing: Subject) -> tuple[Messages, Clip | None]:
     sample = sample_of(thing)
     return chat_of(sample), sample.clip
 
 
-def chat_of(sample: Sample) -> Chat:
+def chat_of(sample: Sample) -> Messages:
     """A conversation in the API's form, its frames as PNGs within it. A clip is vLLM's sequence of
     images, whose times go with the request."""
     pictures = iter(sample.images)
@@ -108,7 +114,7 @@ def blank(sample: Sample) -> Sample:
     return replace(sample, clip=clip, images=[empty] * len(sample.images))
 
 
-def request_of(cfg: StudentConfig, mode: str, clip: Clip | None) -> Request:
+def request_of(cfg: StudentConfig, mode: str, clip: Clip | None) -> RequestFields:
     """What goes with a chat: how tokens are drawn, what may be written, and that frames are neither
     sampled again nor shrunk, as where a model is loaded here."""
     area = cfg.image_size**2
@@ -139,15 +145,15 @@ def request_of(cfg: StudentConfig, mode: str, clip: Clip | None) -> Request:
     return request
 
 
-def written(reply: Reply, opened: bool) -> GeneratedText:
+def written(reply: Response, opened: bool) -> GeneratedText:
     """What a server's model wrote, its thought within the text. A thought that the prompt has
     `opened`, or that the server has taken out, is opened again."""
     text = reply.text
-    if reply.thought:
-        text = f"{THOUGHT}{reply.thought}" + (f"</think>{text}" if text else "")
+    if reply.reasoning:
+        text = f"{THOUGHT}{reply.reasoning}" + (f"</think>{text}" if text else "")
     elif opened and THOUGHT not in text:
         text = f"{THOUGHT}{text}"
-    return GeneratedText(text, reply.flaw == CUT_OFF)
+    return GeneratedText(text, reply.flaw == TRUNCATED)
 
 
 def revision(server: ServerConfig) -> dict[str, Any]:
@@ -162,12 +168,12 @@ def revision(server: ServerConfig) -> dict[str, Any]:
     for url in server.urls:
         try:
             with openai.OpenAI(
-                base_url=url, api_key=api_key(), max_retries=0, timeout=10
+                base_url=url, api_key=get_api_key(), max_retries=0, timeout=10
             ) as client:
                 models = {m.id: m.model_extra or {} for m in client.models.list()}
         except openai.AuthenticationError as error:
-            raise locked(url, error) from error
-        except (openai.OpenAIError, *NO_REPLY) as error:
+            raise authentication_error(url, error) from error
+        except (openai.OpenAIError, *MALFORMED_RESPONSE_ERRORS) as error:
             problems.append(f"{url}: {error.__cause__ or error}")
             continue
         if server.model not in models:

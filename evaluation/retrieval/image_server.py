@@ -22,10 +22,10 @@ from conf.errors import UserError
 from conf.runs import write_json
 from conf.schema import ImageServerConfig
 from data.store import Store, write_atomically
-from teacher.servers.client import Client, UnansweredError
-from teacher.servers.concurrency import in_lanes
-from teacher.servers.replies import Reply
-from teacher.servers.server import Chat, Request, Server
+from teacher.servers.concurrency import run_limited
+from teacher.servers.pool import NoResponseError, ServerPool
+from teacher.servers.responses import Response
+from teacher.servers.server import Messages, RequestFields, Server
 
 DRAWN = "drawn"
 """Folder of them in a store."""
@@ -68,12 +68,12 @@ def is_image(source: Path | io.BytesIO) -> bool:
 
 async def _draw(cfg: ImageServerConfig, waiting: list[str], images: dict[str, Path]) -> None:
     with tqdm(total=len(images), initial=len(images) - len(waiting), desc="drawing") as bar:
-        async with Client(cfg, {}, _chat(CANARY), ImageServer) as client:
+        async with ServerPool(cfg, {}, _chat(CANARY), ImageServer) as client:
 
             async def one(text: str) -> None:
                 try:
-                    [reply] = await client.ask(_chat(text))
-                except UnansweredError as fault:
+                    [reply] = await client.complete(_chat(text))
+                except NoResponseError as fault:
                     raise UserError(
                         f"{cfg.model} has no image of {text[:SHOWN]!r} ({fault}); once that is "
                         "mended, run the same command again, it goes on with what is drawn"
@@ -81,10 +81,10 @@ async def _draw(cfg: ImageServerConfig, waiting: list[str], images: dict[str, Pa
                 write_atomically(images[text], base64.b64decode(reply.text))
                 bar.update()
 
-            await in_lanes(waiting, cfg.concurrency, one)
+            await run_limited(waiting, cfg.concurrency, one)
 
 
-def _chat(text: str) -> Chat:
+def _chat(text: str) -> Messages:
     return [{"role": "user", "content": text}]
 
 
@@ -93,7 +93,7 @@ class ImageServer(Server):
 
     cfg: ImageServerConfig
 
-    async def _replies(self, chat: Chat, n: int, request: Request) -> list[Reply]:
+    async def _responses(self, chat: Messages, n: int, request: RequestFields) -> list[Response]:
         drawn = await self.client.images.generate(
             model=self.cfg.model,
             prompt=chat[0]["content"],
@@ -103,7 +103,7 @@ class ImageServer(Server):
             # The API itself knows of no seed; servers of open models do.
             extra_body={"seed": self.cfg.seed},
         )
-        replies = [Reply(image.b64_json) for image in drawn.data[:n]]
+        replies = [Response(image.b64_json) for image in drawn.data[:n]]
         for reply in replies:
             if not is_image(io.BytesIO(base64.b64decode(reply.text, validate=True))):
                 raise ValueError("what it gives is no image that can be decoded")

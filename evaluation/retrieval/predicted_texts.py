@@ -26,7 +26,7 @@ from evaluation.generators.response_log import (
 )
 from evaluation.retrieval.image_server import short_hash
 from models.student.answer_parser import strip_thought
-from teacher.sections import SECTIONS, parts
+from teacher.sections import SECTIONS, split_sections
 
 TEXTS = "texts"
 """Folder of them in a store."""
@@ -120,7 +120,9 @@ def _said(text: str) -> str:
 
 def _sections(said: str) -> list[str]:
     plain = MARKED.sub(lambda found: f"{found[1].capitalize()}: ", said)
-    told = [plain[start:stop].strip() for name, start, stop in parts(plain) if name in FORESEEN]
+    told = [
+        plain[start:stop].strip() for name, start, stop in split_sections(plain) if name in FORESEEN
+    ]
     return [section for section in told if section]
 
 

@@ -21,7 +21,7 @@ from conf.schema import StudentConfig
 from data.records import FPS, FRAMES, LETTERS, FrameRef, RetrievalQuery, SelectionItem, shown_frames
 from data.render.frame_cache import Frames
 from data.tracks.controls import observed
-from teacher.sections import without
+from teacher.sections import remove_section
 
 MODES = ("reasoning", "answer")
 TEXT_INSTRUCTIONS = {
@@ -117,9 +117,9 @@ def response(rationale: str, matches: Sequence[str], letter: str, mode: str, reg
     candidate in order."""
     if mode == "answer":
         return answer_line(letter)
-    text = without(rationale, "Answer")
+    text = remove_section(rationale, "Answer")
     if not has_analysis(regime):
-        text = without(text, "Candidate analysis")
+        text = remove_section(text, "Candidate analysis")
     lines = matches if has_matches(regime) else ()
     return "\n".join([text.rstrip(), *lines, answer_line(letter)])
 

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from teacher.numbers.finding import WORDS, find_numbers
+from teacher.numbers.detection import WORDS, find_numbers
 
 __all__ = ["WORDS", "find_numbers"]

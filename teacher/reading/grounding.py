@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from teacher.predicates import COMPASS, OUT, Difference, ObjectFacts, Predicates
+from teacher.predicates import COMPASS, OUT_OF_VIEW, Difference, ObjectFacts, Predicates
 from teacher.reading.phrases import COARSE
 
 CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
@@ -255,7 +255,7 @@ def _time(ground: Ground, claim: Claim) -> bool | None:
 def _close(ground: Ground, claim: Claim) -> bool | None:
     if len(claim.subjects) != 2 or not _known(ground, claim) or claim.when != TARGET:
         return None
-    if any(ground.objects[name].target_sight == OUT for name in claim.subjects):
+    if any(ground.objects[name].target_sight == OUT_OF_VIEW for name in claim.subjects):
         return None if claim.value == COARSE else False
     return frozenset(claim.subjects) in ground.close
 

@@ -14,7 +14,7 @@ from data.gallery import Looker
 from data.publish.contact_sheets import sheet
 from data.records import Rationale
 from data.store import Store, write_atomically
-from teacher.predicates import predicates_of
+from teacher.predicates import extract_predicates
 
 PAGE = """<!doctype html>
 <html lang="en">
@@ -52,7 +52,7 @@ def write_page(
         rationale = accepted[k]
         item = items[rationale.item_id]
         write_atomically(folder / "shown" / f"{item.item_id}.png", sheet([look.item(item)]))
-        predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
+        predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
         facts = json.dumps(predicates.to_dict() if predicates else None, indent=1)
         body.append(_article(rationale, facts))
     page = folder / "report.html"

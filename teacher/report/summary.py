@@ -16,7 +16,7 @@ import numpy as np
 
 from data.records import Rationale, SelectionItem
 from teacher.progress import kinds
-from teacher.validation.validate import WORD
+from teacher.validation.validator import WORD
 
 EXAMPLES = 3
 """Answers that are quoted for each reason to reject."""

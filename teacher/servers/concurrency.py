@@ -9,7 +9,9 @@ from typing import TypeVar
 Job = TypeVar("Job")
 
 
-async def in_lanes(jobs: Sequence[Job], lanes: int, do: Callable[[Job], Awaitable[None]]) -> None:
+async def run_limited(
+    jobs: Sequence[Job], lanes: int, do: Callable[[Job], Awaitable[None]]
+) -> None:
     """Await `do` of each job, in order of their start; where one fails, none is begun after it and
     those under way are given up."""
     waiting = iter(jobs)

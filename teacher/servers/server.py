@@ -13,13 +13,13 @@ import openai
 from conf.errors import UserError
 from conf.schema import ServersConfig
 from teacher.servers.health import health_problem
-from teacher.servers.replies import Reply, replies
+from teacher.servers.responses import Response, replies
 
-Chat = list[dict[str, Any]]
-Request = dict[str, Any]
+Messages = list[dict[str, Any]]
+RequestFields = dict[str, Any]
 """Fields of a chat completion's request, those outside the API's own in `extra_body`."""
 
-NO_REPLY = (AttributeError, IndexError, TypeError, ValueError)
+MALFORMED_RESPONSE_ERRORS = (AttributeError, IndexError, TypeError, ValueError)
 """What the client raises at a reply that is not of the API's form."""
 
 
@@ -30,12 +30,12 @@ KEY = "OPENAI_API_KEY"
 down."""
 
 
-def api_key() -> str:
+def get_api_key() -> str:
     """The key; a server that wants none is content with any word, and the client wants one."""
     return os.environ.get(KEY) or "none"
 
 
-def locked(url: str, error: openai.APIStatusError) -> UserError:
+def authentication_error(url: str, error: openai.APIStatusError) -> UserError:
     """What to tell a user whom a server does not let in."""
     return UserError(
         f"{url} does not accept the key that it was given ({error.message}): put that server's key "
@@ -70,10 +70,10 @@ class Server:
         self.url = url
         self.cfg = cfg
         self.client = openai.AsyncOpenAI(
-            base_url=url, api_key=api_key(), max_retries=0, timeout=cfg.timeout
+            base_url=url, api_key=get_api_key(), max_retries=0, timeout=cfg.timeout
         )
 
-    async def ask(self, chat: Chat, n: int, request: Request) -> list[Reply]:
+    async def complete(self, chat: Messages, n: int, request: RequestFields) -> list[Response]:
         """`n` answers to a chat.
 
         Raises:
@@ -84,11 +84,11 @@ class Server:
         try:
             # The client's own timeout starts again with every byte that comes.
             async with asyncio.timeout(cfg.timeout):
-                return await self._replies(chat, n, request)
+                return await self._responses(chat, n, request)
         except openai.NotFoundError as error:
             raise await self._unknown_model() from error
         except openai.AuthenticationError as error:
-            raise locked(self.url, error) from error
+            raise authentication_error(self.url, error) from error
         except openai.RateLimitError as error:
             raise RateLimitedError("HTTP 429", _retry_after(error)) from error
         except openai.InternalServerError as error:
@@ -103,10 +103,10 @@ class Server:
             ) from error
         except openai.APIConnectionError as error:
             raise RequestError(str(error.__cause__ or error)) from error
-        except (openai.APIResponseValidationError, *NO_REPLY) as error:
+        except (openai.APIResponseValidationError, *MALFORMED_RESPONSE_ERRORS) as error:
             raise MalformedReplyError(f"{type(error).__name__}: {error}") from error
 
-    async def _replies(self, chat: Chat, n: int, request: Request) -> list[Reply]:
+    async def _responses(self, chat: Messages, n: int, request: RequestFields) -> list[Response]:
         """Errors are the client's own, and those of `NO_REPLY`."""
         completion = await self.client.chat.completions.create(
             model=self.cfg.model, messages=chat, n=n, **request
@@ -123,7 +123,7 @@ class Server:
     async def _unknown_model(self) -> UserError:
         try:
             served = ", ".join([m.id async for m in self.client.models.list()])
-        except (openai.OpenAIError, *NO_REPLY):
+        except (openai.OpenAIError, *MALFORMED_RESPONSE_ERRORS):
             served = "an unknown set"
         return UserError(
             f"{self.url} does not serve {self.cfg.GROUP}.model={self.cfg.model}; it has {served}. "

@@ -9,8 +9,8 @@ from tests.evaluation.talking import TalkingServer
 
 @pytest.fixture
 def talking(monkeypatch):
-    monkeypatch.setattr("teacher.servers.client.PAUSE", 0.01)
-    monkeypatch.setattr("teacher.servers.client.LONGEST_PAUSE", 0.05)
+    monkeypatch.setattr("teacher.servers.pool.PAUSE", 0.01)
+    monkeypatch.setattr("teacher.servers.pool.LONGEST_PAUSE", 0.05)
     servers = []
 
     def start(says, port=0):

@@ -39,7 +39,7 @@ from models.parameter_counts import Tower, check_towers, count_towers
 from models.student.collator import Collator, encode
 from models.student.prompts import Clip, Sample, conversation, response, selection_sample
 from teacher.narrate import ensure_rationales
-from teacher.validation.claims import LONGEST
+from teacher.validation.claim_extraction import MAX_SENTENCE_TAGS
 from train.common.audit import audit
 from train.student.dataset import supervised_items
 
@@ -335,9 +335,9 @@ def test_the_longest_rationale_fits_and_the_whole_audit_needs_no_weights(
     ]
     longest = max(asked, key=lambda s: len(s.text()))
     words = longest.rationale.split()
-    more = " ".join((words * LONGEST)[: LONGEST - len(words)])
+    more = " ".join((words * MAX_SENTENCE_TAGS)[: MAX_SENTENCE_TAGS - len(words)])
     text = f"{more}\n{longest.rationale}"
-    assert len(text.split()) == LONGEST
+    assert len(text.split()) == MAX_SENTENCE_TAGS
     told = response(text, longest.matches, longest.item.letter, "reasoning", train.regime)
     frames = Frames(micro_store, cfg.image_size)
     sample = selection_sample(longest.item, "reasoning", train.regime, frames, cfg, told)

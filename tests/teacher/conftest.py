@@ -19,8 +19,8 @@ def store(tmp_path: Path) -> MadeStore:
 @pytest.fixture
 def odd(store: MadeStore, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., OddServer]]:
     """Starts servers with the faults that they begin with; pauses are short."""
-    monkeypatch.setattr("teacher.servers.client.PAUSE", 0.01)
-    monkeypatch.setattr("teacher.servers.client.LONGEST_PAUSE", 0.05)
+    monkeypatch.setattr("teacher.servers.pool.PAUSE", 0.01)
+    monkeypatch.setattr("teacher.servers.pool.LONGEST_PAUSE", 0.05)
     servers = []
 
     def start(*faults: object) -> OddServer:

@@ -9,8 +9,8 @@ import numpy as np
 
 from conf.schema import TeacherConfig
 from data.records import Scene, SelectionItem
-from teacher.narrator import narrate
-from teacher.predicates import predicates_of
+from teacher.narrator import write_rationale
+from teacher.predicates import extract_predicates
 from teacher.prompts import messages
 from tests.teacher import synthetic
 
@@ -58,8 +58,8 @@ def corpus(store: MadeStore) -> list[str]:
     cfg = TeacherConfig(name="template")
     texts = []
     for item in store.items:
-        predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
+        predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
         if predicates:
             chat = messages(predicates, item, cfg)
-            texts += [*(part["content"] for part in chat), narrate(predicates, item, 0)]
+            texts += [*(part["content"] for part in chat), write_rationale(predicates, item, 0)]
     return texts

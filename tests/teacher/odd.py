@@ -10,8 +10,8 @@ from socket import SO_LINGER, SOL_SOCKET
 from typing import Any
 
 from conf.schema import TeacherConfig
-from teacher.narrator import narrate
-from teacher.predicates import predicates_of
+from teacher.narrator import write_rationale
+from teacher.predicates import extract_predicates
 from teacher.prompts import messages
 from tests.local import JsonHandler, LocalServer
 from tests.teacher.made import MadeStore
@@ -46,10 +46,10 @@ class OddServer(LocalServer):
         self.delay = 0.0
         self.texts = {}
         for item in store.selection("train"):
-            predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
+            predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
             if predicates:
                 chat = messages(predicates, item, TeacherConfig(name="odd"))
-                self.texts[chat[1]["content"]] = narrate(predicates, item, 0)
+                self.texts[chat[1]["content"]] = write_rationale(predicates, item, 0)
         super().__init__(Handler, port)
 
 

@@ -14,21 +14,21 @@ from benchmarks.experiments.mutations import KINDS, falsehoods, predicates_from
 from benchmarks.experiments.paraphrases import paraphrase
 from benchmarks.experiments.prose import EDITS
 from conf.schema import TeacherConfig
-from teacher.narrator import narrate
+from teacher.narrator import write_rationale
 from teacher.predicates import (
-    OUT,
+    OUT_OF_VIEW,
     CandidateFacts,
     Closeness,
     Difference,
     Meeting,
     ObjectFacts,
     Predicates,
-    predicates_of,
+    extract_predicates,
 )
 from teacher.reading.phrases import PHRASES
 from teacher.sections import SECTIONS
-from teacher.validation.claims import find_claims
-from teacher.validation.validate import validate
+from teacher.validation.claim_extraction import extract_claims
+from teacher.validation.validator import validate_rationale
 
 HERE = Path(__file__).parent
 SECTION = {"S": SECTIONS[0], "M": SECTIONS[1], "P": SECTIONS[2], "C": SECTIONS[3], "O": SECTIONS[4]}
@@ -53,8 +53,12 @@ FACTS = Predicates(
             GREEN, TOP_RIGHT, SHOWN, "slowly", "southwest", TOP_RIGHT, SHOWN, SHIFTS, "southwest"
         ),
         ObjectFacts(GRAY, BOTTOM, SHOWN, "stationary", None, BOTTOM, SHOWN, "stays", None),
-        ObjectFacts(PURPLE, OUT, OUT, None, None, BOTTOM_LEFT, SHOWN, ACROSS, "north"),
-        ObjectFacts(CYAN, TOP_LEFT, SHOWN, "steadily", "west", OUT, OUT, ACROSS, "west"),
+        ObjectFacts(
+            PURPLE, OUT_OF_VIEW, OUT_OF_VIEW, None, None, BOTTOM_LEFT, SHOWN, ACROSS, "north"
+        ),
+        ObjectFacts(
+            CYAN, TOP_LEFT, SHOWN, "steadily", "west", OUT_OF_VIEW, OUT_OF_VIEW, ACROSS, "west"
+        ),
     ),
     entering=(PURPLE,),
     leaving=(CYAN,),
@@ -94,11 +98,11 @@ PROSE = [json.loads(line) for line in (HERE / "prose.jsonl").read_text().splitli
 
 
 def contradicted(text, predicates):
-    return [str(c) for c in find_claims(text, predicates) if c.verdict == "contradicted"]
+    return [str(c) for c in extract_claims(text, predicates) if c.verdict == "contradicted"]
 
 
 def verdicts(section, sentence):
-    claims = find_claims(f"{SECTION[section]}: {sentence}", FACTS)
+    claims = extract_claims(f"{SECTION[section]}: {sentence}", FACTS)
     return {str(c): c.verdict for c in claims if c.kind != "mention"}
 
 
@@ -208,7 +212,7 @@ def test_most_of_what_true_sentences_say_is_supported():
 
 def test_a_claim_stands_where_its_span_says():
     text = f"Scene parse: The {RED} is near the left.\nOutcome: B is right.\nAnswer: B"
-    spans = {(c.kind, text[slice(*c.span)]) for c in find_claims(text, FACTS)}
+    spans = {(c.kind, text[slice(*c.span)]) for c in extract_claims(text, FACTS)}
     assert ("region", "near the left") in spans
     assert ("mention", f"The {RED}") in spans
     assert ("agrees", "B") in spans
@@ -220,9 +224,9 @@ def narrated(benchmark_store):
     found = []
     for item in benchmark_store.selection("train"):
         scene = benchmark_store.scene(item.scene_id)
-        predicates = predicates_of(item, scene, benchmark_store.scene)
+        predicates = extract_predicates(item, scene, benchmark_store.scene)
         if predicates is not None:
-            found.append((item, predicates, narrate(predicates, item, seed=1)))
+            found.append((item, predicates, write_rationale(predicates, item, seed=1)))
     assert len(found) > 30
     return found
 
@@ -269,20 +273,20 @@ def test_no_text_makes_it_raise_and_the_same_text_gives_the_same():
         body = " ".join(rng.choice(words) for _ in range(length))
         for section in SECTIONS:
             text = f"{section}: {body}"
-            assert find_claims(text, FACTS) == find_claims(text, FACTS)
+            assert extract_claims(text, FACTS) == extract_claims(text, FACTS)
     for section in SECTIONS:
-        find_claims(f"{section}: " + f"the {RED} and A, " * 5000, FACTS)
+        extract_claims(f"{section}: " + f"the {RED} and A, " * 5000, FACTS)
 
 
 @pytest.mark.slow
 def test_the_validator_rejects_what_is_contradicted_and_keeps_the_claims(narrated):
     cfg = TeacherConfig(name="template")
     item, predicates, text = narrated[0]
-    verdict = validate(text, predicates, item, cfg)
+    verdict = validate_rationale(text, predicates, item, cfg)
     assert verdict.accepted
     assert {c.verdict for c in verdict.claims} <= {"supported", "unknown"}
     assert sum(c.verdict == "supported" for c in verdict.claims) > 20
     told, _ = next(falsehoods(predicates, item, "color", Random(0), seed=1))
-    false = validate(told, predicates, item, cfg)
+    false = validate_rationale(told, predicates, item, cfg)
     assert not false.accepted
     assert {reason.split(":")[0] for reason in false.reasons} == {"contradicts"}

@@ -13,10 +13,10 @@ import pytest
 from conf.errors import UserError
 from conf.schema import TeacherConfig
 from teacher.grammar import OPENERS, grammar
-from teacher.narrator import narrate
+from teacher.narrator import write_rationale
 from teacher.numbers import lexicon
-from teacher.predicates import predicates_of
-from teacher.validation.validate import validate, word_count
+from teacher.predicates import extract_predicates
+from teacher.validation.validator import validate_rationale, word_count
 from tests.teacher import synthetic
 
 ENGINE = Path(__file__).parents[2] / ".venv-vllm/bin/python"
@@ -91,11 +91,11 @@ def rationales() -> list[str]:
     while len(texts) < 60:
         scene = synthetic.random_scene(rng)
         item = synthetic.item((60, 80, 100, 120), answer=len(texts) % 4)
-        predicates = predicates_of(item, scene, lambda _, scene=scene: scene)
+        predicates = extract_predicates(item, scene, lambda _, scene=scene: scene)
         if predicates is None:
             continue
-        text = narrate(predicates, item, seed=0)
-        if validate(text, predicates, item, DEFAULT).accepted:
+        text = write_rationale(predicates, item, seed=0)
+        if validate_rationale(text, predicates, item, DEFAULT).accepted:
             texts.append(text)
     return texts
 
@@ -188,11 +188,11 @@ def test_what_is_made_of_random_pieces_has_the_form_and_no_number(ask: Ask):
     rng = np.random.default_rng(0)
     while True:
         scene, item = synthetic.random_scene(rng), synthetic.item((60, 80, 100, 120))
-        predicates = predicates_of(item, scene, lambda _, scene=scene: scene)
+        predicates = extract_predicates(item, scene, lambda _, scene=scene: scene)
         if predicates is not None:
             break
     made = ask(DEFAULT, [], samples=40)[1]
-    verdicts = [validate(text, predicates, item, DEFAULT) for text in made]
+    verdicts = [validate_rationale(text, predicates, item, DEFAULT) for text in made]
     # What is said at random is seldom true.
     reasons = [
         r for v in verdicts for r in v.reasons if not r.startswith(("wrong answer", "contradicts"))

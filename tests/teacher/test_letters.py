@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from conf.schema import TeacherConfig
-from teacher.letters import letters, relabel, reorder
-from teacher.narrator import narrate
-from teacher.predicates import predicates_of
-from teacher.validation.validate import validate
+from teacher.candidate_letters import letters, relabel_text, reorder_candidates
+from teacher.narrator import write_rationale
+from teacher.predicates import extract_predicates
+from teacher.validation.validator import validate_rationale
 
 ORDERS = list(permutations(range(4)))
 
@@ -36,18 +36,18 @@ def test_letters_are_told_from_the_article(text, named):
 
 def test_the_same_order_changes_nothing_and_orders_compose():
     text = "Candidate A lacks the cube. B and C differ. A contact follows. Answer: D"
-    assert relabel(text, range(4)) == text
+    assert relabel_text(text, range(4)) == text
     for first in ORDERS:
         back = [first.index(k) for k in range(4)]
-        assert relabel(relabel(text, first), back) == text
+        assert relabel_text(relabel_text(text, first), back) == text
         for second in ORDERS[::5]:
             both = [first[k] for k in second]
-            assert relabel(relabel(text, first), second) == relabel(text, both)
+            assert relabel_text(relabel_text(text, first), second) == relabel_text(text, both)
 
 
 def test_no_order_is_refused():
     with pytest.raises(ValueError, match=r"\[0, 1, 1, 3\] is no order"):
-        relabel("Answer: A", [0, 1, 1, 3])
+        relabel_text("Answer: A", [0, 1, 1, 3])
 
 
 def test_a_relabelled_rationale_is_as_right_for_the_reordered_item(micro_store):
@@ -55,16 +55,16 @@ def test_a_relabelled_rationale_is_as_right_for_the_reordered_item(micro_store):
     cfg, rng, told = TeacherConfig(name="template"), np.random.default_rng(0), 0
     for item in micro_store.selection():
         scene = micro_store.scene(item.scene_id)
-        predicates = predicates_of(item, scene, micro_store.scene)
+        predicates = extract_predicates(item, scene, micro_store.scene)
         if predicates is None:
             continue
-        text = narrate(predicates, item, seed=0)
-        assert validate(text, predicates, item, cfg).accepted
+        text = write_rationale(predicates, item, seed=0)
+        assert validate_rationale(text, predicates, item, cfg).accepted
         order = rng.permutation(4).tolist()
-        other = reorder(item, order)
+        other = reorder_candidates(item, order)
         assert [other.candidates[k] for k in range(4)] == [item.candidates[k] for k in order]
-        facts = predicates_of(other, scene, micro_store.scene)
-        verdict = validate(relabel(text, order), facts, other, cfg)
+        facts = extract_predicates(other, scene, micro_store.scene)
+        verdict = validate_rationale(relabel_text(text, order), facts, other, cfg)
         assert verdict.accepted, verdict.reasons
         assert verdict.answer == other.letter
         told += other.letter != item.letter

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from conf.schema import TeacherConfig
-from teacher.narrator import describe, narrate
+from teacher.narrator import write_description, write_rationale
 from teacher.numbers import find_numbers
-from teacher.predicates import predicates_of
-from teacher.validation.validate import WORD, validate, word_count
+from teacher.predicates import extract_predicates
+from teacher.validation.validator import WORD, validate_rationale, word_count
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import cases
 
@@ -21,8 +21,8 @@ CFG = TeacherConfig(name="template")
 def test_every_narration_is_accepted():
     words, vocabulary, lengths = 0, set(), []
     for item, predicates in cases(250):
-        text = narrate(predicates, item, seed=3)
-        assert validate(text, predicates, item, CFG).reasons == ()
+        text = write_rationale(predicates, item, seed=3)
+        assert validate_rationale(text, predicates, item, CFG).reasons == ()
         lengths.append(word_count(text))
         vocabulary |= {w.lower() for w in WORD.findall(text)}
         words += 1
@@ -37,20 +37,20 @@ def test_sparse_scenes_are_long_enough_and_crowded_ones_short_enough():
     crowded = synthetic.scene(grid, [(0.3 * -x, -y) for x, y in grid])
     for scene in (still, crowded):
         item = synthetic.item((100, 70, 80, 90), stop=20)
-        predicates = predicates_of(item, scene, None)
+        predicates = extract_predicates(item, scene, None)
         if predicates is None:
             continue
         for seed in range(30):
-            text = narrate(predicates, item, seed)
-            assert validate(text, predicates, item, CFG).reasons == ()
+            text = write_rationale(predicates, item, seed)
+            assert validate_rationale(text, predicates, item, CFG).reasons == ()
 
 
 def test_seeds_vary_and_repeat():
     item, predicates = next(cases(9))
-    texts = {narrate(predicates, item, seed) for seed in range(8)}
+    texts = {write_rationale(predicates, item, seed) for seed in range(8)}
     assert len(texts) > 4
-    assert narrate(predicates, item, 0) == narrate(predicates, item, 0)
-    assert len({narrate(predicates, item, 0, attempt) for attempt in range(4)}) > 1
+    assert write_rationale(predicates, item, 0) == write_rationale(predicates, item, 0)
+    assert len({write_rationale(predicates, item, 0, attempt) for attempt in range(4)}) > 1
 
 
 def test_another_process_narrates_alike():
@@ -60,17 +60,17 @@ def test_another_process_narrates_alike():
     )
     item, predicates = next(cases(9))
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == narrate(predicates, item, 5)
+    assert told.stdout.strip() == write_rationale(predicates, item, 5)
 
 
 def test_descriptions_have_no_candidates_and_no_numbers():
     scene = synthetic.random_scene(np.random.default_rng(2))
-    text = describe(scene, 0, 20, 70, 0)
+    text = write_description(scene, 0, 20, 70, 0)
     headings = [line.split(":")[0] for line in text.splitlines()]
     assert headings == ["Scene parse", "Motion analysis", "Prediction", "Outcome"]
     assert not find_numbers(text)
     assert "andidate" not in text
-    assert text == describe(scene, 0, 20, 70, 0)
+    assert text == write_description(scene, 0, 20, 70, 0)
 
 
 def other_letter(text, item):
@@ -121,7 +121,7 @@ def swap(text, item):
 )
 def test_a_broken_rationale_is_rejected(mutate, reason):
     for item, predicates in cases(6):
-        text = narrate(predicates, item, 0)
-        verdict = validate(mutate(text, item), predicates, item, CFG)
+        text = write_rationale(predicates, item, 0)
+        verdict = validate_rationale(mutate(text, item), predicates, item, CFG)
         assert not verdict.accepted
         assert any(r.startswith(reason) for r in verdict.reasons), verdict.reasons

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from teacher.narrator import describe, narrate
+from teacher.narrator import write_description, write_rationale
 from teacher.numbers import find_numbers
 from tests.teacher import synthetic
 from tests.teacher.hostile_text import PIECES, hostile
@@ -45,7 +45,7 @@ a [trio]|a [single] cube|[percent]|for some [seconds]|a [minute] later|a [few fr
 @cache
 def told(count: int) -> list[str]:
     """Rationales of the built-in narrator."""
-    return [narrate(predicates, item, seed=5) for item, predicates in cases(count)]
+    return [write_rationale(predicates, item, seed=5) for item, predicates in cases(count)]
 
 
 def free() -> list[str]:
@@ -130,7 +130,7 @@ def test_a_number_put_anywhere_is_found(phrase):
 
 
 def test_clean_prose_has_none():
-    described = describe(synthetic.scene([(0, 0), (1, 1)], [(1, 0), (0, 0)]), 0, 20, 70, 0)
+    described = write_description(synthetic.scene([(0, 0), (1, 1)], [(1, 0), (0, 0)]), 0, 20, 70, 0)
     for text in (*told(40), *free(), described):
         assert found(text) == []
 

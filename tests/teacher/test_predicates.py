@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from teacher.numbers import find_numbers
-from teacher.predicates import REGIONS, compass, courses, cut_of, facts_of, predicates_of
+from teacher.predicates import (
+    REGIONS,
+    compass,
+    courses,
+    extract_facts,
+    extract_predicates,
+    find_cut,
+)
 from tests.teacher import synthetic
 
 
@@ -37,7 +44,7 @@ def test_compass(delta, word):
 def test_rolling_southwest():
     start = synthetic.on_ground((300, 100))[:2]
     scene = synthetic.scene([start, (0, -1)], [toward(start, (180, 220), 100), (0, 0)])
-    moving, still = facts_of(scene, 20, 40, 90).objects
+    moving, still = extract_facts(scene, 20, 40, 90).objects
     assert moving.heading == moving.travel == "southwest"
     assert (moving.region, moving.extent) == ("near the center", "moves across")
     assert (still.speed, still.heading, still.extent) == ("stationary", None, "stays")
@@ -50,7 +57,7 @@ def test_a_pair_on_a_course_meets():
     names = tuple(o.phrase for o in scene.objects)
     # They close at two units a second and meet after about 32 frames; the cut is 6, then 20.
     for stop, when in ((6, "soon"), (20, "imminent")):
-        facts = facts_of(scene, 0, stop, contact.frame)
+        facts = extract_facts(scene, 0, stop, contact.frame)
         assert facts.courses[0].objects == names
         assert facts.contacts == facts.courses
         assert facts.courses[0].when == when
@@ -70,7 +77,7 @@ def test_what_the_clip_does_not_show_is_not_foretold():
     scene = synthetic.scene([(-1.5, 0), (1.5, 0)], [(0.4, 0), (-0.4, 0)], frames=60)
     assert not scene.collisions
     assert courses(scene, 50) == [(0, 1)]
-    assert facts_of(scene, 20, 50, 55).courses[0].when == "unseen"
+    assert extract_facts(scene, 20, 50, 55).courses[0].when == "unseen"
 
 
 def test_parallel_and_parting_pairs_are_on_no_course():
@@ -81,16 +88,16 @@ def test_parallel_and_parting_pairs_are_on_no_course():
 def test_time_to_event_is_counted_from_the_cut():
     scene = synthetic.scene([(-1.5, 0), (1.5, 0)], [(1, 0), (-1, 0)])
     contact = scene.collisions[0].frame
-    assert cut_of(scene, 0, contact) == contact - 12
-    assert facts_of(scene, 0, contact, contact + 5).courses[0].when == "imminent"
-    assert facts_of(scene, 0, contact, contact + 5).instant == "just before the contact"
-    assert cut_of(scene, contact - 15, contact) is None
+    assert find_cut(scene, 0, contact) == contact - 12
+    assert extract_facts(scene, 0, contact, contact + 5).courses[0].when == "imminent"
+    assert extract_facts(scene, 0, contact, contact + 5).instant == "just before the contact"
+    assert find_cut(scene, contact - 15, contact) is None
 
 
 def test_leaving_the_view():
     start = synthetic.on_ground((440, 160))[:2]
     scene = synthetic.scene([start, (0, 0)], [toward(start, (600, 160), 60), (0, 0)])
-    moving = facts_of(scene, 0, 10, 80).objects[0]
+    moving = extract_facts(scene, 0, 10, 80).objects[0]
     assert moving.leaves
     assert moving.target_region == "out of view"
 
@@ -146,7 +153,7 @@ def test_every_fact_follows_from_the_stored_oracle(benchmark_store):
     told = Counter()
     for item in benchmark_store.selection():
         scene, target = benchmark_store.scene(item.scene_id), item.target_frame
-        predicates = predicates_of(item, scene, benchmark_store.scene)
+        predicates = extract_predicates(item, scene, benchmark_store.scene)
         ahead = [c.frame for c in scene.collisions if c.frame >= item.prefix_stop]
         cut = min([item.prefix_stop, *(frame - 12 for frame in ahead)])
         assert (predicates is None) == (cut - item.prefix_start < 4)
@@ -242,7 +249,7 @@ def check_meetings(scene, predicates, cut, target, since, told):
 
 def test_no_fact_of_a_benchmark_holds_a_number(benchmark_store):
     for item in benchmark_store.selection():
-        predicates = predicates_of(
+        predicates = extract_predicates(
             item, benchmark_store.scene(item.scene_id), benchmark_store.scene
         )
         text = json.dumps(predicates.to_dict() if predicates else None)
@@ -266,7 +273,7 @@ def cases(count):
             scene_ids=foreign,
             framing=(None, "future", "contact")[k % 3],
         )
-        predicates = predicates_of(item, scene, {"other": other}.__getitem__)
+        predicates = extract_predicates(item, scene, {"other": other}.__getitem__)
         if predicates is not None:
             yield item, predicates
 
@@ -283,7 +290,7 @@ def test_differences_of_a_candidate_are_there(benchmark_store):
     told = 0
     for item in benchmark_store.selection():
         scene = benchmark_store.scene(item.scene_id)
-        predicates = predicates_of(item, scene, benchmark_store.scene)
+        predicates = extract_predicates(item, scene, benchmark_store.scene)
         for candidate in predicates.candidates if predicates else ():
             named = item.candidates["ABCD".index(candidate.letter)]
             frame, other = named.frame, benchmark_store.scene(named.scene_id)
@@ -314,6 +321,6 @@ def test_a_displaced_object_is_named_with_its_direction():
     start = synthetic.on_ground((220, 160))[:2]
     scene = synthetic.scene([start, (0, -1)], [toward(start, (340, 160), 100), (0, 0)])
     item = synthetic.item((60, 80, 100, 120), answer=0)
-    late = predicates_of(item, scene, None).candidates[1].differences
+    late = extract_predicates(item, scene, None).candidates[1].differences
     assert [(d.object, d.kind) for d in late] == [(scene.objects[0].phrase, "displaced")]
     assert (late[0].heading, late[0].extent) == ("east", "slightly")

@@ -23,9 +23,9 @@ from teacher.grammar import GRAMMAR_VERSION
 from teacher.narrate import narrate_store
 from teacher.rationale_log import read_rationales
 from teacher.serve import Machine
+from teacher.server_narrator import request_fields
 from teacher.servers import process
-from teacher.servers.client import Client
-from teacher.servers.narration import request_of
+from teacher.servers.pool import ServerPool
 from tests.teacher.made import corpus, made_store
 from tests.teacher.serving import ROOT, Serving, free_port
 from tests.teacher.tiny_qwen3 import save_tiny_qwen3
@@ -60,12 +60,12 @@ def server(model, tmp_path_factory):
 
 def ask(server, constraint=None, n=1, text="Where does the red cube go?"):
     cfg = TeacherConfig(name="tiny", url=server.url, model="tiny", max_tokens=8)
-    request = request_of(cfg)
+    request = request_fields(cfg)
     request["extra_body"]["structured_outputs"] = constraint
 
     async def main():
-        async with Client(cfg, request) as client:
-            return await client.ask([{"role": "user", "content": text}], n)
+        async with ServerPool(cfg, request) as client:
+            return await client.complete([{"role": "user", "content": text}], n)
 
     return asyncio.run(main())
 

@@ -12,8 +12,8 @@ from conf.errors import UserError
 from conf.schema import TeacherConfig
 from teacher.grammar import grammar
 from teacher.narrate import narrate_store
-from teacher.servers.client import Client, jitter
-from teacher.servers.narration import request_of
+from teacher.server_narrator import request_fields
+from teacher.servers.pool import ServerPool, jitter
 from tests.teacher.odd import OddServer, completion
 
 CHAT = [{"role": "user", "content": "Are you there?"}]
@@ -27,8 +27,8 @@ def config(*servers, **changes):
 
 def ask(cfg, times=1, **own):
     async def main():
-        async with Client(cfg, request_of(cfg)) as client:
-            return await asyncio.gather(*(client.ask(CHAT, **own) for _ in range(times)))
+        async with ServerPool(cfg, request_fields(cfg)) as client:
+            return await asyncio.gather(*(client.complete(CHAT, **own) for _ in range(times)))
 
     return asyncio.run(main())
 
@@ -64,8 +64,8 @@ def test_fewer_answers_than_asked_for_are_taken(odd):
     server = odd(json.dumps(completion("Hello.", "stop", 2)).encode())
 
     async def main():
-        async with Client(config(server), {}) as client:
-            return await client.ask(CHAT, 4)
+        async with ServerPool(config(server), {}) as client:
+            return await client.complete(CHAT, 4)
 
     assert len(asyncio.run(main())) == 2
     assert server.asked[0]["n"] == 4
@@ -113,11 +113,11 @@ def test_servers_share_the_work_by_how_busy_they_are(odd):
     slow.delay, fast.delay = 0.1, 0.005
 
     async def main():
-        async with Client(config(slow, fast), {}) as client:
+        async with ServerPool(config(slow, fast), {}) as client:
 
             async def lane():
                 for _ in range(10):
-                    await client.ask(CHAT)
+                    await client.complete(CHAT)
 
             await asyncio.gather(*(lane() for _ in range(4)))
 
@@ -169,7 +169,7 @@ def test_each_url_is_asked_once_for_its_name(odd):
     server = odd()
 
     async def main():
-        async with Client(config(server, server), {}) as client:
+        async with ServerPool(config(server, server), {}) as client:
             return len(client.places)
 
     assert asyncio.run(main()) == 1

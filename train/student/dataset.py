@@ -22,9 +22,9 @@ from models.student.prompts import (
     response,
     selection_sample,
 )
-from teacher.letters import relabel, reorder
-from teacher.narrator import matches
-from teacher.predicates import predicates_of
+from teacher.candidate_letters import relabel_text, reorder_candidates
+from teacher.narrator import write_match_lines
+from teacher.predicates import extract_predicates
 from train.student.lazy_samples import LazySample, Samples, seeded_rng
 from train.tiny_base import questions
 
@@ -58,10 +58,10 @@ class Supervised:
         order = rng.permutation(len(LETTERS)).tolist()
         return replace(
             self,
-            item=reorder(self.item, order),
-            rationale=relabel(self.rationale, order),
+            item=reorder_candidates(self.item, order),
+            rationale=relabel_text(self.rationale, order),
             # The letters again stand in their own order.
-            matches=tuple(sorted(relabel(line, order) for line in self.matches)),
+            matches=tuple(sorted(relabel_text(line, order) for line in self.matches)),
         )
 
     def sample(self, frames: Frames, cfg: StudentConfig, epoch: int) -> Sample:
@@ -123,10 +123,10 @@ def supervised_items(
 def _matches(store: Store, item: SelectionItem, regime: str) -> tuple[str, ...]:
     if not has_matches(regime):
         return ()
-    predicates = predicates_of(item, store.scene(item.scene_id), store.scene)
+    predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
     # An item with too short a prefix has no rationale either.
     assert predicates is not None
-    return matches(predicates, item)
+    return write_match_lines(predicates, item)
 
 
 def splits(
@@ -142,7 +142,8 @@ def splits(
     if cfg.train.regime == "describe":
         kept = [item for item in items if shows_only(item, held_out)]
         told, measuring = (
-            questions.kinds(store, part, cfg.student, frames, cfg.seed) for part in (trained, kept)
+            questions.build_questions(store, part, cfg.student, frames, cfg.seed)
+            for part in (trained, kept)
         )
         return Samples([sample for made in told.values() for sample in made]), {
             kind: Samples(shuffled(made, cfg.seed)[:limit])

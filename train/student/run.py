@@ -33,7 +33,7 @@ from train.student.lazy_samples import LengthSampler, Samples
 from train.student.packing import PackingCollator, rope_of
 from train.student.trainer import LetterChoice, StudentTrainer, TokenChoice, token_mean
 from train.student.vision_cache import Features, Keyed
-from train.tiny_base.object_tokens import SightCollator, SightTrainer, seen_words
+from train.tiny_base.object_tokens import ObjectTokenCollator, ObjectTokenTrainer, scene_word_tokens
 
 log = logging.getLogger(__name__)
 
@@ -140,8 +140,10 @@ class Ways:
 def ways_of(cfg: SftCommand, model: nn.Module, processor: ProcessorMixin) -> Ways:
     if cfg.train.regime == "describe":
         # Descriptions end in no answer whose letter could be measured, and teach to see.
-        collator = SightCollator(processor, cfg.student.max_length)
-        return Ways(collator, collator, TokenChoice(seen_words(processor)), SightTrainer)
+        collator = ObjectTokenCollator(processor, cfg.student.max_length)
+        return Ways(
+            collator, collator, TokenChoice(scene_word_tokens(processor)), ObjectTokenTrainer
+        )
     collator = Collator(processor, cfg.student.max_length)
     rope = rope_of(model, cfg.train.packing)
     packs = PackingCollator(processor, cfg.student.max_length, rope) if rope else collator

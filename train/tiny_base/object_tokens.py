@@ -35,7 +35,7 @@ NONE = -1
 """Stands where a token is told fewer words."""
 
 
-def seen_words(processor: ProcessorMixin) -> dict[str, list[int]]:
+def scene_word_tokens(processor: ProcessorMixin) -> dict[str, list[int]]:
     """The words of objects, of their places and of their motion, by kind, each by its first
     token."""
     kinds = {"color": COLORS, "material": MATERIALS, "shape": SHAPES, "place": PLACES}
@@ -47,7 +47,7 @@ def first_token(processor: ProcessorMixin, word: str) -> int:
     return processor.tokenizer.encode(f" {word}", add_special_tokens=False)[0]
 
 
-class SightCollator(Collator):
+class ObjectTokenCollator(Collator):
     """Batches that also hold `sights` (N, 2 + WORDS): row and position of a visual token, and the
     first tokens of the words that it is told, filled up with NONE. All positions keep their logits.
     """
@@ -83,7 +83,7 @@ class SightCollator(Collator):
         return found
 
 
-class SightTrainer(StudentTrainer):
+class ObjectTokenTrainer(StudentTrainer):
     """A trainer whose loss also counts how well visual tokens name what they show."""
 
     def compute_loss(
@@ -100,11 +100,14 @@ class SightTrainer(StudentTrainer):
         if model.training and len(sights):
             # The mean over ranks, by which gradients are shared, is undone as in the tokens' loss.
             ranks = self.accelerator.num_processes
-            loss = loss + ranks * WEIGHT * unnamed(outputs.logits, sights) / num_items_in_batch
+            loss = (
+                loss
+                + ranks * WEIGHT * object_token_loss(outputs.logits, sights) / num_items_in_batch
+            )
         return (loss, outputs) if return_outputs else loss
 
 
-def unnamed(logits: torch.Tensor, sights: torch.Tensor) -> torch.Tensor:
+def object_token_loss(logits: torch.Tensor, sights: torch.Tensor) -> torch.Tensor:
     """Cross entropy between what visual tokens say and the words for what they show, each word as
     likely as the other; a sum over sights.
 

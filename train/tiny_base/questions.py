@@ -22,15 +22,15 @@ from data.records import LETTERS, Scene, SelectionItem, shown_frames
 from data.render.frame_cache import Frames
 from data.store import Store
 from models.student.prompts import Sample, Sight, answer_line, conversation, load_clip
-from teacher.narrator import describe, matches
+from teacher.narrator import write_description, write_match_lines
 from teacher.predicates import (
     REGIONS,
     ObjectFacts,
     Predicates,
-    facts_of,
-    heading_of,
-    predicates_of,
-    region_of,
+    extract_facts,
+    extract_predicates,
+    object_heading,
+    object_region,
 )
 from train.student.lazy_samples import LazySample, seeded_rng
 
@@ -67,7 +67,7 @@ NAMED = 4
 """Objects at most that a description to be matched names."""
 
 
-def kinds(
+def build_questions(
     store: Store, items: list[SelectionItem], cfg: StudentConfig, frames: Frames, seed: int
 ) -> dict[str, list[LazySample]]:
     """Samples of each kind from some items. Which frame is described or is the later, among which
@@ -205,7 +205,7 @@ class _Maker:
     def moves(self, item: SelectionItem) -> Iterator[LazySample]:
         """How an object of the clip moves, as often one that rests as another."""
         scene = self.store.scene(item.scene_id)
-        facts = facts_of(scene, item.prefix_start, item.prefix_stop, item.target_frame)
+        facts = extract_facts(scene, item.prefix_start, item.prefix_stop, item.target_frame)
         seen = [o for o in facts.objects if o.sight == "shown"] if facts else []
         if seen:
             longest = max((_motion(facts.instant, o) for o in seen), key=len)
@@ -233,7 +233,9 @@ class _Maker:
     def _told(self, item: SelectionItem) -> str | None:
         """The clip and what comes of it in the narrator's words, None where it is too short."""
         scene = self.store.scene(item.scene_id)
-        return describe(scene, item.prefix_start, item.prefix_stop, item.target_frame, self.seed)
+        return write_description(
+            scene, item.prefix_start, item.prefix_stop, item.target_frame, self.seed
+        )
 
     def _clip(self, item: SelectionItem, text: str, k: int, epoch: int) -> Sample:
         shown = seeded_rng(self.seed, epoch, item.item_id, "clip", k).random() < 0.5
@@ -286,7 +288,7 @@ class _Maker:
 
     def matched(self, item: SelectionItem) -> Iterator[LazySample]:
         """A description that one candidate alone fits, where there is such."""
-        predicates = predicates_of(item, self.store.scene(item.scene_id), self.store.scene)
+        predicates = extract_predicates(item, self.store.scene(item.scene_id), self.store.scene)
         plain = predicates and _plain(predicates)
         if not plain:
             return
@@ -295,7 +297,7 @@ class _Maker:
         told.sort(key=lambda o: o.object not in differing)
         what = ", ".join(f"the {o.object} {o.target_region}" for o in told[:NAMED])
         asked = MATCH.format(what)
-        answer = "\n".join([*matches(plain, item), answer_line(item.letter)])
+        answer = "\n".join([*write_match_lines(plain, item), answer_line(item.letter)])
         make = partial(self._match, item, asked, answer)
         yield LazySample(f"{asked} {answer}", len(LETTERS), make)
 
@@ -312,7 +314,7 @@ class _Maker:
         # A visual token of a clip shows two frames; its object is where the first has it.
         pairs = [(f, shown[min(k + 1, len(shown) - 1)]) for k, f in enumerate(shown)][::2]
         watched = [
-            Sight(k, place, (*words, heading_of(scene, index, *pair) or "stationary"))
+            Sight(k, place, (*words, object_heading(scene, index, *pair) or "stationary"))
             for k, pair in enumerate(pairs)
             for index, place, words in sights(scene, pair[0])
         ]
@@ -359,7 +361,7 @@ def _compared(letter: str, phrase: str, place: str | None, expected: str | None)
 def seen_in(scene: Scene, frame: int) -> dict[str, str]:
     """The places of the objects that a frame shows, by their phrases."""
     return {
-        o.phrase: region_of(scene, frame, k)
+        o.phrase: object_region(scene, frame, k)
         for k, o in enumerate(scene.objects)
         if scene.in_view[frame, k] and scene.visible_fraction[frame, k] > HIDDEN
     }

@@ -22,7 +22,7 @@ from evaluation.generators.model_source import model_served, response_settings, 
 from evaluation.generators.openai_server import revision, say, written
 from evaluation.generators.response_log import ResponseLog, collect_responses, score_response
 from evaluation.generators.response_schema import instruction, schema
-from teacher.servers.replies import CUT_OFF, Reply
+from teacher.servers.responses import TRUNCATED, Response
 from tests.evaluation.generators.test_response_schema import FULL
 
 STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
@@ -121,18 +121,18 @@ def test_a_control_hides_the_clip(items, frames, talking) -> None:
 @pytest.mark.parametrize(
     ("reply", "thinking", "text"),
     [
-        (Reply("Answer: B"), False, "Answer: B"),
-        (Reply("B? Yes.</think>Answer: C"), True, "<think>B? Yes.</think>Answer: C"),
-        (Reply("<think>B?</think>C"), True, "<think>B?</think>C"),
-        (Reply("Answer: B", CUT_OFF), True, "<think>Answer: B"),
-        (Reply("C", "thinking", thought="B?"), False, "<think>B?</think>C"),
-        (Reply("", CUT_OFF, thought="Answer: B"), True, "<think>Answer: B"),
+        (Response("Answer: B"), False, "Answer: B"),
+        (Response("B? Yes.</think>Answer: C"), True, "<think>B? Yes.</think>Answer: C"),
+        (Response("<think>B?</think>C"), True, "<think>B?</think>C"),
+        (Response("Answer: B", TRUNCATED), True, "<think>Answer: B"),
+        (Response("C", "thinking", reasoning="B?"), False, "<think>B?</think>C"),
+        (Response("", TRUNCATED, reasoning="Answer: B"), True, "<think>Answer: B"),
     ],
 )
 def test_a_thought_is_no_answer(reply, thinking, text, items) -> None:
     found = written(reply, thinking)
     assert found.text == text
-    assert found.cut == (reply.flaw == CUT_OFF)
+    assert found.cut == (reply.flaw == TRUNCATED)
     letter = score_response(items[0], "answer", found).letter
     assert letter == (None if "</think>" not in text and thinking else text[-1])
 
@@ -270,7 +270,7 @@ def test_adapters_over_another_rounding_are_told(talking, tmp_path, caplog) -> N
 def test_answers_to_other_questions_stay_and_do_not_count(items, tmp_path) -> None:
     path, [item, *_] = tmp_path / "answers.jsonl", items
     first = ResponseLog(path, {"record": {"seed": 0}}, items)
-    first.append([score_response(item, "record", written(Reply(FULL), False))])
+    first.append([score_response(item, "record", written(Response(FULL), False))])
     assert ResponseLog(path, {"record": {"seed": 0}}, items).answers == first.answers
     assert not ResponseLog(path, {"record": {"seed": 1}}, items).answers
     assert not ResponseLog(path, {"answer": {"seed": 0}}, items).answers

@@ -35,7 +35,7 @@ from evaluation import select
 from models import checks, loading
 from models.retriever import embedder
 from models.tiny_qwen3_vl import build_model
-from teacher.narrate import JOURNAL, ensure_rationales
+from teacher.narrate import JOURNAL_FILE, ensure_rationales
 from teacher.rationale_log import Journal
 from train import sft
 from train.common.checkpoints import newest_checkpoint
@@ -194,7 +194,7 @@ def test_rationales_of_another_benchmark_are_told(settings, micro_store, tmp_pat
     first, *_ = ensure_rationales(micro_store, settings.teacher)
     store = tmp_path / "micro"
     shutil.copytree(micro_store.folder, store, ignore=shutil.ignore_patterns("frames"))
-    journal = store / JOURNAL
+    journal = store / JOURNAL_FILE
     stranger = micro_store.selection("test")[0].item_id
     with Journal(journal) as opened:
         opened.append([replace(first, item_id=stranger)])

@@ -13,10 +13,10 @@ from data.store import Store
 from models.student.answer_parser import parse_choice
 from models.student.prompts import answer_line, instruction, response
 from teacher.narrate import ensure_rationales
-from teacher.predicates import predicates_of
-from teacher.sections import SECTIONS, parts
-from teacher.validation.claims import find_claims
-from teacher.validation.validate import validate
+from teacher.predicates import extract_predicates
+from teacher.sections import SECTIONS, split_sections
+from teacher.validation.claim_extraction import extract_claims
+from teacher.validation.validator import validate_rationale
 from train.student.dataset import HELD_OUT, Supervised, held_out_scenes, supervised_items
 from train.student.lazy_samples import Samples
 
@@ -40,10 +40,10 @@ def test_a_regime_is_the_whole_without_its_part(micro_store, regime) -> None:
     assert asked
     for s in asked:
         text = told(s)
-        headings = [name for name, _, _ in parts(text)]
+        headings = [name for name, _, _ in split_sections(text)]
         left_out = {"Candidate analysis"} if regime == "cot_no_candidate_analysis" else set()
         assert headings == [*(name for name in SECTIONS if name not in left_out), "Answer"]
-        for name, start, stop in parts(s.rationale):
+        for name, start, stop in split_sections(s.rationale):
             if name not in ("Answer", *left_out):
                 assert s.rationale[start:stop].strip() in text
         lines = text.splitlines()
@@ -79,15 +79,15 @@ def test_what_is_supervised_is_right_in_every_epochs_order(micro_store) -> None:
             assert parse_choice(told(shown)).letter == LETTERS[item.candidates.index(right)]
             orders.add(tuple(s.item.candidates.index(c) for c in item.candidates))
             if s.mode == "reasoning":
-                predicates = predicates_of(
+                predicates = extract_predicates(
                     item, micro_store.scene(item.scene_id), micro_store.scene
                 )
-                assert validate(shown.rationale, predicates, item, TEACHER).reasons == ()
+                assert validate_rationale(shown.rationale, predicates, item, TEACHER).reasons == ()
                 matching = [line for line in shown.matches if " matches: " in line]
                 assert [line.split()[1] for line in matching] == [item.letter]
                 assert [line.split()[1] for line in shown.matches] == list(LETTERS)
                 analysis = "Candidate analysis: " + "\n".join(shown.matches)
-                verdicts = {c.verdict for c in find_claims(analysis, predicates)}
+                verdicts = {c.verdict for c in extract_claims(analysis, predicates)}
                 assert "contradicted" not in verdicts
                 assert "supported" in verdicts
     assert len(orders) == 24

@@ -10,7 +10,13 @@ import torch
 
 from models.student.collator import Collator
 from train.tiny_base import questions
-from train.tiny_base.object_tokens import NONE, WORDS, SightCollator, first_token, unnamed
+from train.tiny_base.object_tokens import (
+    NONE,
+    WORDS,
+    ObjectTokenCollator,
+    first_token,
+    object_token_loss,
+)
 
 
 def test_words_stand_at_the_tokens_that_show_them(
@@ -18,9 +24,9 @@ def test_words_stand_at_the_tokens_that_show_them(
 ) -> None:
     """Each picture's, a clip's among them: an object's words in the object's cell."""
     items = micro_store.selection("train")
-    kinds = questions.kinds(micro_store, items, student_cfg, frames, 0)
+    kinds = questions.build_questions(micro_store, items, student_cfg, frames, 0)
     samples = [made[0].make(0) for made in kinds.values()]
-    batch = SightCollator(processor, 1500)(samples)
+    batch = ObjectTokenCollator(processor, 1500)(samples)
     plain = Collator(processor, 1500)(samples)
     assert torch.equal(batch["input_ids"], plain["input_ids"])
     kept = plain["labels"].shape[1]
@@ -58,9 +64,11 @@ def test_the_best_answer_names_each_word_as_often() -> None:
     sights = torch.tensor([[0, 1, 4, 5, 6, NONE]])
     even = torch.full((1, 3, 10), -torch.inf)
     even[0, 1, [4, 5, 6]] = 0.0
-    assert unnamed(even, sights).item() == pytest.approx(math.log(3))
+    assert object_token_loss(even, sights).item() == pytest.approx(math.log(3))
     tilted = even.clone()
     tilted[0, 1, 4] = 1.0
-    assert unnamed(tilted, sights).item() > math.log(3)
+    assert object_token_loss(tilted, sights).item() > math.log(3)
     elsewhere = torch.zeros(1, 3, 10)
-    assert unnamed(elsewhere, sights.repeat(2, 1)).item() == pytest.approx(2 * math.log(10))
+    assert object_token_loss(elsewhere, sights.repeat(2, 1)).item() == pytest.approx(
+        2 * math.log(10)
+    )

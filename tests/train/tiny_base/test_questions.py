@@ -10,20 +10,22 @@ import pytest
 from data.records import LETTERS
 from data.render.frame_cache import Frames
 from data.store import Store
-from teacher.predicates import cut_of, region_of
+from teacher.predicates import find_cut, object_region
 from train.student.lazy_samples import LazySample
 from train.tiny_base import questions
 
 
 @pytest.fixture
 def kinds(micro_store, frames, student_cfg) -> dict[str, list[LazySample]]:
-    return questions.kinds(micro_store, micro_store.selection("train"), student_cfg, frames, 0)
+    return questions.build_questions(
+        micro_store, micro_store.selection("train"), student_cfg, frames, 0
+    )
 
 
 def shown(store: Store, scene_id: str, frame: int) -> dict[str, str]:
     scene = store.scene(scene_id)
     return {
-        o.phrase: region_of(scene, frame, k)
+        o.phrase: object_region(scene, frame, k)
         for k, o in enumerate(scene.objects)
         if scene.in_view[frame, k] and scene.visible_fraction[frame, k] > 0.05
     }
@@ -117,7 +119,7 @@ def test_an_object_of_a_clip_moves_as_it_is_said_to(micro_store, kinds) -> None:
         sample = planned.make(0)
         item = items[sample.sample_id.partition(" (")[0]]
         scene = micro_store.scene(item.scene_id)
-        end = cut_of(scene, item.prefix_start, item.prefix_stop)
+        end = find_cut(scene, item.prefix_start, item.prefix_stop)
         phrase = re.fullmatch(r"How does the (.+) move\?", sample.content[-1]["text"])[1]
         index = [o.phrase for o in scene.objects].index(phrase)
         speed = np.linalg.norm(scene.velocities[end, index])
@@ -125,7 +127,7 @@ def test_an_object_of_a_clip_moves_as_it_is_said_to(micro_store, kinds) -> None:
             rf"[A-Z].+, the {phrase} is (near the [\w-]+) and (does not move|moves .+)\.",
             sample.response,
         )
-        assert told[1] == region_of(scene, end, index)
+        assert told[1] == object_region(scene, end, index)
         assert (told[2] == "does not move") == (speed < 0.05)
         if way := re.search(r"toward the (\w+)$", told[2]):
             gone = np.diff(scene.image_positions[[end - 1, end], index], axis=0)[0]

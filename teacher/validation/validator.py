@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 
 from conf.schema import TeacherConfig
 from data.records import LETTERS, SelectionItem
-from teacher.letters import letters
+from teacher.candidate_letters import letters
 from teacher.numbers import find_numbers
 from teacher.predicates import Predicates
 from teacher.reading.grounding import Claim
-from teacher.sections import SECTIONS, opening, parts
-from teacher.validation.claims import find_claims
+from teacher.sections import SECTIONS, opening, split_sections
+from teacher.validation.claim_extraction import extract_claims
 
 VALIDATOR_VERSION = "4"
 SMALL_LETTER = re.compile(r"\b[Cc]andidates? [a-d]\b")
@@ -33,7 +33,9 @@ class Verdict:
     """What the rationale claims, each with the predicates' verdict on it."""
 
 
-def validate(text: str, predicates: Predicates, item: SelectionItem, cfg: TeacherConfig) -> Verdict:
+def validate_rationale(
+    text: str, predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
+) -> Verdict:
     """Reads a rationale and lists everything that is wrong with it."""
     reasons = [f"number: {text[start:stop]!r}" for start, stop in find_numbers(text)]
     words = word_count(text)
@@ -46,7 +48,7 @@ def validate(text: str, predicates: Predicates, item: SelectionItem, cfg: Teache
     reasons += _not_analysed(sections.get("Candidate analysis", ""))
     if answer is not None and answer != item.letter:
         reasons.append(f"wrong answer: {answer}")
-    claims = find_claims(text, predicates)
+    claims = extract_claims(text, predicates)
     reasons += dict.fromkeys(f"contradicts: {c}" for c in claims if c.verdict == "contradicted")
     return Verdict(not reasons, tuple(reasons), sections, answer, claims)
 
@@ -66,7 +68,7 @@ def word_count(text: str) -> int:
 
 
 def _parse(text: str) -> tuple[dict[str, str], str | None, list[str]]:
-    bounds = parts(text)
+    bounds = split_sections(text)
     told = [(name, text[start:stop].strip()) for name, start, stop in bounds]
     sections = {name: body for name, body in told if name != "Answer"}
     answers = [body for name, body in told if name == "Answer"]

@@ -12,8 +12,8 @@ from teacher.narrator import NARRATOR_VERSION
 from teacher.predicates import Predicates
 from teacher.prompts import PROMPT_VERSION
 from teacher.reading.grounding import VERDICTS, Claim
-from teacher.servers.replies import Reply
-from teacher.validation.validate import VALIDATOR_VERSION, validate
+from teacher.servers.responses import Response
+from teacher.validation.validator import VALIDATOR_VERSION, validate_rationale
 
 LONGEST = 20_000
 """Characters of an answer that are read and kept; no rationale has as many."""
@@ -21,7 +21,7 @@ LONGEST = 20_000
 Signature = tuple[str, str, str, str, int]
 
 
-class Judge:
+class RationaleGrader:
     """Judges answers under one configuration."""
 
     def __init__(self, cfg: TeacherConfig) -> None:
@@ -36,13 +36,13 @@ class Judge:
         return (self.cfg.name, self.version, VALIDATOR_VERSION, self.settings, self.cfg.seed)
 
     def judge(
-        self, reply: Reply, predicates: Predicates, item: SelectionItem, attempt: int
+        self, reply: Response, predicates: Predicates, item: SelectionItem, attempt: int
     ) -> Rationale:
         reasons, sections, answer, claims = (reply.flaw,), {}, None, ()
         if len(reply.text) > LONGEST:
             reasons = ("too long",)
         elif reply.flaw is None:
-            verdict = validate(reply.text, predicates, item, self.cfg)
+            verdict = validate_rationale(reply.text, predicates, item, self.cfg)
             reasons, sections, answer = verdict.reasons, verdict.sections, verdict.answer
             claims = verdict.claims
         return Rationale(

@@ -11,7 +11,7 @@ from teacher.reading.candidates import CandidateReader
 from teacher.reading.grounding import CUT, EITHER, TARGET, Claim, Ground
 from teacher.reading.scenes import SceneReader
 from teacher.reading.tagging import Tag, tags
-from teacher.sections import parts
+from teacher.sections import split_sections
 
 MOMENTS = {
     "Scene parse": CUT,
@@ -21,15 +21,15 @@ MOMENTS = {
 }
 """What the present tense of a section speaks of."""
 
-LONGEST = 250
+MAX_SENTENCE_TAGS = 250
 """Tags of a sentence, beyond which it is cut."""
 
 
-def find_claims(text: str, predicates: Predicates) -> tuple[Claim, ...]:
+def extract_claims(text: str, predicates: Predicates) -> tuple[Claim, ...]:
     """The claims of a rationale in order, each with its verdict; never raises."""
     ground = Ground(predicates)
     found: list[Claim] = []
-    for name, start, stop in parts(text):
+    for name, start, stop in split_sections(text):
         if name == "Answer":
             found += _answer(text, start, stop)
             continue
@@ -59,6 +59,6 @@ def _sentences(found: list[Tag]) -> list[list[Tag]]:
     sentences: list[list[Tag]] = [[]]
     for tag in found:
         sentences[-1].append(tag)
-        if tag.tag == "stop" or len(sentences[-1]) >= LONGEST:
+        if tag.tag == "stop" or len(sentences[-1]) >= MAX_SENTENCE_TAGS:
             sentences.append([])
     return [s for s in sentences if s]

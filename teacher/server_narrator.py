@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
-from teacher.predicates import Predicates, predicates_of
+from teacher.predicates import Predicates, extract_predicates
 from teacher.progress import Progress
 from teacher.prompts import messages
-from teacher.servers.client import Client, UnansweredError
-from teacher.servers.concurrency import in_lanes
-from teacher.servers.replies import Reply
-from teacher.servers.server import Request
-from teacher.validation.verdict import Judge
+from teacher.servers.concurrency import run_limited
+from teacher.servers.pool import NoResponseError, ServerPool
+from teacher.servers.responses import Response
+from teacher.servers.server import RequestFields
+from teacher.validation.grader import RationaleGrader
 
 if TYPE_CHECKING:
     from data.store import Store
@@ -26,11 +26,16 @@ Job = tuple[SelectionItem, int]
 Keep = Callable[[list[Rationale]], None]
 
 
-class Asking:
+class ServerNarrator:
     """One run over items: `jobs` are those that are open, `keep` puts answers on the disk."""
 
     def __init__(
-        self, store: Store, cfg: TeacherConfig, judge: Judge, keep: Keep, progress: Progress
+        self,
+        store: Store,
+        cfg: TeacherConfig,
+        judge: RationaleGrader,
+        keep: Keep,
+        progress: Progress,
     ) -> None:
         self.store, self.cfg, self.judge = store, cfg, judge
         self.keep, self.progress = keep, progress
@@ -41,13 +46,13 @@ class Asking:
         # One thread judges and waits for the disk, so that answers are written one after another
         # while the loop goes on asking.
         with ThreadPoolExecutor(1) as self.desk:
-            async with Client(self.cfg, request_of(self.cfg)) as self.client:
-                await in_lanes(jobs, self.cfg.concurrency, self._ask)
+            async with ServerPool(self.cfg, request_fields(self.cfg)) as self.client:
+                await run_limited(jobs, self.cfg.concurrency, self._ask)
         return self.too_short
 
     async def _ask(self, job: Job) -> None:
         item, first = job
-        predicates = predicates_of(item, self.store.scene(item.scene_id), self.store.scene)
+        predicates = extract_predicates(item, self.store.scene(item.scene_id), self.store.scene)
         if predicates is None:
             self.too_short += 1
         else:
@@ -61,9 +66,9 @@ class Asking:
             # Most items are accepted at once: more than one answer is worth it after a failure.
             n = min(self.cfg.samples, self.cfg.attempts - attempt) if attempt else 1
             try:
-                replies = await self.client.ask(chat, n)
-            except UnansweredError as fault:
-                replies = [Reply("", f"unanswered: {fault}")]
+                replies = await self.client.complete(chat, n)
+            except NoResponseError as fault:
+                replies = [Response("", f"unanswered: {fault}")]
             answers = await asyncio.get_running_loop().run_in_executor(
                 self.desk, self._take, replies, predicates, item, attempt
             )
@@ -73,7 +78,7 @@ class Asking:
             attempt += len(answers)
 
     def _take(
-        self, replies: list[Reply], predicates: Predicates, item: SelectionItem, attempt: int
+        self, replies: list[Response], predicates: Predicates, item: SelectionItem, attempt: int
     ) -> list[Rationale]:
         answers = [
             self.judge.judge(reply, predicates, item, attempt + k)
@@ -83,7 +88,7 @@ class Asking:
         return answers
 
 
-def request_of(cfg: TeacherConfig) -> Request:
+def request_fields(cfg: TeacherConfig) -> RequestFields:
     """What goes with every chat with a teacher."""
     # No seed: one a request crashed vLLM on a CPU at 32 in flight.
     extra = {"top_k": cfg.top_k, "chat_template_kwargs": {"enable_thinking": False}}

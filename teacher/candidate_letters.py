@@ -25,7 +25,7 @@ def letters(text: str) -> list[tuple[int, int]]:
     ]
 
 
-def relabel(text: str, order: Sequence[int]) -> str:
+def relabel_text(text: str, order: Sequence[int]) -> str:
     """A rationale for the same candidates in another order.
 
     Args:
@@ -41,7 +41,7 @@ def relabel(text: str, order: Sequence[int]) -> str:
     return "".join([*pieces, text[at:]])
 
 
-def reorder(item: SelectionItem, order: Sequence[int]) -> SelectionItem:
+def reorder_candidates(item: SelectionItem, order: Sequence[int]) -> SelectionItem:
     """An item with its candidates in another order; see `relabel`."""
     _check(order)
     candidates = tuple(item.candidates[old] for old in order)

@@ -11,13 +11,13 @@ import time
 from conf.errors import UserError
 from conf.schema import ServersConfig
 from teacher.servers.server import (
-    Chat,
     MalformedReplyError,
+    Messages,
     RateLimitedError,
     RefusedError,
-    Reply,
-    Request,
     RequestError,
+    RequestFields,
+    Response,
     Server,
 )
 
@@ -27,11 +27,11 @@ PAUSE, LONGEST_PAUSE = 0.5, 10.0
 """Seconds of the first pause before something is tried again at most, doubled up to the longest."""
 FAULTS = 4
 """Requests for one item that may fail in a row at servers that are up."""
-CANARY: Chat = [{"role": "user", "content": "Say hello."}]
+CANARY: Messages = [{"role": "user", "content": "Say hello."}]
 """What any server can answer: it tells whether a server is broken or an item is."""
 
 
-class UnansweredError(Exception):
+class NoResponseError(Exception):
     """Servers that answer other requests have no answer to this one."""
 
 
@@ -64,7 +64,7 @@ class Place:
         self.free_at = max(self.free_at, now + seconds)
 
 
-class Client:
+class ServerPool:
     """Asks `cfg.model` at `cfg.urls`, each time at the least busy server that is up.
 
     `request` goes with every chat. `canary` is what any server can answer that serves such chats,
@@ -74,8 +74,8 @@ class Client:
     def __init__(
         self,
         cfg: ServersConfig,
-        request: Request,
-        canary: Chat = CANARY,
+        request: RequestFields,
+        canary: Messages = CANARY,
         kind: type[Server] = Server,
     ) -> None:
         self.cfg, self.request, self.canary = cfg, request, canary
@@ -83,7 +83,7 @@ class Client:
         self.stuck_since: float | None = None
         """When no server could be asked, with no answer since."""
 
-    async def __aenter__(self) -> Client:
+    async def __aenter__(self) -> ServerPool:
         await asyncio.gather(*(self._look(place) for place in self.places))
         return self
 
@@ -94,7 +94,7 @@ class Client:
         await asyncio.gather(*watches, return_exceptions=True)
         await asyncio.gather(*(place.server.close() for place in self.places))
 
-    async def ask(self, chat: Chat, n: int = 1, **own: object) -> list[Reply]:
+    async def complete(self, chat: Messages, n: int = 1, **own: object) -> list[Response]:
         """Up to `n` answers to a chat, however often servers have to be waited for; `own` are
         fields of this request alone.
 
@@ -117,14 +117,16 @@ class Client:
                 faults += 1
                 if faults == FAULTS or isinstance(fault, RefusedError):
                     if await self._sings(place):
-                        raise UnansweredError(str(fault)) from fault
+                        raise NoResponseError(str(fault)) from fault
                     faults = 0
             await asyncio.sleep(jitter(faults))
 
-    async def _ask(self, place: Place, chat: Chat, n: int, request: Request) -> list[Reply]:
+    async def _ask(
+        self, place: Place, chat: Messages, n: int, request: RequestFields
+    ) -> list[Response]:
         place.in_flight += 1
         try:
-            replies = await place.server.ask(chat, n, request)
+            replies = await place.server.complete(chat, n, request)
         finally:
             place.in_flight -= 1
         place.limited, self.stuck_since = 0, None

@@ -16,7 +16,7 @@ from functools import lru_cache
 from itertools import accumulate
 
 from teacher.numbers import lexicon
-from teacher.numbers.folding import FOLDS, Spans, fold, fold_word
+from teacher.numbers.normalization import FOLDS, Spans, fold, fold_word
 
 Rule = Callable[["Prose", int], "tuple[int, int] | None"]
 

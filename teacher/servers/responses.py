@@ -6,12 +6,12 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-CUT_OFF = "cut off"
+TRUNCATED = "cut off"
 """The flaw of an answer that has as many tokens as it may have."""
 
 
 @dataclass(frozen=True)
-class Reply:
+class Response:
     """A server's answer. `flaw` says why its text is none, whatever it reads; `thought` is what a
     server's reasoning parser has taken out of the text."""
 
@@ -20,10 +20,10 @@ class Reply:
     prompt_tokens: int | None = None
     completion_tokens: int | None = None
     finished: float | None = None
-    thought: str = ""
+    reasoning: str = ""
 
 
-def replies(completion: Any, n: int) -> list[Reply]:
+def replies(completion: Any, n: int) -> list[Response]:
     """The first `n` choices of a chat completion. Raises ValueError where there is none."""
     choices = completion.choices[:n]
     if not choices:
@@ -35,7 +35,7 @@ def replies(completion: Any, n: int) -> list[Reply]:
         prompt = None if read is None else read * (k == 0)
         text, thought = _clean(choice.message.content), _clean(_thought(choice))
         flaw = _flaw(text, thought, choice)
-        given.append(Reply(text, flaw, prompt, share, time.time(), thought))
+        given.append(Response(text, flaw, prompt, share, time.time(), thought))
     return given
 
 
@@ -56,7 +56,7 @@ def _clean(text: str | None) -> str:
 
 def _flaw(text: str, thought: str, choice: Any) -> str | None:
     if choice.finish_reason == "length":
-        return CUT_OFF
+        return TRUNCATED
     if thought or "<think>" in text or "</think>" in text:
         return "thinking"
     return None if text else "empty"
