@@ -1,50 +1,24 @@
-"""Holds against each other what is put together to be trained or measured: a base, its processor,
-adapters, pooling and widths, and the run that they belong to."""
+"""Checks that a base, its processor, its adapters, its pooling and its widths fit together."""
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
-from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from safetensors import safe_open
 
 from conf.errors import UserError
-from conf.runs import write_json
 from conf.schema import RetrieverConfig, StudentConfig
-from data.store import Store
 
 if TYPE_CHECKING:
     from torch import nn
     from transformers import PreTrainedConfig, PreTrainedTokenizerBase, ProcessorMixin
 
-Preset = TypeVar("Preset", StudentConfig, RetrieverConfig)
-
-BASE = "base.json"
-DATA = "data.json"
 MODULES = "modules.json"
 """In which sentence-transformers lists a model's parts."""
 PEFT = "base_model.model."
 """What peft puts before the names of the modules that it adapts."""
-BLOCK = 1 << 12
-"""Bytes that a hash takes of a tensor."""
-PROCESSOR = (
-    "*processor_config.json",
-    "*token*.json",
-    "chat_template*",
-    "additional_chat_templates/*",
-    "merges.txt",
-    "sentence_bert_config.json",
-    "tokenizer.model",
-    "vocab.*",
-)
-"""Files, beside the weights, that say how text and pixels become a model's input."""
-METADATA = "__metadata__"
-"""What stands among the tensors in a file's head and is none."""
 UNTRAINED_MODULES = ("Transformer", "Pooling", "Normalize")
 """Kinds of modules that a retriever of one vector here has, of which the first alone is trained."""
 DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)
@@ -225,154 +199,4 @@ def check_widths(cfg: RetrieverConfig, entries: int) -> None:
         raise UserError(
             f"retriever.widths asks for {cfg.widths[0]}, and the embeddings of {cfg.name} "
             f"have {entries} entries: give retriever.widths=[{fitting}]"
-        )
-
-
-def weights_digest(*models: str | Path | None) -> str:
-    """A short hash of the safetensors of models in folders, wherever the folder is, by each file's
-    name and size, the names and shapes of its tensors, and a block of each tensor's middle: what is
-    trained, or merged, changes all of a tensor. A hub's name stands for itself, with its commit or
-    without."""
-    whole = hashlib.sha256()
-    for k, model in enumerate(models):
-        folder = model is not None and Path(model).is_dir()
-        whole.update(f"{k} {'' if folder else model}".encode())
-        for path in sorted(Path(model).rglob("*.safetensors")) if folder else []:
-            whole.update(f"{path.name} {path.stat().st_size}".encode())
-            with open(path, "rb") as file:
-                _hash_tensors(file, whole)
-    return whole.hexdigest()[:16]
-
-
-def _hash_tensors(file: BinaryIO, whole: Any) -> None:
-    """Add the head of a file of safetensors to a hash, and a block of each of its tensors."""
-    size = os.fstat(file.fileno()).st_size
-    head = file.read(min(size, int.from_bytes(file.read(8), "little")))
-    whole.update(head)
-    try:
-        tensors = [told for name, told in sorted(json.loads(head).items()) if name != METADATA]
-        places = [(int(first), int(last)) for first, last in (t["data_offsets"] for t in tensors)]
-    except (ValueError, TypeError, KeyError, AttributeError):
-        # What loads the file tells that it is damaged.
-        places = []
-    for first, last in places:
-        size = max(0, min(BLOCK, last - first))
-        file.seek(max(0, 8 + len(head) + (first + last - size) // 2))
-        whole.update(file.read(size))
-
-
-def processor_digest(model: str | Path | None) -> str:
-    """A short hash of what makes a model's input in a folder: the files of its tokenizer, its
-    processor and its chat template; a hub's name stands for itself."""
-    whole = hashlib.sha256()
-    if model is None or not Path(model).is_dir():
-        whole.update(f"{model}".encode())
-        return whole.hexdigest()[:16]
-    for path in sorted({p for pattern in PROCESSOR for p in Path(model).rglob(pattern)}):
-        whole.update(f"{path.relative_to(model)} {path.stat().st_size} ".encode())
-        whole.update(path.read_bytes())
-    return whole.hexdigest()[:16]
-
-
-def pin_revisions(cfg: Preset) -> Preset:
-    """A preset with the commits of its hub's models as their revisions: a name stands for other
-    weights once its owner changes them. A commit in the cache comes first. Where none can be known
-    the preset stays as it is, and what loads the model tells why it cannot be had."""
-    commits = {}
-    for model, revision in (("model", "revision"), ("image_model", "image_revision")):
-        if is_hub_model(name := getattr(cfg, model, None)):
-            asked = getattr(cfg, revision)
-            commits[revision] = _commit(name, asked) or asked
-    return replace(cfg, **commits)
-
-
-def _commit(model: str, revision: str | None) -> str | None:
-    from huggingface_hub import model_info, try_to_load_from_cache
-
-    try:
-        # Adapters have no settings of a whole model beside them.
-        for file in ("config.json", "adapter_config.json"):
-            there = try_to_load_from_cache(model, file, revision=revision)
-            if isinstance(there, str):
-                # Within the cache, files stand in a folder that goes by the commit.
-                return Path(there).parent.name
-        return model_info(model, revision=revision, timeout=10).sha
-    except Exception:
-        # The hub's client raises errors of whichever HTTP library it has.
-        return None
-
-
-def is_hub_model(model: str | None) -> bool:
-    """Whether a preset's model is a hub's, and neither a folder here nor built from a seed."""
-    return model is not None and not Path(model).is_dir()
-
-
-def model_id(cfg: Preset) -> str | None:
-    """A preset's model: its folder, or the hub's name with the revision."""
-    return _named(cfg.model, cfg.revision)
-
-
-def image_model_id(cfg: RetrieverConfig) -> str | None:
-    """The same of what embeds frames alone."""
-    return _named(cfg.image_model, cfg.image_revision)
-
-
-def _named(model: str | None, revision: str | None) -> str | None:
-    at = f"@{revision}" if is_hub_model(model) and revision else ""
-    return model and f"{model}{at}"
-
-
-def based(folder: Path, cfg: Preset) -> Preset:
-    """A run's preset with the commit that the run has noted of its hub's base, where there is a
-    note: whatever the hub has by then, the run goes on, and is measured, over the same weights."""
-    note = folder / BASE
-    there = json.loads(note.read_text()) if note.exists() else ""
-    name, _, commit = there.rpartition("@")
-    return replace(cfg, revision=commit) if name and name == cfg.model else cfg
-
-
-def note_base(folder: Path, cfg: Preset) -> None:
-    """Note in a run's folder which weights it is trained over, a hub's by name and commit, others
-    by their hash, and hold these to an earlier note: a run that goes on goes on over the same."""
-    check_base(folder, cfg)
-    if not is_hub_model(cfg.model):
-        write_json(folder / BASE, weights_digest(cfg.model))
-    elif cfg.revision:
-        write_json(folder / BASE, model_id(cfg))
-
-
-def note_data(folder: Path, store: Store, *told: Iterable[str]) -> None:
-    """Note in a run's folder a hash of what it learns from, and hold it to an earlier note.
-
-    Args:
-        told: texts in which everything shows that the benchmark does not hold, in their order.
-
-    Raises:
-        UserError: the run was begun on other data.
-    """
-    whole = hashlib.sha256(store.identity.encode())
-    for texts in told:
-        for text in texts:
-            whole.update(hashlib.sha256(text.encode()).digest())
-    digest = whole.hexdigest()[:16]
-    note = folder / DATA
-    if note.exists() and json.loads(note.read_text()) != digest:
-        raise UserError(
-            f"{folder} was begun on other data than {store.folder} holds now: the benchmark, its "
-            "rationales or how they are told have changed. Put those back, or train in a run of "
-            "its own (run=NAME)"
-        )
-    write_json(note, digest)
-
-
-def check_base(folder: Path, cfg: Preset) -> None:
-    """Raises UserError where a run's base is in a folder, and not the one that it was trained
-    over."""
-    note = folder / BASE
-    if is_hub_model(cfg.model) or not note.exists():
-        return
-    if json.loads(note.read_text()) != weights_digest(cfg.model):
-        raise UserError(
-            f"the weights in {cfg.model} are not those that {folder} is trained over: put those "
-            "back, or delete that run and train again"
         )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from typing import TypeVar
 
@@ -32,6 +33,30 @@ def from_main(make: Callable[[], Made]) -> Made:
     torch.distributed.broadcast_object_list(made, src=0, group=waiting)
     torch.distributed.destroy_process_group(waiting)
     return made[0]
+
+
+@contextmanager
+def main_first() -> Iterator[None]:
+    """Run a block on the main rank first; the others wait as long as it takes, then run it too.
+
+    Work that is kept on disk is thus done once, and every rank reads the result from there.
+    """
+    if ranks() == 1:
+        yield
+        return
+    import torch
+    from accelerate import PartialState
+
+    # This also assigns each rank its GPU.
+    PartialState(cpu=not torch.cuda.is_available())
+    # A separate group with its own timeout: a rank that waits this long in a step has lost another.
+    group = torch.distributed.new_group(backend="gloo", timeout=PATIENCE)
+    if rank() > 0:
+        torch.distributed.barrier(group)
+    yield
+    if rank() == 0:
+        torch.distributed.barrier(group)
+    torch.distributed.destroy_process_group(group)
 
 
 def accumulation_steps(batch: int, micro_batch: int) -> int:

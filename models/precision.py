@@ -1,32 +1,16 @@
-"""What a model computes in."""
+"""The precision of a model's passes."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import torch
-
-from conf.runs import rank, write_json
-
-PRECISION = "precision.json"
-
-
-def of_run(folder: Path, precision: str) -> str:
-    """`settled` once for a run in `folder`, which notes it: on another machine too it goes on in
-    what it was begun in."""
-    note = folder / PRECISION
-    if note.exists():
-        return json.loads(note.read_text())
-    found = resolve_precision(precision)
-    if rank() == 0:
-        write_json(note, found)
-    return found
 
 
 def resolve_precision(precision: str) -> str:
-    """bf16 or fp32; `auto` is bf16 where this machine has instructions for it. A CPU without them
-    takes several times as long as in fp32."""
+    """Return bf16 or fp32 for bf16, fp32 or auto.
+
+    auto is bf16 where this machine has instructions for it: a CPU without them takes several times
+    as long in bf16 as in fp32.
+    """
     if precision != "auto":
         return precision
     return "bf16" if supports_bf16() else "fp32"

@@ -13,7 +13,7 @@ from yaml import YAMLError
 
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig
-from models.checks import based
+from models.resolved import pin_base, resolved_precision
 
 EXPORT = "export.json"
 """Stands in a folder that `train.export` wrote, and there only."""
@@ -93,7 +93,8 @@ def trained_settings(
         raise UserError(
             f"{config} is damaged or of another version of DynaPix ({first}); train again"
         ) from error
-    setattr(settings, product, based(folder, getattr(settings, product)))
+    setattr(settings, product, pin_base(folder, getattr(settings, product)))
+    settings.train.precision = resolved_precision(folder, settings.train.precision)
     return settings
 
 

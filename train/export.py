@@ -7,7 +7,7 @@ alone.
         modules.json and the modules' folders, of a retriever
         tokenizer and processor files
         README.md      the model card
-        config.yaml, run.json, metrics.json    the training run's own, base.json with adapters too
+        config.yaml, resolved.yaml, run.json, metrics.json    the training run's own
         export.json    what was exported, and how far what it gives is from what was trained
 
 The folder is written beside and renamed when it is whole.
@@ -70,8 +70,7 @@ def main(cfg: ExportModelCommand, run: Run) -> Measured:
     trained = find(cfg)
 
     from data.store import digest
-    from models.checks import check_base
-    from models.precision import of_run
+    from models.resolved import check_base
     from models.trained_runs import EXPORT, export_record
     from train.common.model_card import text
 
@@ -79,8 +78,6 @@ def main(cfg: ExportModelCommand, run: Run) -> Measured:
     if not adapters.exists():
         raise UserError(f"{trained.saved} holds no adapters: delete the run and train again")
     check_base(trained.folder, trained.preset)
-    train = trained.settings.train
-    train.precision = of_run(trained.folder, train.precision)
     weights = digest(adapters)
     folder = run.folder / trained.product
     if folder.exists():
@@ -149,11 +146,11 @@ def renamed_when_whole(folder: Path) -> Iterator[Path]:
 
 def write_adapter(trained: Trained, folder: Path) -> Measured:
     """Copy the adapters and the processor, and the hash of the base that they were trained over."""
-    from models.checks import BASE
+    from models.resolved import RESOLVED
 
     shutil.copytree(trained.saved, folder, dirs_exist_ok=True)
-    if (trained.folder / BASE).exists():
-        shutil.copy(trained.folder / BASE, folder)
+    if (trained.folder / RESOLVED).exists():
+        shutil.copy(trained.folder / RESOLVED, folder)
     return {}
 
 

@@ -26,7 +26,7 @@ from conf.compose import compose
 from conf.schema import SelectCommand, SftCommand
 from data.records import FAMILIES
 from data.store import open_store
-from models.checks import weights_digest
+from models.fingerprints import weights_digest
 
 LETTERS = Path(__file__).with_name("letters.parquet")
 MODES = {

@@ -18,8 +18,9 @@ from evaluation.generators import local, openai_server
 from evaluation.generators.response_log import RECORD_MODES, Respond, SaveResponses, Subject
 from evaluation.generators.response_schema import instruction as record_instruction
 from evaluation.generators.response_schema import schema
-from models import checks, loading, memory
+from models import fingerprints, loading, memory
 from models.precision import resolve_precision
+from models.resolved import check_base
 from models.student.generation import response_token_limit
 from models.student.prompts import Sample, instructed_sample, instruction
 from models.trained_runs import product_folder, run_title
@@ -77,9 +78,9 @@ def model_here(
     """
     weights = None
     if folder is None:
-        student = checks.pin_revisions(student)
+        student = fingerprints.pin_revisions(student)
     else:
-        checks.check_base(folder, student)
+        check_base(folder, student)
         weights = product_folder(folder, "student")
 
     @cache
@@ -98,8 +99,8 @@ def model_here(
         return answer
 
     revision = {
-        "weights": checks.weights_digest(checks.model_id(student), weights),
-        "processor": checks.processor_digest(weights or checks.model_id(student)),
+        "weights": fingerprints.weights_digest(fingerprints.model_id(student), weights),
+        "processor": fingerprints.processor_digest(weights or fingerprints.model_id(student)),
         "revision": student.revision,
         "quantization": student.quantization,
         "precision": precision,
@@ -147,8 +148,8 @@ def model_served(
             seen,
         )
     told["revision"] = student.revision
-    told["weights"] = checks.weights_digest(told["root"], told["parent"], weights)
-    told["processor"] = checks.processor_digest(seen)
+    told["weights"] = fingerprints.weights_digest(told["root"], told["parent"], weights)
+    told["processor"] = fingerprints.processor_digest(seen)
 
     def say(mode: str, sample_of: SampleOf) -> Respond:
         def answer(things: list[Subject], keep: SaveResponses) -> None:

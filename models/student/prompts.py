@@ -170,7 +170,7 @@ def instructed_sample(
 def text_sample(
     frames: Frames, cfg: StudentConfig, mode: str, thing: RetrievalQuery | FrameRef
 ) -> Sample:
-    """A query's prefix and question, or a frame, with what is asked of it in a mode of `TEXT_INSTRUCTIONS`."""
+    """A prompt of `TEXT_INSTRUCTIONS` about a query (its prefix and question) or about a frame."""
     name, asked = f"{thing.name} ({mode})", f"\n{TEXT_INSTRUCTIONS[mode]}"
     if isinstance(thing, FrameRef):
         pixels = frames.array(thing.scene_id, thing.frame)

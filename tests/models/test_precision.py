@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from models.precision import of_run, resolve_precision
+from models.precision import resolve_precision
 
 
 @pytest.mark.parametrize("named", ["bf16", "fp32"])
@@ -23,11 +23,3 @@ def test_a_cpu_computes_in_what_it_has_instructions_for(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: instructions)
     assert resolve_precision("auto") == expected
-
-
-def test_a_run_goes_on_in_what_it_was_begun_in(monkeypatch, tmp_path) -> None:
-    monkeypatch.setattr("models.precision.supports_bf16", lambda: True)
-    assert of_run(tmp_path, "auto") == "bf16"
-    monkeypatch.setattr("models.precision.supports_bf16", lambda: False)
-    assert of_run(tmp_path, "auto") == "bf16"
-    assert resolve_precision("auto") == "fp32"

@@ -10,7 +10,8 @@ from huggingface_hub import ModelCardData
 
 from conf.multirun.summary import AT_START_SUFFIX
 from conf.schema import ContrastiveCommand, RetrieverConfig, SftCommand, StudentConfig
-from models.checks import BASE, is_hub_model
+from models.fingerprints import is_hub_model
+from models.resolved import read_resolved
 from train.common.journal import BEST_STEP
 
 SHOWN_PACKAGES = ("torch", "transformers", "sentence-transformers", "peft", "bitsandbytes")
@@ -100,8 +101,8 @@ def _training(settings: Settings, folder: Path) -> Iterable[tuple[str, str]]:
     student = isinstance(settings, SftCommand)
     record = json.loads((folder / "run.json").read_text())
     yield "base", f"{preset.model}{f' at {preset.revision}' if preset.revision else ''}"
-    if not is_hub_model(preset.model) and (folder / BASE).exists():
-        yield "hash of the base's weights", json.loads((folder / BASE).read_text())
+    if not is_hub_model(preset.model) and (resolved := read_resolved(folder)):
+        yield "hash of the base's weights", resolved["base"]
     yield "quantisation of the base", preset.quantization
     lora = preset.lora
     yield "adapters", f"LoRA of rank {lora.rank}, alpha {lora.alpha}, dropout {lora.dropout}"

@@ -30,9 +30,9 @@ from data.records import RetrievalQuery
 from data.render.frame_cache import Frames
 from data.store import Store
 from data.tracks.retrieval.checks import check_training
-from models import checks, distributed, memory
+from models import distributed, memory
 from models.lora_kernels import fuse
-from models.precision import of_run
+from models.resolved import data_digest, resolve_run
 from models.retriever import embedder
 from models.retriever.embedder import ADAPTERS, Retriever
 from train.common import checkpoints, journal, training_loop
@@ -56,18 +56,14 @@ def train_retriever(
     """Train a retriever in its run's folder and give what it measured there. `share` is a rank's
     part of a step's queries."""
     memory.keep_freed_memory()
-    cfg.train.precision = of_run(run.folder, cfg.train.precision)
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
     training, validation = split(cfg, store)
-    preset = cfg.retriever
-    cfg.retriever = distributed.from_main(
-        lambda: checks.pin_revisions(checks.based(run.folder, preset))
-    )
-    log.info("loading retriever %s, to compute in %s", cfg.retriever.name, cfg.train.precision)
-    if rank() == 0:
-        checks.note_base(run.folder, cfg.retriever)
-        checks.note_data(run.folder, store, (q.query_id for q in (*training, *validation)))
+    data = data_digest(store.identity, (q.query_id for q in (*training, *validation)))
+    with distributed.main_first():
+        precision, preset = resolve_run(run.folder, cfg.train.precision, cfg.retriever, data)
+    cfg = replace(cfg, retriever=preset, train=replace(cfg.train, precision=precision))
+    log.info("loading retriever %s, to compute in %s", preset.name, precision)
     frames = Frames(store, cfg.retriever.image_size)
     with training_loop.loading(run.folder, "retriever"):
         model = embedder.load_retriever(

@@ -52,6 +52,10 @@ class Samples(Dataset):
         return self._planned[index].make(self._epoch)
 
     @property
+    def texts(self) -> list[str]:
+        return [p.text for p in self._planned]
+
+    @property
     def families(self) -> list[str | None]:
         return [p.family for p in self._planned]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from data.render.frame_cache import Frames
 from data.store import Store
 from models import checks, distributed, loading, memory
 from models.lora_kernels import fuse
-from models.precision import of_run
+from models.resolved import data_digest, resolve_run
 from models.student.collator import Collator, letter_ids
 from train.common import checkpoints, journal, memory_probe, training_loop
 from train.common.audit import audit
@@ -43,15 +43,14 @@ def train_student(
 ) -> dict[str, float]:
     """Train a student in its run's folder and give what it measured there."""
     memory.keep_freed_memory()
-    cfg.train.precision = of_run(run.folder, cfg.train.precision)
     # Adapters are drawn before the trainer sets its seed.
     set_seed(cfg.seed)
-    cfg.student = distributed.from_main(
-        lambda: checks.pin_revisions(checks.based(run.folder, cfg.student))
-    )
+    training, validation = split(cfg, store, rationales)
+    data = data_digest(store.identity, training.texts)
+    with distributed.main_first():
+        precision, student = resolve_run(run.folder, cfg.train.precision, cfg.student, data)
+    cfg = replace(cfg, student=student, train=replace(cfg.train, precision=precision))
     log.info("loading student %s, to compute in %s", cfg.student.name, cfg.train.precision)
-    if rank() == 0:
-        checks.note_base(run.folder, cfg.student)
     with training_loop.loading(run.folder, "student"):
         model, processor = loading.load_student(
             cfg.student, cfg.train.precision, lambda: dataset.corpus(store, rationales)
@@ -60,12 +59,8 @@ def train_student(
             # Else the trainer would only find later that it does not fit.
             model.to(PartialState(cpu=not torch.cuda.is_available()).device)
     fuse(model)
-    training, validation = split(cfg, store, rationales)
     ways = ways_of(cfg, model, processor)
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
-    if rank() == 0:
-        accepted = (text for r in rationales for text in (r.item_id, r.text))
-        checks.note_data(run.folder, store, accepted, map(str, lengths))
     longest = training[lengths.index(max(lengths))]
     log.info(audit(model, processor, cfg.student, longest, ways.collator))
     train = memory_probe.settle(cfg.train, run.folder, model, ways.packs, training, lengths)

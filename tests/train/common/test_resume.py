@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from sentence_transformers import SentenceTransformerTrainer
 from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import LateConfig, LoraConfig, RetrieverConfig, SftCommand, StudentConfig
-from models.checks import based, check_base, image_model_id, model_id, note_base, pin_revisions
+from conf.schema import LateConfig, LoraConfig, SftCommand
+from tests.user_errors import raises_user_error
 from train import contrastive, sft
 from train.common.checkpoints import newest_checkpoint
 from train.common.journal import read_journal
@@ -85,7 +85,7 @@ def test_a_run_does_not_go_on_with_other_data(sft_settings, tmp_path, monkeypatc
     monkeypatch.setattr(
         dataset, "supervised_items", lambda *given: {m: s[:-1] for m, s in told(*given).items()}
     )
-    with pytest.raises(UserError, match=r"was begun on other data than .*run=NAME"):
+    with raises_user_error("other-data"):
         sft.main.__wrapped__(sft_settings, killed)
     assert not (killed.folder / "student").exists()
 
@@ -164,63 +164,6 @@ def test_a_run_killed_after_its_last_step_takes_no_other(sft_settings, tmp_path)
     again = load_file(weights)
     assert all(torch.equal(again[name], weight) for name, weight in kept.items())
     assert newest_checkpoint(tmp_path).name == "checkpoint-2"
-
-
-def test_a_run_holds_to_its_base(saved_base, tmp_path) -> None:
-    base = tmp_path / "base"
-    shutil.copytree(saved_base, base)
-    cfg = StudentConfig(name="own", model=str(base))
-    note_base(tmp_path, cfg)
-    check_base(tmp_path, cfg)
-    weights = load_file(base / "model.safetensors")
-    changed = {name: weight + 1e-3 for name, weight in weights.items()}
-    save_file(changed, base / "model.safetensors", metadata={"format": "pt"})
-    with pytest.raises(UserError, match="are not those that"):
-        check_base(tmp_path, cfg)
-
-
-def test_a_run_holds_to_the_commit_of_a_hubs_base(tmp_path, monkeypatch) -> None:
-    """A hub's name stands for other weights once its owner changes them: what a run began over, it
-    goes on over, and is measured over."""
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    cached, commits = tmp_path / "models--lab--base", ("a" * 40, "b" * 40)
-    for commit in commits:
-        (cached / "snapshots" / commit).mkdir(parents=True)
-        (cached / "snapshots" / commit / "config.json").write_text("{}")
-    (cached / "refs").mkdir()
-    (cached / "refs" / "main").write_text(commits[0])
-    cfg = RetrieverConfig(name="own", model="lab/base")
-    first = pin_revisions(based(tmp_path, cfg))
-    assert (first.revision, model_id(first)) == (commits[0], f"lab/base@{commits[0]}")
-    note_base(tmp_path, first)
-    (cached / "refs" / "main").write_text(commits[1])
-    assert pin_revisions(cfg).revision == commits[1]
-    assert pin_revisions(based(tmp_path, cfg)) == first
-    # A preset's own revision is one by which it is known.
-    assert pin_revisions(replace(cfg, revision=commits[0])) == first
-    # What embeds frames alone has a commit of its own.
-    two = pin_revisions(replace(cfg, image_model="lab/base", image_revision=commits[0]))
-    assert (model_id(two), image_model_id(two)) == tuple(f"lab/base@{c}" for c in reversed(commits))
-    # Another model of the settings is another base.
-    other = replace(cfg, model="lab/other")
-    assert based(tmp_path, other) == other
-
-
-def test_a_base_that_is_away_for_a_while_leaves_its_note(saved_base, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
-    base = tmp_path / "base"
-    shutil.copytree(saved_base, base)
-    cfg = StudentConfig(name="own", model=str(base))
-    note_base(tmp_path, cfg)
-    noted = (tmp_path / "base.json").read_text()
-    base.rename(tmp_path / "away")
-    # What loads it tells that it is gone.
-    note_base(tmp_path, pin_revisions(based(tmp_path, cfg)))
-    assert (tmp_path / "base.json").read_text() == noted
-    (tmp_path / "away").rename(base)
-    check_base(tmp_path, cfg)
 
 
 def test_a_batch_beyond_the_queries_is_refused(contrastive_settings, tmp_path) -> None:

@@ -44,8 +44,7 @@ def refused(settings: ContrastiveCommand, folder: Path, said: str) -> None:
     folder.mkdir()
     with pytest.raises(UserError, match=said):
         contrastive.main.__wrapped__(settings, Run("run", folder))
-    notes = {"base.json", "data.json", "precision.json"}
-    assert {p.name for p in folder.iterdir()} <= {"untrained", *notes}
+    assert {p.name for p in folder.iterdir()} <= {"untrained", "resolved.yaml"}
 
 
 def twice(rows: Rows) -> Rows:

@@ -29,7 +29,8 @@ from conf.schema import (
     RetrieverConfig,
 )
 from evaluation import retrieve
-from models import checks, loading
+from models import loading
+from models.resolved import resolve_run
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
 from train import export
 from train.retriever.merge import RetrieverOutputs, compare, rows_of
@@ -52,7 +53,7 @@ def runs(settings, tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("checkpoints")
     folder = root / "contrastive" / "run"
     open_run(Run("run", folder), asdict(settings), "train.contrastive", [])
-    checks.note_base(folder, settings.retriever)
+    resolve_run(folder, "fp32", settings.retriever, data="0")
     torch.manual_seed(0)
     model = load_retriever(settings.retriever, "fp32", [], folder)
     with torch.no_grad():

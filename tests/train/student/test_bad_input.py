@@ -32,7 +32,7 @@ from conf.schema import (
     StudentConfig,
 )
 from evaluation import select
-from models import checks, loading
+from models import loading, resolved
 from models.retriever import embedder
 from models.tiny_qwen3_vl import build_model
 from teacher.narrate import JOURNAL_FILE, ensure_rationales
@@ -89,13 +89,13 @@ def test_adapters_of_another_base_are_told(settings, trained, wider, saved_base,
     with pytest.raises(UserError, match=r"another base than .* 64 wide there and 128 here"):
         loading.load_trained(over, "fp32", trained / "student")
     with pytest.raises(UserError, match=r"are not those that .* is trained over"):
-        checks.check_base(trained, over)
+        resolved.check_base(trained, over)
     shutil.copytree(trained / "checkpoint-1", tmp_path / "checkpoint-1")
     with pytest.raises(UserError, match="checkpoint-1 holds adapters of another base than"):
         sft.main.__wrapped__(replace(settings, student=over), Run("run", tmp_path))
     # The same base elsewhere is the same base.
     shutil.copytree(saved_base, tmp_path / "moved")
-    checks.check_base(trained, replace(over, model=str(tmp_path / "moved")))
+    resolved.check_base(trained, replace(over, model=str(tmp_path / "moved")))
 
 
 @pytest.mark.slow

@@ -30,7 +30,8 @@ from conf.schema import (
     TeacherConfig,
 )
 from evaluation import select
-from models import checks, loading
+from models import loading
+from models.resolved import resolve_run
 from models.student.collator import encode
 from models.student.prompts import selection_sample
 from models.trained_runs import run_title, trained_settings
@@ -55,7 +56,7 @@ def finished_run(settings: SftCommand, root: Path) -> Path:
     """A run of train.sft as it ends, with adapters that weigh as much as their base."""
     folder = root / "sft" / "run"
     open_run(Run("run", folder), asdict(settings), "train.sft", [])
-    checks.note_base(folder, settings.student)
+    resolve_run(folder, "fp32", settings.student, data="0")
     torch.manual_seed(0)
     model, processor = loading.load_student(settings.student, settings.train.precision, list)
     with torch.no_grad():
@@ -294,6 +295,10 @@ def test_differences_are_shares_of_the_logits_size() -> None:
     assert math.isnan(merge.compare(before, broken)["answer_logit_difference"])
 
 
+def other_base(path: Path) -> None:
+    path.write_text("precision: fp32\nbase: other\ndata: x")
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -301,7 +306,10 @@ def test_differences_are_shares_of_the_logits_size() -> None:
         (lambda run: shutil.rmtree(run), r"run=.*sft/run is no run folder"),
         (lambda run: whole(run / "config.yaml"), r"trained the whole model .*lora\.rank=0"),
         (lambda run: (run / "student" / "adapter_model.safetensors").unlink(), "no adapters"),
-        (lambda run: (run / "base.json").write_text('"other"'), "are not those that"),
+        (
+            lambda run: (run / "resolved.yaml").write_text("precision: fp32\nbase: other\ndata: x"),
+            "are not those that",
+        ),
     ],
 )
 def test_what_cannot_be_exported_is_told(settings, runs, tmp_path, damage, said) -> None:

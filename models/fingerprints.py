@@ -1,0 +1,134 @@
+"""Digests of a model's weights and processor, and the commits of models from the hub.
+
+A measurement or a resumed run is only valid for the model that it began with. A folder is
+identified by a digest of its files, a model of the hub by its name and commit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+from conf.schema import RetrieverConfig, StudentConfig
+
+Preset = TypeVar("Preset", StudentConfig, RetrieverConfig)
+
+BLOCK = 1 << 12
+"""Bytes of each tensor that enter the digest."""
+PROCESSOR_FILES = (
+    "*processor_config.json",
+    "*token*.json",
+    "chat_template*",
+    "additional_chat_templates/*",
+    "merges.txt",
+    "sentence_bert_config.json",
+    "tokenizer.model",
+    "vocab.*",
+)
+"""Files that define how text and pixels become a model's input."""
+
+
+def weights_digest(*models: str | Path | None) -> str:
+    """Return a short hash of the weights of several models.
+
+    A folder contributes the name and size of each safetensors file, the names and shapes of its
+    tensors, and a block from the middle of each tensor: training or merging changes every entry of
+    a tensor, so a block suffices. The folder's location does not matter. The name of a hub model
+    (with or without its commit) contributes as a string.
+    """
+    whole = hashlib.sha256()
+    for k, model in enumerate(models):
+        folder = model is not None and Path(model).is_dir()
+        whole.update(f"{k} {'' if folder else model}".encode())
+        for path in sorted(Path(model).rglob("*.safetensors")) if folder else []:
+            whole.update(f"{path.name} {path.stat().st_size}".encode())
+            with open(path, "rb") as file:
+                _hash_tensors(file, whole)
+    return whole.hexdigest()[:16]
+
+
+def _hash_tensors(file: BinaryIO, whole: Any) -> None:
+    """Hash the header of a safetensors file and a block of each of its tensors."""
+    size = os.fstat(file.fileno()).st_size
+    header = file.read(min(size, int.from_bytes(file.read(8), "little")))
+    whole.update(header)
+    try:
+        tensors = [
+            entry for name, entry in sorted(json.loads(header).items()) if name != "__metadata__"
+        ]
+        offsets = [(int(begin), int(end)) for begin, end in (t["data_offsets"] for t in tensors)]
+    except (ValueError, TypeError, KeyError, AttributeError):
+        # Loading the file reports the damage.
+        offsets = []
+    for begin, end in offsets:
+        size = max(0, min(BLOCK, end - begin))
+        file.seek(max(0, 8 + len(header) + (begin + end - size) // 2))
+        whole.update(file.read(size))
+
+
+def processor_digest(model: str | Path | None) -> str:
+    """Return a short hash of a folder's tokenizer, processor and chat template files. The name of a
+    hub model is hashed as a string."""
+    whole = hashlib.sha256()
+    if model is None or not Path(model).is_dir():
+        whole.update(f"{model}".encode())
+        return whole.hexdigest()[:16]
+    for path in sorted({p for pattern in PROCESSOR_FILES for p in Path(model).rglob(pattern)}):
+        whole.update(f"{path.relative_to(model)} {path.stat().st_size} ".encode())
+        whole.update(path.read_bytes())
+    return whole.hexdigest()[:16]
+
+
+def pin_revisions(cfg: Preset) -> Preset:
+    """Return a preset whose hub models have their current commit as revision.
+
+    The owner of a hub model can replace its weights under the same name. A commit in the local
+    cache takes precedence. If no commit can be determined the preset is returned unchanged, and
+    loading the model reports the reason.
+    """
+    commits = {}
+    for model, revision in (("model", "revision"), ("image_model", "image_revision")):
+        if is_hub_model(name := getattr(cfg, model, None)):
+            requested = getattr(cfg, revision)
+            commits[revision] = _commit(name, requested) or requested
+    return replace(cfg, **commits)
+
+
+def _commit(model: str, revision: str | None) -> str | None:
+    from huggingface_hub import model_info, try_to_load_from_cache
+
+    try:
+        # A repository of adapters has no config.json.
+        for file in ("config.json", "adapter_config.json"):
+            cached = try_to_load_from_cache(model, file, revision=revision)
+            if isinstance(cached, str):
+                # The cache stores files in a folder named after the commit.
+                return Path(cached).parent.name
+        return model_info(model, revision=revision, timeout=10).sha
+    except Exception:
+        # The hub's client raises the errors of whichever HTTP library is installed.
+        return None
+
+
+def is_hub_model(model: str | None) -> bool:
+    """Whether a preset's model comes from the hub, not from a folder or from an architecture."""
+    return model is not None and not Path(model).is_dir()
+
+
+def model_id(cfg: Preset) -> str | None:
+    """Return a preset's model: its folder, or NAME@COMMIT of the hub."""
+    return _id(cfg.model, cfg.revision)
+
+
+def image_model_id(cfg: RetrieverConfig) -> str | None:
+    """Return the same for the model that embeds frames, where a retriever has a separate one."""
+    return _id(cfg.image_model, cfg.image_revision)
+
+
+def _id(model: str | None, revision: str | None) -> str | None:
+    commit = f"@{revision}" if is_hub_model(model) and revision else ""
+    return model and f"{model}{commit}"

@@ -1,0 +1,111 @@
+"""A run keeps the precision, the base and the data that it started with."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import pytest
+from safetensors.torch import load_file, save_file
+
+from conf.schema import RetrieverConfig, StudentConfig
+from models.fingerprints import image_model_id, model_id, pin_revisions
+from models.precision import resolve_precision
+from models.resolved import (
+    RESOLVED,
+    check_base,
+    data_digest,
+    pin_base,
+    read_resolved,
+    resolve_run,
+    resolved_precision,
+)
+from tests.user_errors import raises_user_error
+
+
+@pytest.fixture
+def base(saved_base, tmp_path) -> StudentConfig:
+    """A student over a copy of the saved base."""
+    shutil.copytree(saved_base, tmp_path / "base")
+    return StudentConfig(name="own", model=str(tmp_path / "base"))
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    """An offline cache of lab/base with two commits; returns the file that names the current."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    cached = tmp_path / "models--lab--base"
+    for commit in ("a" * 40, "b" * 40):
+        (cached / "snapshots" / commit).mkdir(parents=True)
+        (cached / "snapshots" / commit / "config.json").write_text("{}")
+    (cached / "refs").mkdir()
+    (cached / "refs" / "main").write_text("a" * 40)
+    return cached / "refs" / "main"
+
+
+def test_a_resumed_run_keeps_its_precision(base, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("models.precision.supports_bf16", lambda: True)
+    assert resolve_run(tmp_path, "auto", base, "x") == ("bf16", base)
+    monkeypatch.setattr("models.precision.supports_bf16", lambda: False)
+    assert resolve_run(tmp_path, "auto", base, "x") == ("bf16", base)
+    assert resolved_precision(tmp_path, "auto") == "bf16"
+    assert resolve_precision("auto") == "fp32"
+    assert resolved_precision(tmp_path / "nowhere", "auto") == "auto"
+
+
+def test_other_data_are_refused(base, tmp_path) -> None:
+    first = data_digest("store", ["a", "b"])
+    assert first != data_digest("store", ["b", "a"]) != data_digest("other", ["a", "b"])
+    resolve_run(tmp_path, "fp32", base, first)
+    with raises_user_error("other-data", contains=str(tmp_path)):
+        resolve_run(tmp_path, "fp32", base, data_digest("store", ["a"]))
+
+
+def test_other_weights_in_the_base_are_refused(base, tmp_path) -> None:
+    resolve_run(tmp_path, "fp32", base, "x")
+    check_base(tmp_path, base)
+    path = tmp_path / "base" / "model.safetensors"
+    changed = {name: weight + 1e-3 for name, weight in load_file(path).items()}
+    save_file(changed, path, metadata={"format": "pt"})
+    for attempt in (check_base, lambda f, cfg: resolve_run(f, "fp32", cfg, "x")):
+        with raises_user_error("other-base", contains=base.model):
+            attempt(tmp_path, base)
+
+
+def test_a_run_keeps_the_commit_of_a_hub_base(tmp_path, hub) -> None:
+    """The owner of a hub model may replace its weights under the same name."""
+    cfg = RetrieverConfig(name="own", model="lab/base")
+    _, first = resolve_run(tmp_path, "fp32", cfg, "x")
+    assert (first.revision, model_id(first)) == ("a" * 40, f"lab/base@{'a' * 40}")
+    hub.write_text("b" * 40)
+    assert pin_revisions(cfg).revision == "b" * 40
+    assert resolve_run(tmp_path, "fp32", cfg, "x")[1] == first == pin_base(tmp_path, cfg)
+    # A revision in the preset takes precedence over the current commit.
+    assert pin_revisions(replace(cfg, revision="a" * 40)) == first
+    two = pin_revisions(replace(cfg, image_model="lab/base", image_revision="a" * 40))
+    assert (model_id(two), image_model_id(two)) == (f"lab/base@{'b' * 40}", f"lab/base@{'a' * 40}")
+    other = replace(cfg, model="lab/other")
+    assert pin_base(tmp_path, other) == other
+
+
+def test_a_missing_base_leaves_the_resolved_values(base, tmp_path, hub) -> None:
+    """Loading the base reports that it is missing."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (tmp_path / "base").rename(tmp_path / "away")
+    resolve_run(folder, "fp32", base, "x")
+    assert not (folder / RESOLVED).exists()
+    (tmp_path / "away").rename(tmp_path / "base")
+    resolve_run(folder, "fp32", base, "x")
+    before = read_resolved(folder)
+    (tmp_path / "base").rename(tmp_path / "away")
+    resolve_run(folder, "fp32", base, "x")
+    assert read_resolved(folder) == before
+
+
+@pytest.mark.parametrize("content", ["[", "3", "precision: bf16"])
+def test_a_damaged_file_is_refused(tmp_path, content) -> None:
+    (tmp_path / RESOLVED).write_text(content)
+    with raises_user_error("damaged-file", contains=RESOLVED):
+        read_resolved(tmp_path)
