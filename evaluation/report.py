@@ -20,16 +20,16 @@ PAGE = "report.html"
 
 @command("evaluation.report", ReportCommand)
 def main(cfg: ReportCommand, run: Run) -> None:
-    from evaluation.reporting.page.runs import gather
+    from evaluation.reporting.runs import gather
 
     root = Path(cfg.checkpoints)
     runs = gather(root, cfg.runs)
 
-    from evaluation.reporting.page.checks import browser_of
-    from evaluation.reporting.page.page import write_page
-    from evaluation.reporting.page.run_responses import check_same_build, check_same_rankings
-    from evaluation.reporting.page.run_rows import once, read_rows
-    from evaluation.reporting.page.sections import sections_of
+    from evaluation.reporting.checks import browser_of
+    from evaluation.reporting.measurements import once, read_rows
+    from evaluation.reporting.page import write_page
+    from evaluation.reporting.run_responses import check_same_build, check_same_rankings
+    from evaluation.reporting.sections import sections_of
 
     choices, ranks = read_rows(runs, root)
     check_same_build(m.run for m in (*choices, *ranks))

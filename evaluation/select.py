@@ -35,7 +35,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 
     from data.render.frame_cache import Frames
     from evaluation.generators import model_source, response_log
-    from evaluation.reporting import selection_results
+    from evaluation.reporting import selection_report
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = Frames(store, student.image_size)
@@ -61,7 +61,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
             keys[mode, control] = journal.keys[mode]
 
     about = {"build": store.identity, "asked": [[*how, key] for how, key in keys.items()]}
-    metrics = selection_results.write_report(
+    metrics = selection_report.write_report(
         given, items, model.name, store.name, cfg, run.folder, about
     )
     letter = given[modes[0], cfg.control][0].letter

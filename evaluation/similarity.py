@@ -35,8 +35,8 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from evaluation.metrics.breakdown import accuracy_by_subtype, selection_row
     from evaluation.metrics.calibration import measure_position_bias
     from evaluation.metrics.significance import compare_anchors
-    from evaluation.reporting import figures, paper, tables
-    from evaluation.reporting.rows import SIMILARITY
+    from evaluation.reporting import figures, reference, tables
+    from evaluation.reporting.results import SIMILARITY
     from evaluation.retrieval import nearest_candidate
     from evaluation.select import select_items
     from models.precision import resolve_precision
@@ -78,7 +78,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         "positions": {n: asdict(found) for n, found in letters.items()},
     }
     write_text(run.folder / "report.json", json.dumps(report, indent=1))
-    figures.selection_figure(rows, run.folder / "selection.png", suite == paper.SUITE)
+    figures.selection_figure(rows, run.folder / "selection.png", suite == reference.SUITE)
     first = rows[0]
     metrics = {family: found.value for family, found in first.families.items()}
     return metrics | {"macro": first.macro, "micro": first.micro.value}

@@ -46,9 +46,9 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from data.render.frame_cache import Frames
     from evaluation.embedders.embed import embedders
     from evaluation.generators.model_source import open_generator
-    from evaluation.metrics import breakdown
-    from evaluation.reporting import paper, tables
-    from evaluation.reporting.rows import UNTRAINED
+    from evaluation.metrics.accuracy import breakdown
+    from evaluation.reporting import reference, tables
+    from evaluation.reporting.results import UNTRAINED
     from evaluation.retrieval import predicted_texts, standard_test, text_matching
     from models.precision import resolve_precision
     from models.student.prompts import text_sample
@@ -82,10 +82,10 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         metrics |= {f"{key}_{m}": i.value for m, i in found[0].measures.items() if m != "tie_rate"}
 
     told = {mode: predicted_texts.counts(of) for mode, of in written.items()}
-    reading = tables.reading_table(told, "What was written")
+    reading = tables.parsing_table(told, "What was written")
     also = {"build": store.identity, "indexes": [], "texts": told}
     standard_test.write_report(
-        run.folder, rows, curves, [reading], paper.RETRIEVAL_TWO_STAGE, **also
+        run.folder, rows, curves, [reading], reference.RETRIEVAL_TWO_STAGE, **also
     )
     write_text(run.folder / "matched.jsonl", "".join(json.dumps(m) + "\n" for m in matched))
     return metrics

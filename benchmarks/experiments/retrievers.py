@@ -23,7 +23,7 @@ from threading import Lock
 import pandas as pd
 
 from benchmarks.experiments.jobs import run, run_all
-from evaluation.reporting.rows import RetrievalRow
+from evaluation.reporting.results import RetrievalResult
 
 RANKS = Path(__file__).with_name("ranks.parquet")
 VARIANTS: dict[str, list[str]] = {
@@ -96,7 +96,7 @@ def train_and_evaluate(experiment: Experiment, job: tuple[str, int], threads: in
         model = experiment.checkpoints / "contrastive" / name
         run(["evaluation.retrieve", f"model={model}", *shared], threads)
     report = json.loads((evaluated / "report.json").read_text())
-    results = [RetrievalRow.from_dict(row) for row in report["rows"] if row["builder"] is None]
+    results = [RetrievalResult.from_dict(row) for row in report["rows"] if row["builder"] is None]
     rows = [
         {
             "benchmark": experiment.benchmark, "variant": variant, "seed": seed,

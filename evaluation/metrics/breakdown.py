@@ -11,10 +11,17 @@ import numpy as np
 
 from data.records import RetrievalQuery, SelectionItem
 from data.tracks.selection.time import CELLS
-from evaluation.metrics.accuracy import accuracy_by_family, accuracy_by_group
-from evaluation.metrics.intervals import Interval, SceneBootstrap, macro_by_scene
-from evaluation.metrics.ranking import expected_hits, query_metrics, summary
-from evaluation.reporting.rows import RECALLS, RetrievalRow, SelectionRow
+from evaluation.metrics.accuracy import (
+    Interval,
+    SceneBootstrap,
+    accuracy_by_family,
+    accuracy_by_group,
+    expected_hits,
+    macro_by_scene,
+    query_measures,
+    summary,
+)
+from evaluation.reporting.results import RECALLS, RetrievalResult, SelectionResult
 from evaluation.retrieval.exact_search import Ranks
 
 
@@ -28,7 +35,7 @@ def selection_row(
     seed: int,
     suite: str | None = None,
     control: str | None = None,
-) -> SelectionRow:
+) -> SelectionResult:
     """A row of the credit that each item was given, 1 for a right choice and 1/m for a tie among m.
     The scenes of macro's interval are drawn by `seed`."""
     families = [i.family for i in items]
@@ -37,7 +44,7 @@ def selection_row(
     horizons = accuracy_by_group([f"{CELLS[i.subtype]} s" for i, _ in timed], [c for _, c in timed])
     accuracy = accuracy_by_family(families, credits)
     told = (macro, horizons, suite, control)
-    return SelectionRow.of(benchmark, name, mode, accuracy, parse_rate, *told)
+    return SelectionResult.of(benchmark, name, mode, accuracy, parse_rate, *told)
 
 
 def accuracy_by_subtype(
@@ -49,7 +56,7 @@ def accuracy_by_subtype(
 
 def retrieval_rows(
     benchmark: str, name: str, ranks: Ranks, queries: Sequence[RetrievalQuery], seed: int
-) -> list[RetrievalRow]:
+) -> list[RetrievalResult]:
     """A row a width, widest first, over all queries, and then as many of each builder's. The scenes
     of the intervals are drawn by `seed`."""
     rows = []
@@ -57,11 +64,11 @@ def retrieval_rows(
         scenes = SceneBootstrap([queries[k].scene_id for k in of], seed)
         for k, width in enumerate(ranks.widths):
             counts = (ranks.greater[k, of], ranks.tied[k, of], ranks.found[k, of])
-            each = query_metrics(*counts, ranks.frames, RECALLS)
+            each = query_measures(*counts, ranks.frames, RECALLS)
             found = [_measured(measure, values, scenes) for measure, values in each.items()]
             sizes = (len(of), ranks.frames)
             cost = (ranks.bytes and ranks.bytes[k], ranks.seconds and ranks.seconds[k])
-            rows.append(RetrievalRow(benchmark, name, width, builder, *found, *sizes, *cost))
+            rows.append(RetrievalResult(benchmark, name, width, builder, *found, *sizes, *cost))
     return rows
 
 
@@ -77,7 +84,7 @@ def compare_retrievers(
     for right, other in others:
         for k, width in enumerate(one.widths):
             each = [
-                query_metrics(r.greater[k], r.tied[k], r.found[k], r.frames, RECALLS)
+                query_measures(r.greater[k], r.tied[k], r.found[k], r.frames, RECALLS)
                 for r in (one, other)
             ]
             names = [*(f"recall@{k}" for k in RECALLS), "mrr"]

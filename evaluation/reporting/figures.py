@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data.records import FAMILIES
-from evaluation.reporting import paper
-from evaluation.reporting.rows import RECALLS, UNTRAINED, RetrievalRow, SelectionRow
+from evaluation.reporting import reference as paper
+from evaluation.reporting.results import RECALLS, UNTRAINED, RetrievalResult, SelectionResult
 from train.common.curves import COLORS, empty_figure
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ NUMBERED = 6
 
 
 def selection_figure(
-    rows: Sequence[SelectionRow], path: Path | str, reference: bool = True
+    rows: Sequence[SelectionResult], path: Path | str, reference: bool = True
 ) -> None:
     """Bars of accuracy (%) by family with 95% Wilson whiskers, one colour a row of `rows`; the
     chance line; and, as a `reference`, the paper's reasoning student as hollow diamonds."""
@@ -70,7 +70,7 @@ def selection_figure(
     figure.savefig(path)
 
 
-def retrieval_figure(rows: Sequence[RetrievalRow], path: Path | str) -> None:
+def retrieval_figure(rows: Sequence[RetrievalResult], path: Path | str) -> None:
     """Recall@1, @10 and @50 (%) of all queries over embedding width, one panel each, in bands of
     their 95% intervals; untrained rows are dashed.
 
@@ -114,7 +114,7 @@ def retrieval_figure(rows: Sequence[RetrievalRow], path: Path | str) -> None:
 
 
 def builders_figure(
-    rows: Sequence[RetrievalRow], curves: Sequence[dict[str, Any]], path: Path | str
+    rows: Sequence[RetrievalResult], curves: Sequence[dict[str, Any]], path: Path | str
 ) -> None:
     """By builder, of the first retriever in `rows`: recall (%) over k at its widest width, and
     Recall@10 over width; all queries in black, with the band of their 95% interval.

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from data.records import FAMILIES, LETTERS
+from evaluation.metrics.accuracy import Interval
 from evaluation.metrics.calibration import Calibration, PositionBias
-from evaluation.metrics.intervals import Interval
 from evaluation.metrics.significance import PairedComparison
-from evaluation.reporting import paper
-from evaluation.reporting.rows import RECALLS, SIMILARITY, RetrievalRow, SelectionRow
+from evaluation.reporting import reference as paper
+from evaluation.reporting.results import RECALLS, SIMILARITY, RetrievalResult, SelectionResult
 from evaluation.reporting.table import Table
 
 SELECTION_HEAD = (*(f.capitalize() for f in FAMILIES), "Macro", "Micro", "Parsed", "Items")
@@ -19,11 +19,16 @@ RETRIEVAL_HEAD = ("Width", *_HEADS, "Queries", "Frames")
 PAPER = "paper (full benchmark)"
 
 
-def selection_table(rows: Sequence[SelectionRow], suite: str = paper.SUITE) -> Table:
+def selection_table(rows: Sequence[SelectionResult], suite: str = paper.SUITE) -> Table:
     """The rows, and below them, where the items are of the suite that the paper has by family, the
     paper's; in percent."""
     similar = paper.SELECTION_SIMILARITY if any(r.mode == SIMILARITY for r in rows) else ()
-    reference = (paper.CHANCE, *similar, *paper.SELECTION_DISTILLED, paper.HUMAN_MAJORITY)
+    reference = (
+        paper.CHANCE,
+        *similar,
+        *paper.SELECTION_DISTILLED,
+        paper.HUMAN_MAJORITY,
+    )
     own = {"": selection_cells(rows)}
     return Table(
         "selection",
@@ -39,7 +44,7 @@ SELECTION_NOTE = (
 )
 
 
-def selection_cells(rows: Sequence[SelectionRow]) -> list[list[str]]:
+def selection_cells(rows: Sequence[SelectionResult]) -> list[list[str]]:
     """Of each row, a line under `SELECTION_HEAD`, one with its intervals, and its time items by how
     far ahead they ask."""
     cells = []
@@ -164,7 +169,7 @@ def calibration_table(mode: str, found: Calibration) -> Table:
     return Table("calibration", caption, head, {"": cells}, (note,))
 
 
-def reading_table(reasons: dict[str, dict[str, int]], head: str = "Answers") -> Table:
+def parsing_table(reasons: dict[str, dict[str, int]], head: str = "Answers") -> Table:
     """How the answers of each mode could be read: counts by reason."""
     names = list(dict.fromkeys(name for counts in reasons.values() for name in counts))
     cells = [
@@ -176,7 +181,7 @@ def reading_table(reasons: dict[str, dict[str, int]], head: str = "Answers") -> 
 
 
 def retrieval_table(
-    rows: Sequence[RetrievalRow],
+    rows: Sequence[RetrievalResult],
     reference: Sequence[paper.RetrievalReference] = paper.RETRIEVAL_DISTILLED,
 ) -> Table:
     """The rows over all queries by width, widest first, each width's untrained row on top; then the
@@ -195,7 +200,7 @@ def retrieval_table(
 RETRIEVAL_NOTE = "Intervals are bootstrapped over scenes; a target that is not found is last."
 
 
-def retrieval_cells(rows: Sequence[RetrievalRow]) -> list[list[str]]:
+def retrieval_cells(rows: Sequence[RetrievalResult]) -> list[list[str]]:
     """Of each row, a line under `RETRIEVAL_HEAD` and one with its intervals."""
     cells = []
     for r in rows:
@@ -222,9 +227,9 @@ def retrieval_references(rows: Sequence[paper.RetrievalReference]) -> list[list[
     ]
 
 
-def ranks_apart_table(apart: Sequence[dict[str, Any]]) -> Table:
-    """What `evaluation.metrics.breakdown.compare_retrievers` tells: under the retrievers' names two lines
-    a width,
+def rank_differences_table(apart: Sequence[dict[str, Any]]) -> Table:
+    """What `evaluation.metrics.breakdown.compare_retrievers` gives: under the retrievers' names
+    two lines a width,
     the second with the intervals."""
     parts: dict[str, list[list[str]]] = {}
     for of in apart:
@@ -246,7 +251,7 @@ def _rank_gap(measure: str, m: dict[str, float]) -> tuple[str, str]:
     return value, f"{low} to {high}"
 
 
-def cost_table(rows: Sequence[RetrievalRow]) -> Table:
+def cost_table(rows: Sequence[RetrievalResult]) -> Table:
     """What the rows over all queries cost beside what they give, those that give most first."""
     every = [r for r in rows if r.builder is None]
     cells = [
@@ -268,7 +273,7 @@ def cost_table(rows: Sequence[RetrievalRow]) -> Table:
     return Table("costs", "What retrievers give and cost", head, {"": cells}, (note,))
 
 
-def builder_tables(rows: Sequence[RetrievalRow]) -> list[Table]:
+def builder_tables(rows: Sequence[RetrievalResult]) -> list[Table]:
     """A table for each retriever: by builder, at every width, with the intervals."""
     tables = []
     for name in dict.fromkeys(r.name for r in rows):
@@ -332,7 +337,10 @@ def human_table(found: dict[str, Any]) -> Table:
         own.append([f"Median seconds, {clock}", *shown, "", "", ""])
     reference = [
         [r.name, *map(_printed, (r.event, r.time, r.window, r.macro)), "", items]
-        for r, items in [*((r, "") for r in paper.HUMAN_ANNOTATORS), (paper.HUMAN_MAJORITY, "59")]
+        for r, items in [
+            *((r, "") for r in paper.HUMAN_ANNOTATORS),
+            (paper.HUMAN_MAJORITY, "59"),
+        ]
     ]
     seconds = [f"{paper.HUMAN_SECONDS[f]:.1f}" for f in FAMILIES]
     reference.append(["Median seconds", *seconds, "", "", ""])
@@ -363,14 +371,14 @@ def _agreed(value: float | None) -> str:
     return "undefined" if value is None else f"{value:.2f}"
 
 
-def _values(row: RetrievalRow) -> list[str]:
+def _values(row: RetrievalResult) -> list[str]:
     found = row.measures
     recalls = [_percent(found[f"recall@{k}"].value) for k in RECALLS]
     median, ties = f"{row.median_rank.value:g}", _percent(row.tie_rate.value)
     return [*recalls, f"{row.mrr.value:.3f}", median, ties]
 
 
-def _ranges(row: RetrievalRow) -> list[str]:
+def _ranges(row: RetrievalResult) -> list[str]:
     found = row.measures
     recalls = [interval_cell(found[f"recall@{k}"]) for k in RECALLS]
     mrr = f"{row.mrr.low:.2f}-{row.mrr.high:.2f}"

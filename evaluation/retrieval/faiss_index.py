@@ -23,7 +23,7 @@ import numpy as np
 from conf.errors import UserError
 from conf.runs import lock_folder, write_json
 from evaluation.embedders.cache import EmbeddingCache
-from evaluation.reporting.rows import RECALLS
+from evaluation.reporting.results import RECALLS
 from evaluation.retrieval.exact_search import Cut, Ranks, block_scores, least_of_top
 
 log = logging.getLogger(__name__)

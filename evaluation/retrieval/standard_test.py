@@ -17,8 +17,8 @@ from data.records import FrameRef, RetrievalQuery
 from data.store import Store
 from data.tracks.retrieval.checks import check_test
 from evaluation.embedders.cache import EmbeddingCache
-from evaluation.reporting import figures, paper, tables
-from evaluation.reporting.rows import RetrievalRow
+from evaluation.reporting import figures, reference, tables
+from evaluation.reporting.results import RetrievalResult
 from evaluation.reporting.table import Table
 from evaluation.retrieval.exact_search import Ranks, exact_ranks
 
@@ -74,10 +74,10 @@ def write_ranks(
 
 def write_report(
     folder: Path,
-    rows: Sequence[RetrievalRow],
+    rows: Sequence[RetrievalResult],
     curves: Sequence[dict[str, Any]],
     told: Sequence[Table] = (),
-    reference: Sequence[paper.RetrievalReference] = paper.RETRIEVAL_DISTILLED,
+    reference: Sequence[reference.RetrievalReference] = reference.RETRIEVAL_DISTILLED,
     **also: Any,
 ) -> None:
     """Write report.txt, report.json and the figures of some rows; `told` are more tables and `also`

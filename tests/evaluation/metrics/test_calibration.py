@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from evaluation.metrics.accuracy import wilson
 from evaluation.metrics.calibration import BINS, measure_calibration, measure_position_bias
-from evaluation.metrics.intervals import wilson_interval
-from evaluation.reporting.tables import calibration_table, position_table, reading_table
+from evaluation.reporting.tables import calibration_table, parsing_table, position_table
 
 
 def test_one_who_is_sure_and_right_is_calibrated():
@@ -25,7 +25,7 @@ def test_one_who_always_says_the_same_is_off_by_the_difference():
     # The Brier score is the outcome's variance and the square of the bias.
     assert found.brier == pytest.approx(0.65 * 0.35 + 0.15**2)
     [only] = found.bins
-    assert (only.accuracy.low, only.accuracy.high) == wilson_interval(13, 20)
+    assert (only.accuracy.low, only.accuracy.high) == wilson(13, 20)
 
 
 def test_one_who_knows_how_sure_to_be_comes_close_to_zero():
@@ -107,5 +107,5 @@ def test_tables_show_what_was_found():
     told = str(calibration_table("record", measure_calibration([0.81, 0.85], [1, 0])))
     assert "0.8 to 0.9 83.0 50.0 9-91 2" in " ".join(told.split())
     assert "Expected calibration error 0.330, Brier score 0.379" in told
-    read = reading_table({"record": {"with a letter": 3, "x": 1}, "answer": {"with a letter": 4}})
+    read = parsing_table({"record": {"with a letter": 3, "x": 1}, "answer": {"with a letter": 4}})
     assert [line.split()[-2:] for line in str(read).splitlines()[2:4]] == [["3", "4"], ["1", "-"]]

@@ -15,8 +15,8 @@ from conf.schema import BenchmarkConfig, SelectCommand, ServerConfig, StudentCon
 from data.tracks.controls import MATCHED, pairs
 from evaluation import select
 from evaluation.generators.response_log import score_response
-from evaluation.reporting.rows import SelectionRow
-from evaluation.reporting.selection_results import write_report
+from evaluation.reporting.results import SelectionResult
+from evaluation.reporting.selection_report import write_report
 from models.student.generation import GeneratedText
 
 STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
@@ -52,7 +52,7 @@ def test_a_prefix_is_worth_what_its_items_lose_without_it(
     plain, control = (sum(i.letter == x for i in items) for x in "CB")
     told = json.loads((tmp_path / "report.json").read_text())
     name = micro_store.name
-    rows = [SelectionRow.from_dict(r) for r in told["rows"]]
+    rows = [SelectionResult.from_dict(r) for r in told["rows"]]
     assert [(r.benchmark, r.control, r.mode) for r in rows] == [
         (name, None, "answer"), (name, "candidate_only", "answer"),
     ]  # fmt: skip

@@ -30,7 +30,7 @@ from evaluation import report
 from evaluation.metrics.accuracy import accuracy_by_family, accuracy_by_group
 from evaluation.metrics.breakdown import compare_retrievers, recall_curves, retrieval_rows
 from evaluation.metrics.calibration import measure_position_bias
-from evaluation.reporting.rows import SIMILARITY, SelectionRow
+from evaluation.reporting.results import SIMILARITY, SelectionResult
 from evaluation.retrieval import nearest_candidate
 from evaluation.retrieval.exact_search import Ranks
 from evaluation.select import limit_items
@@ -96,7 +96,7 @@ def select_run(
     accuracy = accuracy_by_family([i.family for i in items], credits)
     parsed = sum(c is not None for c in chosen)
     name = model or "small base"
-    row = SelectionRow.of(store.name, name, mode, accuracy, parsed / len(items), suite=suite)
+    row = SelectionResult.of(store.name, name, mode, accuracy, parsed / len(items), suite=suite)
     cells = accuracy_by_group([f"{i.family}/{i.subtype}" for i in items], credits)
     letters = measure_position_bias(chosen, [i.letter for i in items])
     report = {
@@ -140,7 +140,7 @@ def similarity_run(
     for title, of in scores.items():
         credits = nearest_candidate.credits(of, answers)
         accuracy = accuracy_by_family([i.family for i in items], credits)
-        rows.append(SelectionRow.of(store.name, title, SIMILARITY, accuracy, None))
+        rows.append(SelectionResult.of(store.name, title, SIMILARITY, accuracy, None))
         cells = accuracy_by_group([f"{i.family}/{i.subtype}" for i in items], credits)
         told[title] = {cell: vars(found) for cell, found in cells.items()}
         lines += nearest_candidate.told(title, items, of)

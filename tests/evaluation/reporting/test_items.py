@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from evaluation.metrics.intervals import Interval
-from evaluation.reporting.page import item_browser as shown
-from evaluation.reporting.page.page import embedded
-from evaluation.reporting.page.plots import by_horizon, confusion
-from evaluation.reporting.page.run_responses import Said
+from evaluation.metrics.accuracy import Interval
+from evaluation.reporting import item_browser as shown
+from evaluation.reporting.page import embedded
+from evaluation.reporting.plots import by_horizon, confusion
+from evaluation.reporting.run_responses import Said
 
 LABELS = ("one", "other")
 

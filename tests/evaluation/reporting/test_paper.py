@@ -1,7 +1,7 @@
 import pytest
 
-from evaluation.reporting import paper
-from evaluation.reporting.paper import SelectionReference
+from evaluation.reporting import reference as paper
+from evaluation.reporting.reference import SelectionReference
 
 SELECTION = [
     paper.CHANCE,

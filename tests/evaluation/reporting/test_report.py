@@ -15,7 +15,7 @@ from conf.errors import UserError
 from conf.schema import ReportCommand
 from data.records import LETTERS
 from data.tracks.controls import MATCHED
-from evaluation.reporting.page.run_responses import Scored
+from evaluation.reporting.run_responses import Scored
 from tests.evaluation.reporting.measured import (
     reported,
     retrieve_run,

@@ -8,25 +8,28 @@ import pytest
 from PIL import Image
 
 from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
-from evaluation.metrics.accuracy import accuracy_by_family
+from evaluation.metrics.accuracy import (
+    accuracy_by_family,
+    metrics_from_counts,
+    query_measures,
+    wilson,
+)
 from evaluation.metrics.breakdown import compare_retrievers, recall_curves, selection_row
 from evaluation.metrics.breakdown import retrieval_rows as retrieval_rows_of
-from evaluation.metrics.intervals import wilson_interval
-from evaluation.metrics.ranking import query_metrics, ranking_metrics
-from evaluation.reporting import paper
+from evaluation.reporting import reference as paper
 from evaluation.reporting.figures import (
     builders_figure,
     item_figure,
     retrieval_figure,
     selection_figure,
 )
-from evaluation.reporting.page.plots import confusion_figure, recall_figure
-from evaluation.reporting.rows import RECALLS, UNTRAINED, RetrievalRow, SelectionRow
+from evaluation.reporting.plots import confusion_figure, recall_figure
+from evaluation.reporting.results import RECALLS, UNTRAINED, RetrievalResult, SelectionResult
 from evaluation.reporting.tables import (
     builder_tables,
     cost_table,
     index_table,
-    ranks_apart_table,
+    rank_differences_table,
     retrieval_table,
     selection_table,
 )
@@ -36,14 +39,16 @@ from train.common.curves import curves_figure
 
 
 @pytest.fixture(scope="module")
-def selection_rows() -> list[SelectionRow]:
+def selection_rows() -> list[SelectionResult]:
     families = ["event"] * 20 + ["time"] * 30 + ["window"] * 50
     quarter = [1, 0, 0, 0] * 25
     name = "a student with a name that is much too long for any table"
     return [
-        SelectionRow.of("tiny", UNTRAINED, "answer", accuracy_by_family(families, quarter), 0.9),
-        SelectionRow.of("tiny", name, "reasoning", accuracy_by_family(families, [1] * 100), 1.0),
-        SelectionRow.of("tiny", "transfer", "similarity", accuracy_by_family(["event"], [1]), None),
+        SelectionResult.of("tiny", UNTRAINED, "answer", accuracy_by_family(families, quarter), 0.9),
+        SelectionResult.of("tiny", name, "reasoning", accuracy_by_family(families, [1] * 100), 1.0),
+        SelectionResult.of(
+            "tiny", "transfer", "similarity", accuracy_by_family(["event"], [1]), None
+        ),
     ]
 
 
@@ -73,7 +78,7 @@ def ranks(queries) -> Ranks:
 
 
 @pytest.fixture(scope="module")
-def retrieval_rows(ranks, queries) -> list[RetrievalRow]:
+def retrieval_rows(ranks, queries) -> list[RetrievalResult]:
     names = ("contrastive", UNTRAINED)
     return [row for n in names for row in retrieval_rows_of("tiny", n, ranks, queries, seed=0)]
 
@@ -87,13 +92,13 @@ def test_rows_are_the_metrics_of_their_queries_with_an_interval_around(ranks, qu
         of = [k for k, q in enumerate(queries) if row.builder in (None, q.builder)]
         k = ranks.widths.index(row.width)
         counts = (ranks.greater[k, of], ranks.tied[k, of], ranks.found[k, of])
-        metrics = ranking_metrics(*counts, 10_000, RECALLS)
+        metrics = metrics_from_counts(*counts, 10_000, RECALLS)
         assert {name: found.value for name, found in row.measures.items()} == metrics
         assert (row.queries, row.frames) == (len(of), 10_000)
         for found in row.measures.values():
             assert found.low <= found.value <= found.high
             assert found.n == len(of)
-    each = query_metrics(ranks.greater[1], ranks.tied[1], ranks.found[1], 10_000, RECALLS)
+    each = query_measures(ranks.greater[1], ranks.tied[1], ranks.found[1], 10_000, RECALLS)
     scenes = [q.scene_id for q in queries]
     for name, statistic in (("mrr", np.mean), ("median_rank", np.median), ("recall@10", np.mean)):
         found = rows[1].measures[name]
@@ -206,12 +211,10 @@ def test_a_row_holds_the_time_items_by_their_distance_and_macros_interval():
     for k, horizon in enumerate(("1 s", "2 s")):
         of = [c for n, c in enumerate(credits) if families[n] == "time" and n % 2 == k]
         assert row.horizons[horizon].value == pytest.approx(np.mean(of))
-        assert (row.horizons[horizon].low, row.horizons[horizon].high) == wilson_interval(
-            sum(of), len(of)
-        )
+        assert (row.horizons[horizon].low, row.horizons[horizon].high) == wilson(sum(of), len(of))
     assert row.families == accuracy_by_family(families, credits).families
     assert row.macro_interval.value == pytest.approx(row.macro)
-    assert SelectionRow.from_dict(json.loads(json.dumps(row.to_dict()))) == row
+    assert SelectionResult.from_dict(json.loads(json.dumps(row.to_dict()))) == row
     table = str(selection_table([row]))
     assert max(map(len, table.splitlines())) <= 100
     own, reference = table.split("paper (full benchmark)")
@@ -220,7 +223,7 @@ def test_a_row_holds_the_time_items_by_their_distance_and_macros_interval():
         assert line.index(share) == table.index("Time")
     # An older report's row has neither.
     old = {k: v for k, v in row.to_dict().items() if k not in ("macro_interval", "horizons")}
-    assert SelectionRow.from_dict(old).micro == row.micro
+    assert SelectionResult.from_dict(old).micro == row.micro
 
 
 def test_rows_are_json(selection_rows, retrieval_rows):
@@ -290,6 +293,6 @@ def test_retrievers_are_apart_query_by_query():
     (apart,) = compare_retrievers({"one": one, "other": other}, scenes, 0)
     assert apart["measures"]["recall@1"]["value"] == (greater == 0).mean()
     assert all(0 <= m["low"] <= m["value"] <= m["high"] for m in apart["measures"].values())
-    text = str(ranks_apart_table([same, apart]))
+    text = str(rank_differences_table([same, apart]))
     assert "one less again" in text
     assert "+0.0 to +0.0" in text

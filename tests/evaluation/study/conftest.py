@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from conf.schema import StudyCommand
-from evaluation.study import preparing, storage
+from evaluation.study import setup, storage
 from tests.evaluation.study.running import Server
 
 ITEMS = 59
@@ -22,8 +22,8 @@ def prepare(micro, micro_store, root: Path, items: int) -> Path:
     )
     folder = root / "study" / str(items)
     folder.mkdir(parents=True)
-    db = preparing.begin(cfg, folder / storage.DATABASE)
-    preparing.add_media(cfg, db, folder)
+    db = setup.begin(cfg, folder / storage.DATABASE)
+    setup.add_media(cfg, db, folder)
     db.close()
     return folder
 

@@ -23,9 +23,9 @@ from conf.entry import Run
 from conf.schema import ExportStudyCommand
 from data.records import LETTERS
 from data.render.frame_cache import Frames
-from evaluation.study import accounts, export, storage
-from evaluation.study.app import make_app
+from evaluation.study import auth, export, storage
 from evaluation.study.guards import HEADERS, Guard
+from evaluation.study.routes import make_app
 from evaluation.study.votes import Vote, votes_of
 from tests.evaluation.study.conftest import ITEMS, SMALL
 from tests.evaluation.study.running import Annotator, Visitor, both
@@ -208,7 +208,7 @@ def test_what_goes_wrong_inside_carries_them_and_locks_nobody_out(small) -> None
 
     db = storage.open_study(small.folder / storage.DATABASE)
     told = asked(make_app(db, 10, None, full), "POST", "/link", small.links()["A1"])
-    accounts.write_links(db, small.folder / accounts.LINKS, "http://here")
+    auth.write_links(db, small.folder / auth.LINKS, "http://here")
     assert told["status"] == 303
     assert any(name == b"set-cookie" for name, _ in told["headers"])
     # Without its tables no page can be made.

@@ -13,7 +13,7 @@ import pytest
 
 from conf.errors import UserError
 from conf.schema import StudyCommand
-from evaluation.study import preparing, serving, storage
+from evaluation.study import serving, setup, storage
 from tests.evaluation.study.running import ROOT, Server
 
 
@@ -84,7 +84,7 @@ def test_lost_media_are_made_again_from_the_same_benchmark(path, micro, micro_st
     cfg = StudyCommand(benchmark=micro, store=str(micro_store.folder.parent), items="4")
     db = storage.open_study(path)
     assert len(storage.without_media(db)) == 7
-    preparing.add_media(cfg, db, path)
+    setup.add_media(cfg, db, path)
     assert storage.without_media(db) == []
     db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     assert path.read_bytes().count(b"IEND") >= before
@@ -94,7 +94,7 @@ def test_lost_media_of_another_benchmark_are_told(path, micro, micro_store) -> N
     changed(path, "DELETE FROM medium", "UPDATE about SET value = 'x' WHERE key = 'identity'")
     cfg = StudyCommand(benchmark=micro, store=str(micro_store.folder.parent), items="4")
     with pytest.raises(UserError, match=r"of 7 items, and .* is another benchmark"):
-        preparing.add_media(cfg, storage.open_study(path), path)
+        setup.add_media(cfg, storage.open_study(path), path)
 
 
 def test_a_file_that_names_other_items_by_now_is_told(path, tmp_path) -> None:
@@ -102,19 +102,19 @@ def test_a_file_that_names_other_items_by_now_is_told(path, tmp_path) -> None:
     names = storage.item_ids(db, practice=False)
     file = tmp_path / "items.txt"
     file.write_text("\n".join(names))
-    preparing.check_names(StudyCommand(items=str(file)), db)
+    setup.check_names(StudyCommand(items=str(file)), db)
     file.write_text("\n".join(names[1:]))
     with pytest.raises(UserError, match="names other items than this study was begun with"):
-        preparing.check_names(StudyCommand(items=str(file)), db)
+        setup.check_names(StudyCommand(items=str(file)), db)
 
 
 def test_more_items_than_there_are_are_told(micro, micro_store) -> None:
     cfg = StudyCommand(benchmark=micro, items="1000")
     with pytest.raises(UserError, match=r"items=1000 are more .* there are \d+"):
-        preparing.asked_items(cfg, micro_store)
+        setup.asked_items(cfg, micro_store)
     cfg = StudyCommand(benchmark=micro, practice=1000)
     with pytest.raises(UserError, match="practice=1000 are more than the training items"):
-        preparing.practice_items(cfg, micro_store)
+        setup.practice_items(cfg, micro_store)
 
 
 def test_practice_is_of_the_training_split(micro_store, prepared_small) -> None:

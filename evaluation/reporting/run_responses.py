@@ -10,8 +10,8 @@ from functools import cached_property
 from conf.errors import UserError
 from data.records import LETTERS
 from evaluation.metrics.significance import check_same_items
-from evaluation.reporting.page.run_rows import Measured
-from evaluation.reporting.page.runs import Finished, json_lines, unreadable
+from evaluation.reporting.measurements import Measured
+from evaluation.reporting.runs import Finished, json_lines, unreadable
 from models.student.answer_parser import ParsedAnswer, Reason, parse_choice
 
 Asked = tuple[str, str | None]
@@ -117,7 +117,9 @@ def check_same_build(runs: Iterable[Finished]) -> None:
             )
 
 
-def check_same_items(rows: Sequence[Measured], ids: Sequence[Mapping[str, object] | None]) -> None:
+def check_rows_share_items(
+    rows: Sequence[Measured], ids: Sequence[Mapping[str, object] | None]
+) -> None:
     """Rows of one benchmark stand in one table, so they must be of the same items.
 
     Args:

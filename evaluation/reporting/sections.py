@@ -12,15 +12,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from evaluation.metrics.accuracy import Interval
 from evaluation.metrics.calibration import Calibration, PositionBias
-from evaluation.metrics.intervals import Interval
 from evaluation.metrics.significance import PairedComparison
-from evaluation.reporting import figures, paper, tables
-from evaluation.reporting.page import paper_tables as shaped
-from evaluation.reporting.page import plots
-from evaluation.reporting.page.paper_tables import ABLATED, REGIMES
-from evaluation.reporting.page.run_rows import Measured, by_items, model_names, transfers, widest
-from evaluation.reporting.page.runs import STUDIES, TRAININGS, Finished, json_lines, unreadable
+from evaluation.reporting import figures, plots, tables
+from evaluation.reporting import paper_tables as shaped
+from evaluation.reporting import reference as paper
+from evaluation.reporting.measurements import Measured, by_items, model_names, transfers, widest
+from evaluation.reporting.paper_tables import ABLATED, REGIMES
+from evaluation.reporting.runs import STUDIES, TRAININGS, Finished, json_lines, unreadable
 from evaluation.reporting.table import Table
 from train.common.curves import curves_figure
 
@@ -119,7 +119,7 @@ def distillation(
             for of in run.report.get("apart", [])
         ]
         if told:
-            section.tables.append(_renamed(tables.ranks_apart_table(told), benchmark))
+            section.tables.append(_renamed(tables.rank_differences_table(told), benchmark))
     return section
 
 
@@ -264,7 +264,7 @@ def _details(rows: Sequence[Measured], cells: Mapping[str, Mapping[str, Interval
     letters = _told(rows, "positions", lambda of: PositionBias(**of))
     sure = _told(rows, "calibration", Calibration.from_dict)
     told = [tables.subtype_table(cells)] if cells else []
-    told += [tables.reading_table(readings)] if readings else []
+    told += [tables.parsing_table(readings)] if readings else []
     told += [tables.position_table(letters)] if letters else []
     for k, (label, found) in enumerate(sure.items()):
         table = tables.calibration_table(label, found)

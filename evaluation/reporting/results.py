@@ -20,7 +20,7 @@ SIMILARITY = "similarity"
 
 
 @dataclass(frozen=True)
-class SelectionRow:
+class SelectionResult:
     """One model on one benchmark's selection items, in shares. What could not be parsed counts as
     wrong.
 
@@ -55,7 +55,7 @@ class SelectionRow:
         horizons: dict[str, Interval] | None = None,
         suite: str | None = None,
         control: str | None = None,
-    ) -> SelectionRow:
+    ) -> SelectionResult:
         shares = (found.families, found.macro, found.micro, parse_rate)
         told = (macro_interval, horizons or {}, suite, control)
         return cls(benchmark, name, mode, *shares, found.micro.n, *told)
@@ -64,7 +64,7 @@ class SelectionRow:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, row: dict[str, Any]) -> SelectionRow:
+    def from_dict(cls, row: dict[str, Any]) -> SelectionResult:
         families = {name: Interval(**found) for name, found in row["families"].items()}
         horizons = {name: Interval(**found) for name, found in row.get("horizons", {}).items()}
         macro = row.get("macro_interval")
@@ -73,7 +73,7 @@ class SelectionRow:
 
 
 @dataclass(frozen=True)
-class RetrievalRow:
+class RetrievalResult:
     """One retriever at one width (None for a pipeline without widths) on the queries of one builder
     (None for all of them), recalls in shares. Intervals are drawn over scenes. `bytes` and
     `seconds` are those of `evaluation.retrieval.exact_search.Ranks`; rows that differ in the time
@@ -109,6 +109,6 @@ class RetrievalRow:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, row: dict[str, Any]) -> RetrievalRow:
+    def from_dict(cls, row: dict[str, Any]) -> RetrievalResult:
         names = [f"recall_{k}" for k in RECALLS] + list(MEASURES)
         return cls(**{**row, **{name: Interval(**row[name]) for name in names}})

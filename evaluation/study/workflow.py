@@ -11,8 +11,8 @@ import time
 from dataclasses import dataclass
 
 from data.records import LETTERS
-from evaluation.study.accounts import new_token
 from evaluation.study.assignment import Waiting, next_item
+from evaluation.study.auth import new_token
 from evaluation.study.media import PREFIX
 from evaluation.study.storage import transaction
 

@@ -19,7 +19,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from data.records import LETTERS
-from evaluation.study import accounts, course
+from evaluation.study import auth, workflow
 from evaluation.study.guards import Guard
 
 log = logging.getLogger(__name__)
@@ -80,23 +80,23 @@ class Pages:
 
     async def home(self, request: Request) -> Response:
         me = self._signed_in(request)
-        stage = course.stage_of(self._db, me, self._rest_every)
+        stage = workflow.stage_of(self._db, me, self._rest_every)
         asks = stage.page in ("practice", "feedback", "item")
-        question = course.question(self._db, stage.key) if asks else None
+        question = workflow.question(self._db, stage.key) if asks else None
         page = "question" if asks else stage.page
         return self._page(page, stage=stage, question=question, form_key=me["form_key"])
 
     async def link(self, request: Request) -> Response:
         # Looking at a link does not spend it: mail programs look too.
         link = request.path_params["link"]
-        if accounts.owner(self._db, link) is None:
+        if auth.owner(self._db, link) is None:
             raise HTTPException(410)
         return self._page("link", link=link)
 
     async def sign_in(self, request: Request) -> Response:
         link = (await form_of(request)).get("link", "")
-        name = accounts.owner(self._db, link)
-        session = accounts.sign_in(self._db, link)
+        name = auth.owner(self._db, link)
+        session = auth.sign_in(self._db, link)
         if session is None:
             raise HTTPException(410)
         log.info("%s signed in", name)
@@ -114,17 +114,17 @@ class Pages:
 
     async def consent(self, request: Request) -> Response:
         me, _ = await self._posted(request)
-        course.consent(self._db, me)
+        workflow.consent(self._db, me)
         return RedirectResponse("/", 303)
 
     async def go_on(self, request: Request) -> Response:
         me, form = await self._posted(request)
-        course.go_on(self._db, me, form.get("key", ""), self._rest_every)
+        workflow.go_on(self._db, me, form.get("key", ""), self._rest_every)
         return RedirectResponse("/", 303)
 
     async def loaded(self, request: Request) -> Response:
         me, form = await self._posted(request)
-        there = course.note_loaded(self._db, me["name"], form.get("key", ""))
+        there = workflow.note_loaded(self._db, me["name"], form.get("key", ""))
         return Response(status_code=204 if there else 409)
 
     async def answer(self, request: Request) -> Response:
@@ -132,13 +132,13 @@ class Pages:
         letter, seconds = form.get("choice", ""), _seconds(form.get("seconds", ""))
         if letter not in tuple(LETTERS) or seconds is None:
             raise HTTPException(400)
-        if course.answer(self._db, me["name"], form.get("key", ""), letter, seconds):
+        if workflow.answer(self._db, me["name"], form.get("key", ""), letter, seconds):
             self._tell_end(me)
         return RedirectResponse("/", 303)
 
     async def media(self, request: Request) -> Response:
         me = self._signed_in(request)
-        found = course.medium(self._db, me["name"], request.path_params["name"])
+        found = workflow.medium(self._db, me["name"], request.path_params["name"])
         if found is None:
             raise HTTPException(404)
         return Response(found["content"], media_type=found["kind"])
@@ -156,13 +156,13 @@ class Pages:
         return self._page("refusal", status, refused=status, told=told)
 
     def _tell_end(self, me: sqlite3.Row) -> None:
-        stage = course.stage_of(self._db, me, self._rest_every)
+        stage = workflow.stage_of(self._db, me, self._rest_every)
         if stage.page == "done":
             log.info("%s has answered all %d items", me["name"], stage.total)
 
     def _signed_in(self, request: Request) -> sqlite3.Row:
         """Raises HTTPException 401 for somebody without a session."""
-        me = accounts.signed_in(self._db, request.cookies.get(COOKIE, ""))
+        me = auth.signed_in(self._db, request.cookies.get(COOKIE, ""))
         if me is None:
             raise HTTPException(401)
         return me

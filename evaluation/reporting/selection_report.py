@@ -17,7 +17,8 @@ from evaluation.generators.response_log import Answer
 from evaluation.metrics.breakdown import accuracy_by_subtype, selection_row
 from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
 from evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
-from evaluation.reporting import figures, paper, tables
+from evaluation.reporting import figures, tables
+from evaluation.reporting import reference as paper
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +67,7 @@ def write_report(
     named = [replace(row, mode=w) for row, w in zip(rows, told, strict=True)]
     parts = [tables.selection_table(named, suite), *([tables.paired_table(apart)] if apart else [])]
     log.info("%s", "\n\n".join(map(str, parts)))
-    parts += [tables.subtype_table(subtypes), tables.reading_table(reasons)]
+    parts += [tables.subtype_table(subtypes), tables.parsing_table(reasons)]
     parts += [tables.position_table(letters)]
     parts += [tables.calibration_table(w, found) for w, found in confidences.items()]
     write_text(folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")

@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 
 from conf.errors import UserError
 from conf.multirun.summary import AT_START_SUFFIX
-from evaluation.metrics.intervals import Interval
-from evaluation.reporting import paper
-from evaluation.reporting.page.run_rows import SUITES, Measured
-from evaluation.reporting.page.runs import Finished, unreadable
-from evaluation.reporting.rows import SIMILARITY
+from evaluation.metrics.accuracy import Interval
+from evaluation.reporting import reference as paper
+from evaluation.reporting.measurements import SUITES, Measured
+from evaluation.reporting.results import SIMILARITY
+from evaluation.reporting.runs import Finished, unreadable
 from evaluation.reporting.table import Best, Table
 from evaluation.reporting.tables import (
     RETRIEVAL_HEAD,

@@ -14,7 +14,7 @@ from data.build import ensure_benchmark
 from data.records import SelectionItem
 from data.render.frame_cache import Frames
 from data.store import Store
-from evaluation.study import accounts, sampling, storage
+from evaluation.study import auth, sampling, storage
 from evaluation.study.assignment import plan
 from evaluation.study.media import media_of
 
@@ -33,9 +33,9 @@ def begin(cfg: StudyCommand, path: Path) -> sqlite3.Connection:
             shared,
             len(items),
         )
-    names = accounts.annotator_names(cfg.annotators)
+    names = auth.annotator_names(cfg.annotators)
     planned = plan(items, names, cfg.seed) + plan(practice, names, cfg.seed)
-    links = {name: accounts.new_token() for name in names}
+    links = {name: auth.new_token() for name in names}
     noted = {"benchmark": store.name, "identity": store.identity}
     return storage.create(path, noted, items, practice, links, planned)
 

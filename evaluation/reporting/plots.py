@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from data.records import LETTERS
-from evaluation.metrics.intervals import Interval, wilson_interval
-from evaluation.reporting import paper
+from evaluation.metrics.accuracy import Interval, wilson
+from evaluation.reporting import reference as paper
 from evaluation.reporting.figures import FAINT, INK, color_of, legend_above, literal
-from evaluation.reporting.rows import UNTRAINED
+from evaluation.reporting.results import UNTRAINED
 from train.common.curves import COLORS, empty_figure
 
 HORIZONS = {"time/in_1s": "1 s", "time/in_2s": "2 s"}
@@ -44,7 +44,7 @@ def by_horizon(subtypes: Mapping[str, Interval]) -> dict[str, Interval]:
             right, n = hits.get(horizon, (0.0, 0))
             hits[horizon] = (right + found.value * found.n, n + found.n)
     return {
-        horizon: Interval(right / n, *wilson_interval(right, n), n)
+        horizon: Interval(right / n, *wilson(right, n), n)
         for horizon, (right, n) in sorted(hits.items(), key=lambda found: _how_far(found[0]))
     }
 

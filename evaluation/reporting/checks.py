@@ -13,16 +13,16 @@ from conf.errors import UserError
 from data.store import Store, open_store
 from data.tracks.controls import MATCHED
 from evaluation.metrics.significance import PairedComparison
-from evaluation.reporting.page import item_browser, plots
-from evaluation.reporting.page.comparisons import apart
-from evaluation.reporting.page.run_responses import (
+from evaluation.reporting import item_browser, plots
+from evaluation.reporting.comparisons import apart
+from evaluation.reporting.measurements import Measured, once
+from evaluation.reporting.run_responses import (
     Asked,
     Said,
     Scored,
     answers_of,
-    check_same_items,
+    check_rows_share_items,
 )
-from evaluation.reporting.page.run_rows import Measured, once
 
 RunAnswers = Mapping[Path, Mapping[Asked, Mapping[str, Said | Scored]]]
 """What was said in each run's folder."""
@@ -52,7 +52,7 @@ def browser_of(choices: Sequence[Measured], stores: Path, bound: int, seed: int)
     """
     said = {run.folder: answers_of(run) for run in {m.run.folder: m.run for m in choices}.values()}
     opened = {name: _open(stores / name) for name in dict.fromkeys(m.benchmark for m in choices)}
-    check_same_items(choices, [_answers(m, said) or None for m in choices])
+    check_rows_share_items(choices, [_answers(m, said) or None for m in choices])
     browser = Browser()
     for name, store in opened.items():
         answered = [m for m in once(choices) if m.benchmark == name and _answers(m, said)]

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 from data.records import SelectionItem
 from evaluation.metrics.significance import PairedComparison, compare_runs
-from evaluation.reporting.page.paper_tables import ABLATED, REGIMES
-from evaluation.reporting.page.run_responses import Said, Scored
-from evaluation.reporting.page.run_rows import Measured
-from evaluation.reporting.rows import SelectionRow
+from evaluation.reporting.measurements import Measured
+from evaluation.reporting.paper_tables import ABLATED, REGIMES
+from evaluation.reporting.results import SelectionResult
+from evaluation.reporting.run_responses import Said, Scored
 
 
 def apart(
@@ -47,7 +47,7 @@ def pairs(models: Mapping[str, Measured]) -> Iterator[tuple[str, str]]:
     for label, m in models.items():
         if m.run.kind == "similarity" and m.trained:
             # Once, a base's row stands under the run that measured it first.
-            began = [SelectionRow.from_dict(row) for row in m.run.report["rows"]]
+            began = [SelectionResult.from_dict(row) for row in m.run.report["rows"]]
             yield from (
                 (label, name)
                 for name, o in models.items()

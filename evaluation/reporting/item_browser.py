@@ -15,7 +15,7 @@ from conf.errors import UserError
 from data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, shown_frames
 from data.render.frame_cache import Frames
 from data.store import Store
-from evaluation.reporting.page.run_responses import Said, Scored
+from evaluation.reporting.run_responses import Said, Scored
 
 OBSERVED = 6
 """Frames of a prefix that are shown."""

@@ -12,9 +12,9 @@ import jinja2
 from markupsafe import Markup
 
 from conf.runs import write_text
-from evaluation.reporting.page.checks import Browser
-from evaluation.reporting.page.plots import inlined
-from evaluation.reporting.page.sections import Section
+from evaluation.reporting.checks import Browser
+from evaluation.reporting.plots import inlined
+from evaluation.reporting.sections import Section
 
 STYLE, SCRIPT = "page.css", "page.js"
 
@@ -23,12 +23,12 @@ def write_page(
     path: Path, sections: Sequence[Section], browser: Browser, runs: Sequence[str]
 ) -> None:
     """Write the page whole or not at all; `runs` are the names of those that it is over."""
-    loader = jinja2.PackageLoader("evaluation.reporting.page")
+    loader = jinja2.PackageLoader("evaluation.reporting")
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,
     )  # fmt: skip
-    folder = files("evaluation.reporting.page") / "templates"
+    folder = files("evaluation.reporting") / "templates"
     drawn = [figure for section in sections for figure in section.figures]
     pictures = {f.path: Markup(inlined(f.path, k)) for k, f in enumerate(drawn)}
     page = environment.get_template("page.html").render(

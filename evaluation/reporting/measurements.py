@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from evaluation.reporting.page.runs import CHOICES, RANKINGS, Finished, training_of, unreadable
-from evaluation.reporting.rows import UNTRAINED, RetrievalRow, SelectionRow
+from evaluation.reporting.results import UNTRAINED, RetrievalResult, SelectionResult
+from evaluation.reporting.runs import CHOICES, RANKINGS, Finished, training_of, unreadable
 
 SUITES = {"movi_a": "MoVi-A", "physion": "Physion"}
 """The paper's transfer suites by their simulator."""
@@ -24,7 +24,7 @@ class Measured:
     model, where the row's is another.
     """
 
-    row: SelectionRow | RetrievalRow
+    row: SelectionResult | RetrievalResult
     run: Finished
     training: dict[str, Any] | None = None
     reported: str | None = None
@@ -36,7 +36,7 @@ class Measured:
     @property
     def ways(self) -> list[str]:
         """How its items were chosen and shown, where that is not all of them as they are."""
-        if isinstance(self.row, RetrievalRow):
+        if isinstance(self.row, RetrievalResult):
             return []
         return [way for way in (self.row.suite, self.row.control) if way is not None]
 
@@ -111,13 +111,13 @@ def read_rows(runs: Sequence[Finished], root: Path) -> tuple[list[Measured], lis
     Raises:
         UserError: a report is of another version.
     """
-    choices = [m for run in runs if run.kind in CHOICES for m in _rows(run, root, SelectionRow)]
-    ranks = [m for run in runs if run.kind in RANKINGS for m in _rows(run, root, RetrievalRow)]
+    choices = [m for run in runs if run.kind in CHOICES for m in _rows(run, root, SelectionResult)]
+    ranks = [m for run in runs if run.kind in RANKINGS for m in _rows(run, root, RetrievalResult)]
     return choices, ranks
 
 
 def _rows(
-    run: Finished, root: Path, kind: type[SelectionRow] | type[RetrievalRow]
+    run: Finished, root: Path, kind: type[SelectionResult] | type[RetrievalResult]
 ) -> list[Measured]:
     training = training_of(run, root)
     try:
@@ -144,7 +144,7 @@ def once(rows: Iterable[Measured]) -> list[Measured]:
 def _place(m: Measured) -> tuple:
     """What tells a row from others of a table."""
     row = m.row
-    how = row.mode if isinstance(row, SelectionRow) else (row.width, row.builder)
+    how = row.mode if isinstance(row, SelectionResult) else (row.width, row.builder)
     return m.run.kind, m.items, row.name, how
 
 
