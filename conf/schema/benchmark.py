@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import product
 
 from omegaconf import MISSING
 
@@ -11,6 +12,11 @@ from conf.schema.checks import too_small
 RENDERERS = ("bullet", "egl", "blender")
 SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
 STANDINS = ("movi_a", "physion")
+WINDOW_FAMILIES = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
+"""Window families of each group: B needs a collision ahead, C leaves out G4 (paper, Window)."""
+WINDOW_HORIZONS = (8, 16, 24)
+"""Frames from the end of a window item's prefix to its target."""
+WINDOW_DIFFICULTIES = ("easy", "hard")
 STANDIN_OBJECTS = 6
 DISTINCT_APPEARANCES = 48
 """Objects that can be told apart by their names: 3 shapes, 8 colours, 2 materials."""
@@ -33,8 +39,13 @@ class SelectionConfig:
     event: dict[str, Quota] = field(default_factory=dict)
     time: dict[str, Quota] = field(default_factory=dict)
     window: dict[str, Quota] = field(default_factory=dict)
+    """Quotas of cells, such as G1_A_h8_easy, or of all six cells of a group and family, such as
+    G1_A, which are divided evenly among them."""
     matched: Quota = field(default_factory=Quota)
     """Pairs of items that differ in their question's anchor alone, a suite of their own."""
+
+    def __post_init__(self) -> None:
+        self.window = divide_window_quotas(self.window)
 
     def check(self) -> list[str]:
         problems = too_small(self, "benchmark.selection.", {"min_displacement": 0})
@@ -174,3 +185,24 @@ def quota_problems(above: str, quotas: dict[str, Quota]) -> list[str]:
         for name, quota in quotas.items()
         for problem in too_small(quota, f"{above}.{name}.", {"train": 0, "test": 0})
     ]
+
+
+def divide_window_quotas(quotas: dict[str, Quota]) -> dict[str, Quota]:
+    """Divide the quota of a group and family evenly among its cells, the remainder to the first.
+
+    A quota named by its cell replaces that cell's share.
+    """
+    cells: dict[str, Quota] = {}
+    for name, quota in quotas.items():
+        group, _, family = name.partition("_")
+        if len(family) != 1 or family not in WINDOW_FAMILIES.get(group, ""):
+            cells[name] = quota
+            continue
+        shares = list(product(WINDOW_HORIZONS, WINDOW_DIFFICULTIES))
+        for k, (horizon, difficulty) in enumerate(shares):
+            train, test = (
+                total // len(shares) + (k < total % len(shares))
+                for total in (quota.train, quota.test)
+            )
+            cells.setdefault(f"{name}_h{horizon}_{difficulty}", Quota(train, test))
+    return cells | {name: quota for name, quota in quotas.items() if name in cells}

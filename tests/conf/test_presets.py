@@ -9,6 +9,7 @@ import pytest
 from conf import schema
 from conf.compose import compose, options, short
 from conf.errors import SettingsError
+from data.tracks.selection.window import CELLS
 
 CONF = Path(str(files("conf")))
 SCHEMAS = {
@@ -109,6 +110,17 @@ def test_a_retriever_brings_its_recipe():
     assert (tiny.train.batch, tiny.train.lr, tiny.retriever.widths[0]) == (64, 1.5e-3, 128)
     assert tiny.retriever.architecture.vocabulary == 1024
     assert (paper.train.batch, paper.train.mini_batch, paper.train.lr) == (512, 8, 2e-5)
+
+
+def test_a_window_group_quota_is_divided_among_its_cells():
+    window = settings(
+        "python -m data.build benchmark=tiny benchmark.selection.window.G2_B.train=20 "
+        "+benchmark.selection.window={G1_A_h16_easy:{train:7}}"
+    ).benchmark.selection.window
+    trains = [q.train for name, q in window.items() if name.startswith("G2_B")]
+    assert trains == [4, 4, 3, 3, 3, 3]
+    assert window["G1_A_h16_easy"] == schema.Quota(7, 0)
+    assert list(window) == list(CELLS)
 
 
 def test_the_paper_quotas_add_up():

@@ -14,6 +14,7 @@ from itertools import product
 
 import numpy as np
 
+from conf.schema.benchmark import WINDOW_DIFFICULTIES, WINDOW_FAMILIES, WINDOW_HORIZONS
 from data.records import FrameRef, Scene
 from data.tracks.selection.distractors import Draft, Picker, observed, of_scene, unobserved
 from data.world.events import collisions_in, window_group
@@ -21,10 +22,6 @@ from data.world.geometry import object_match, on_screen
 
 QUESTION = "Which image best matches the next scene state?"
 PREFIX_FRAMES = 16
-HORIZONS = (8, 16, 24)
-DIFFICULTIES = ("easy", "hard")
-FAMILIES_OF_GROUP = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
-"""Family B needs a collision ahead, family C leaves out G4 (paper, Window-anchored)."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +34,8 @@ class WindowCell:
 
 CELLS = {
     f"{group}_{family}_h{horizon}_{difficulty}": WindowCell(group, family, horizon, difficulty)
-    for group, families in FAMILIES_OF_GROUP.items()
-    for family, horizon, difficulty in product(families, HORIZONS, DIFFICULTIES)
+    for group, families in WINDOW_FAMILIES.items()
+    for family, horizon, difficulty in product(families, WINDOW_HORIZONS, WINDOW_DIFFICULTIES)
 }
 
 
