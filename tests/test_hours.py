@@ -1,4 +1,4 @@
-"""GPU hours follow from measured rates alone, and none is given where there is no rate."""
+"""GPU hours follow from measured rates only; a missing rate gives no figure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.speed import hours
-from conf.errors import UserError
+from tests.user_errors import raises_user_error
 
 FAST = hours.Rate("sft_gpu", "qwen3_vl_8b", "nf4", 10.0, "a card", "2026-01-31")
 
@@ -64,5 +64,5 @@ def test_of_a_card_the_last_rate_counts(tmp_path: Path, steps: dict[str, hours.S
 def test_a_line_that_is_no_rate_is_named(tmp_path: Path, line: str) -> None:
     path = tmp_path / "rates.jsonl"
     path.write_text(f"{json.dumps(vars(FAST))}\n{line}\n")
-    with pytest.raises(UserError, match=r"rates\.jsonl, line 2 is no measured rate"):
+    with raises_user_error("damaged-file", contains="rates.jsonl, line 2"):
         hours.read(path)

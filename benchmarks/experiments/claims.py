@@ -1,13 +1,13 @@
-"""How well false statements are told from true ones, by mutation, over a built benchmark.
+"""How well the validator distinguishes false statements from true ones, by mutation.
 
     python -m benchmarks.experiments.claims store/small [--prose tests/teacher/prose.jsonl]
 
-Every training item is narrated by the built-in narrator, as it is and paraphrased: neither may be
-rejected. Then a fact is flipped, of each kind in turn, and the item narrated from the false facts
-but held against the true ones: the falsehood is to be found. A flipped fact that the text does
-not tell is no mutation, and is counted as untold. The prose of a language model, where given, is
-mutated in place, every word of each kind. Given are shares with their counts, the claims by kind
-and verdict, and the milliseconds that a rationale takes.
+The built-in narrator narrates every training item of a built benchmark. The rationale and a
+paraphrase of it must be accepted. Then one fact of each kind is flipped, the item is narrated from
+the false facts and validated against the true ones: the falsehood must be caught. A flipped fact
+that the text does not state is counted as unstated. With `--prose`, every word of each kind is
+replaced in the rationales of a language model. Prints shares with their counts, the claims by kind
+and verdict, and the milliseconds per rationale.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ def is_contradicted(text: str, predicates: Predicates) -> bool:
 
 
 class Tally:
-    """Counts of what was found, by name, with a few texts that went wrong."""
+    """Counts of correct verdicts by name, with the texts of some wrong ones."""
 
     def __init__(self) -> None:
         self.caught: Counter[str] = Counter()
         self.total: Counter[str] = Counter()
-        self.untold: Counter[str] = Counter()
+        self.unstated: Counter[str] = Counter()
         self.wrong: dict[str, list[str]] = {}
 
     def add(self, name: str, good: bool, text: str) -> None:
@@ -51,9 +51,9 @@ class Tally:
 
     def show(self, verb: str) -> None:
         for name, total in self.total.items():
-            untold = f", {self.untold[name]} untold" if self.untold[name] else ""
+            unstated = f", {self.unstated[name]} unstated" if self.unstated[name] else ""
             share = self.caught[name] / total
-            print(f"  {name:12} {share:8.2%} {verb} ({self.caught[name]} of {total}{untold})")
+            print(f"  {name:12} {share:8.2%} {verb} ({self.caught[name]} of {total}{unstated})")
             for text in self.wrong.get(name, [])[:MISSES_SHOWN]:
                 print(f"      {text}")
 
@@ -75,23 +75,25 @@ def measure_narrator(folder: Path, limit: int | None) -> None:
         claims.update((c.kind, c.verdict) for c in found)
         false = [str(c) for c in found if c.verdict == "contradicted"]
         passed.add("untouched", not false, f"{item.item_id}: {false}")
-        told = paraphrase(text, rng)
+        paraphrased = paraphrase(text, rng)
         false = [
-            f"{c} <- {sentence(told, c.span)}"
-            for c in extract_claims(told, predicates)
+            f"{c} <- {sentence(paraphrased, c.span)}"
+            for c in extract_claims(paraphrased, predicates)
             if c.verdict == "contradicted"
         ]
         passed.add("paraphrased", not false, f"{item.item_id}: {false}")
         for kind in KINDS:
             for false_text, mutation in falsehoods(predicates, item, kind, rng):
                 good = is_contradicted(false_text, predicates)
-                caught.add(kind, good, f"{item.item_id}: {mutation.told}")
-                told = paraphrase(false_text, rng)
-                good = is_contradicted(told, predicates)
-                caught.add(f"{kind}, par.", good, f"{item.item_id}: {mutation.told}\n{told}")
+                caught.add(kind, good, f"{item.item_id}: {mutation.patterns}")
+                paraphrased = paraphrase(false_text, rng)
+                good = is_contradicted(paraphrased, predicates)
+                caught.add(
+                    f"{kind}, par.", good, f"{item.item_id}: {mutation.patterns}\n{paraphrased}"
+                )
                 break
             else:
-                caught.untold[kind] += 1
+                caught.unstated[kind] += 1
     print(f"{folder}: {narrated} rationales, {seconds / narrated * 1e3:.2f} ms each")
     passed.show("let through")
     caught.show("caught")
@@ -99,7 +101,7 @@ def measure_narrator(folder: Path, limit: int | None) -> None:
 
 
 def sentence(text: str, span: tuple[int, int]) -> str:
-    """The sentence of a text that a span lies in."""
+    """The sentence that contains a span of the text."""
     stop = text.find(".", span[1])
     return text[text.rfind(".", 0, span[0]) + 1 : stop if stop >= 0 else len(text)].strip()
 

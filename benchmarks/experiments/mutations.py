@@ -1,4 +1,4 @@
-"""Facts flipped, so that a rationale narrated from them says something false."""
+"""Flips facts of predicates, so that a rationale narrated from them states a falsehood."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ PAIRED = {"courses": "collision course", "contacts": "ontact|meet", "close": "ve
 
 @dataclass(frozen=True)
 class Mutation:
-    """Flipped predicates, and what a sentence that tells the flipped fact holds (patterns)."""
+    """Flipped predicates, and patterns that match in a sentence that states the flipped fact."""
 
     predicates: Predicates
-    told: tuple[str, ...]
+    patterns: tuple[str, ...]
 
-    def is_told(self, text: str) -> bool:
-        """Whether a sentence of a rationale tells the flipped fact."""
+    def is_stated(self, text: str) -> bool:
+        """Whether a sentence of the rationale states the flipped fact."""
         sentences = re.split(r"(?<=\.)\s", text)
-        return any(all(re.search(p, s) for p in self.told) for s in sentences)
+        return any(all(re.search(p, s) for p in self.patterns) for s in sentences)
 
 
 def predicates_from(record: dict[str, Any]) -> Predicates:
-    """Predicates from what their `to_dict` gave, as JSON keeps it."""
+    """Rebuild predicates from the JSON form of their `to_dict`."""
 
     def pairs(name: str, make: Callable[..., Any]) -> tuple[Any, ...]:
         return tuple(make(**{**m, "objects": tuple(m["objects"])}) for m in record[name])
@@ -67,20 +67,20 @@ def predicates_from(record: dict[str, Any]) -> Predicates:
 
 
 def mutations(predicates: Predicates, kind: str, rng: Random) -> list[Mutation]:
-    """Every place's flip of a kind, each to a false value drawn at random."""
+    """All flips of one kind, each to a random false value."""
     return KINDS[kind](predicates, rng)
 
 
 def falsehoods(
     predicates: Predicates, item: SelectionItem, kind: str, rng: Random, seed: int = 0
 ) -> Iterator[tuple[str, Mutation]]:
-    """Rationales that the built-in narrator tells of flipped facts, each of which it does tell."""
+    """Rationales that the built-in narrator writes from flipped facts and that state them."""
     text = write_rationale(predicates, item, seed)
     options = mutations(predicates, kind, rng)
     rng.shuffle(options)
     for mutation in options:
         false = write_rationale(mutation.predicates, item, seed)
-        if false != text and mutation.is_told(false):
+        if false != text and mutation.is_stated(false):
             yield false, mutation
 
 
@@ -96,10 +96,10 @@ def _with_object(p: Predicates, i: int, **changes: Any) -> Predicates:
 
 def _with_difference(p: Predicates, c: int, d: int, **changes: Any) -> Predicates:
     facts = p.candidates[c]
-    found = list(facts.differences)
-    found[d] = replace(found[d], **changes)
+    flips = list(facts.differences)
+    flips[d] = replace(flips[d], **changes)
     candidates = list(p.candidates)
-    candidates[c] = replace(facts, differences=tuple(found))
+    candidates[c] = replace(facts, differences=tuple(flips))
     return replace(p, candidates=tuple(candidates))
 
 
@@ -112,59 +112,59 @@ def _differences(p: Predicates) -> list[tuple[int, int, str, Difference]]:
 
 
 def directions(p: Predicates, rng: Random) -> list[Mutation]:
-    found = []
+    flips = []
     for i, o in enumerate(p.objects):
         for field in ("heading", "travel"):
             if getattr(o, field):
-                way = _other(rng, COMPASS, o.heading, o.travel)
-                told = (f"{o.object}", rf"toward the {way}\b")
-                found.append(Mutation(_with_object(p, i, **{field: way}), told))
+                direction = _other(rng, COMPASS, o.heading, o.travel)
+                patterns = (f"{o.object}", rf"toward the {direction}\b")
+                flips.append(Mutation(_with_object(p, i, **{field: direction}), patterns))
     for c, d, letter, difference in _differences(p):
         if difference.heading:
-            way = _other(rng, COMPASS, difference.heading)
-            told = (f"andidate {letter}", rf"{difference.object} [^.]*toward the {way}\b")
-            found.append(Mutation(_with_difference(p, c, d, heading=way), told))
-    return found
+            direction = _other(rng, COMPASS, difference.heading)
+            patterns = (f"andidate {letter}", rf"{difference.object} [^.]*toward the {direction}\b")
+            flips.append(Mutation(_with_difference(p, c, d, heading=direction), patterns))
+    return flips
 
 
 def speeds(p: Predicates, rng: Random) -> list[Mutation]:
-    found = []
+    flips = []
     for i, o in enumerate(p.objects):
         if o.speed is None:
             continue
         speed = _other(rng, ALL_SPEEDS, o.speed)
         word = STILL if speed == "stationary" else rf"[mM]ov(?:ing|es) {speed}\b"
-        found.append(Mutation(_with_object(p, i, speed=speed), (o.object, word)))
-    return found
+        flips.append(Mutation(_with_object(p, i, speed=speed), (o.object, word)))
+    return flips
 
 
 def regions(p: Predicates, rng: Random) -> list[Mutation]:
-    found = []
+    flips = []
     for i, o in enumerate(p.objects):
         for field in ("region", "target_region"):
             if getattr(o, field) in ALL_REGIONS:
                 region = _other(rng, ALL_REGIONS, o.region, o.target_region)
-                told = (f"{o.object}", rf"{region}(?![-\w])")
-                found.append(Mutation(_with_object(p, i, **{field: region}), told))
+                patterns = (f"{o.object}", rf"{region}(?![-\w])")
+                flips.append(Mutation(_with_object(p, i, **{field: region}), patterns))
     for c, d, letter, difference in _differences(p):
         if difference.region:
             places = {o.object: o.target_region for o in p.objects}
             region = _other(rng, ALL_REGIONS, difference.region, places[difference.object])
-            told = (f"andidate {letter}", rf"{difference.object} {region}(?![-\w])")
-            found.append(Mutation(_with_difference(p, c, d, region=region), told))
+            patterns = (f"andidate {letter}", rf"{difference.object} {region}(?![-\w])")
+            flips.append(Mutation(_with_difference(p, c, d, region=region), patterns))
     for k, close in enumerate(p.close):
         region = _other(rng, ALL_REGIONS, close.region)
         flipped = (*p.close[:k], replace(close, region=region), *p.close[k + 1 :])
-        found.append(Mutation(replace(p, close=flipped), (f"very close {region}(?![-\\w])",)))
-    return found
+        flips.append(Mutation(replace(p, close=flipped), (f"very close {region}(?![-\\w])",)))
+    return flips
 
 
 def pairs(p: Predicates, rng: Random) -> list[Mutation]:
-    """A partner exchanged for an object that the pair's fact does not hold of."""
+    """Replace the partner of a pair by an object for which the fact is false."""
     names = [o.object for o in p.objects]
     met = {frozenset(m.objects) for m in (*p.courses, *p.contacts)}
     near = {frozenset(c.objects) for c in p.close}
-    found = []
+    flips = []
     for field, known in (("courses", met), ("contacts", met), ("close", near)):
         facts = getattr(p, field)
         for k, fact in enumerate(facts):
@@ -174,14 +174,14 @@ def pairs(p: Predicates, rng: Random) -> list[Mutation]:
                 partner = rng.choice(free)
                 new = replace(fact, objects=(kept, partner))
                 flipped = replace(p, **{field: (*facts[:k], new, *facts[k + 1 :])})
-                found.append(Mutation(flipped, (kept, partner, PAIRED[field])))
+                flips.append(Mutation(flipped, (kept, partner, PAIRED[field])))
     if p.courses:
-        found.append(Mutation(replace(p, courses=()), ("No pair",)))
-    return found
+        flips.append(Mutation(replace(p, courses=()), ("No pair",)))
+    return flips
 
 
 def colors(p: Predicates, rng: Random) -> list[Mutation]:
-    found = []
+    flips = []
     text = json.dumps(p.to_dict())
     names = {o.object for o in p.objects}
     for o in p.objects:
@@ -190,12 +190,12 @@ def colors(p: Predicates, rng: Random) -> list[Mutation]:
         if color in COLORS and free and len(names) == len(p.objects):
             name = f"{rng.choice(free)} {looks}"
             flipped = predicates_from(json.loads(text.replace(f'"{o.object}"', f'"{name}"')))
-            found.append(Mutation(flipped, (name,)))
-    return found
+            flips.append(Mutation(flipped, (name,)))
+    return flips
 
 
 def answers(p: Predicates, rng: Random) -> list[Mutation]:
-    """The right candidate's facts under another letter, and that letter's under its own."""
+    """Swap the facts of the right candidate with those of another one."""
     letters = [c.letter for c in p.candidates]
     right = letters.index(p.answer)
     other = rng.choice([i for i in range(len(letters)) if i != right])
@@ -203,38 +203,38 @@ def answers(p: Predicates, rng: Random) -> list[Mutation]:
 
 
 def candidates(p: Predicates, rng: Random) -> list[Mutation]:
-    """Two wrong candidates' facts exchanged."""
+    """Swap the facts of two wrong candidates."""
     wrong = [i for i, c in enumerate(p.candidates) if not c.agrees]
     i, j = rng.sample(wrong, 2)
     first, second = p.candidates[i], p.candidates[j]
     if first.other_objects == second.other_objects and (
         first.differences[0] in second.differences and second.differences[0] in first.differences
     ):
-        # What is told of each holds of both.
+        # The statement about each is true of both.
         return []
     return [Mutation(_swapped(p, i, j), (f"andidate {p.candidates[i].letter}",))]
 
 
 def _swapped(p: Predicates, i: int, j: int) -> Predicates:
-    found = list(p.candidates)
-    found[i], found[j] = (
-        replace(found[j], letter=found[i].letter),
-        replace(found[i], letter=found[j].letter),
+    flips = list(p.candidates)
+    flips[i], flips[j] = (
+        replace(flips[j], letter=flips[i].letter),
+        replace(flips[i], letter=flips[j].letter),
     )
-    return replace(p, candidates=tuple(found))
+    return replace(p, candidates=tuple(flips))
 
 
 def times(p: Predicates, rng: Random) -> list[Mutation]:
-    """When a pair meets: another time, or never."""
-    found = []
+    """Change when a pair meets: another time, or never."""
+    flips = []
     for k, course in enumerate(p.courses):
         if course.when == "unseen":
             continue
         when = rng.choice([w for w in ("imminent", "soon", "later", None) if w != course.when])
         flipped = (*p.courses[:k], replace(course, when=when), *p.courses[k + 1 :])
-        told = "without contact|not meet" if when is None else f"about to|{when}"
-        found.append(Mutation(replace(p, courses=flipped), (*course.objects, told)))
-    return found
+        patterns = "without contact|not meet" if when is None else f"about to|{when}"
+        flips.append(Mutation(replace(p, courses=flipped), (*course.objects, patterns)))
+    return flips
 
 
 KINDS: dict[str, Callable[[Predicates, Random], list[Mutation]]] = {
@@ -247,4 +247,4 @@ KINDS: dict[str, Callable[[Predicates, Random], list[Mutation]]] = {
     "imminence": times,
     "candidate": candidates,
 }
-"""What can be flipped, by kind."""
+"""The generators of flips, by kind of fact."""

@@ -1,20 +1,20 @@
-"""Other words for what the built-in narrator says: synonyms, voice, order, merged sentences."""
+"""Paraphrases of the built-in narrator's sentences: synonyms, voice, order, merged sentences."""
 
 from __future__ import annotations
 
 import re
 from random import Random
 
-THING = r"((?:small |large )?(?:\w+ )?(?:\w+ )?(?:cube|sphere|cylinder))"
+OBJECT = r"((?:small |large )?(?:\w+ )?(?:\w+ )?(?:cube|sphere|cylinder))"
 REGION = r"(near the [a-z-]+)"
-WAY = r"(\w+)"
+DIRECTION = r"(\w+)"
 SPEED = r"(slowly|steadily|quickly|very quickly)"
 NAME = r"[Cc]andidate ([A-D])"
 
 RULES: list[tuple[str, tuple[str, ...]]] = [
     # Scene parse.
     (
-        rf"the {THING} is {REGION}(?:, moving| and moves) {SPEED} toward the {WAY}",
+        rf"the {OBJECT} is {REGION}(?:, moving| and moves) {SPEED} toward the {DIRECTION}",
         (
             r"the \1 moves \3 \4 \2",
             r"\2, the \1 heads \3 \4ward",
@@ -25,7 +25,7 @@ RULES: list[tuple[str, tuple[str, ...]]] = [
         ),
     ),
     (
-        rf"the {THING} {REGION} is moving {SPEED} toward the {WAY}",
+        rf"the {OBJECT} {REGION} is moving {SPEED} toward the {DIRECTION}",
         (
             r"the \1 \2 heads \3 \4",
             r"the \1, \2, rolls \4ward \3",
@@ -33,7 +33,7 @@ RULES: list[tuple[str, tuple[str, ...]]] = [
         ),
     ),
     (
-        rf"the {THING} (?:is stationary|rests) {REGION}",
+        rf"the {OBJECT} (?:is stationary|rests) {REGION}",
         (
             r"the \1 is at rest \2",
             r"\2, the \1 is motionless",
@@ -44,7 +44,7 @@ RULES: list[tuple[str, tuple[str, ...]]] = [
         ),
     ),
     (
-        rf"the {THING} is {REGION} and does not move",
+        rf"the {OBJECT} is {REGION} and does not move",
         (
             r"the \1 is \2 and is motionless",
             r"the \1, \2, does not move",
@@ -52,9 +52,9 @@ RULES: list[tuple[str, tuple[str, ...]]] = [
             r"the motionless \1 sits \2",
         ),
     ),
-    (rf"the {THING} is out of view", (r"the \1 cannot be seen", r"the \1 is not in view")),
+    (rf"the {OBJECT} is out of view", (r"the \1 cannot be seen", r"the \1 is not in view")),
     (
-        rf"the {THING} and the {THING} are on a collision course",
+        rf"the {OBJECT} and the {OBJECT} are on a collision course",
         (
             r"the \1 is on a collision course with the \2",
             r"the \2 and the \1 are on course to collide",
@@ -67,8 +67,8 @@ RULES: list[tuple[str, tuple[str, ...]]] = [
     ),
     # Motion analysis.
     (
-        rf"the {THING} and the {THING} are about to meet"
-        rf"|contact between the {THING} and the {THING} is imminent",
+        rf"the {OBJECT} and the {OBJECT} are about to meet"
+        rf"|contact between the {OBJECT} and the {OBJECT} is imminent",
         (
             r"the \1\3 is about to hit the \2\4",
             r"a collision between the \2\4 and the \1\3 is imminent",
@@ -77,15 +77,15 @@ RULES: list[tuple[str, tuple[str, ...]]] = [
         ),
     ),
     (
-        rf"the {THING} and the {THING} will meet (soon|later)",
+        rf"the {OBJECT} and the {OBJECT} will meet (soon|later)",
         (r"the \1 will collide with the \2 \3", r"the \2 will be hit by the \1 \3"),
     ),
     (
-        rf"contact between the {THING} and the {THING} comes (soon|later)",
+        rf"contact between the {OBJECT} and the {OBJECT} comes (soon|later)",
         (r"the \1 and the \2 will touch \3", r"the \2 runs into the \1 \3"),
     ),
     (
-        rf"the {THING} and the {THING} will (?:pass without contact|not meet)",
+        rf"the {OBJECT} and the {OBJECT} will (?:pass without contact|not meet)",
         (
             r"the \1 does not touch the \2",
             r"the \2 and the \1 will miss each other",
@@ -94,7 +94,7 @@ RULES: list[tuple[str, tuple[str, ...]]] = [
         ),
     ),
     (
-        rf"the {THING} (shifts slightly|moves across) toward the {WAY}",
+        rf"the {OBJECT} (shifts slightly|moves across) toward the {DIRECTION}",
         (
             r"the \1 \2 to the \3",
             r"toward the \3, the \1 \2",
@@ -102,11 +102,14 @@ RULES: list[tuple[str, tuple[str, ...]]] = [
             r"the \1, in turn, \2 \3",
         ),
     ),
-    (rf"the {THING} leaves the view", (r"the \1 exits the view", r"the \1 goes out of view")),
-    (rf"the {THING} enters the view {REGION}", (r"the \1 comes into view \2", r"the \1 enters \2")),
+    (rf"the {OBJECT} leaves the view", (r"the \1 exits the view", r"the \1 goes out of view")),
+    (
+        rf"the {OBJECT} enters the view {REGION}",
+        (r"the \1 comes into view \2", r"the \1 enters \2"),
+    ),
     # Prediction and outcome.
     (
-        rf"the {THING} and the {THING} (will be|are) very close {REGION}",
+        rf"the {OBJECT} and the {OBJECT} (will be|are) very close {REGION}",
         (
             r"the \1 and the \2 \3 very close together \4",
             r"the \2 is very close to the \1 \4",
@@ -114,16 +117,16 @@ RULES: list[tuple[str, tuple[str, ...]]] = [
         ),
     ),
     (
-        rf"the {THING} (?:will|should) be {REGION}",
+        rf"the {OBJECT} (?:will|should) be {REGION}",
         (r"the \1 ends up \2", r"\2 will be the \1", r"the \1 will lie \2", r"\2, expect the \1"),
     ),
     (
-        rf"the {THING} (?:remains|stays) {REGION}",
+        rf"the {OBJECT} (?:remains|stays) {REGION}",
         (r"the \1 is still \2", r"the \1 keeps its place \2"),
     ),
     # Candidates.
     (
-        rf"{NAME}(?: wrongly)? (?:shows|has) the {THING} {REGION}(?:,| and) not {REGION}",
+        rf"{NAME}(?: wrongly)? (?:shows|has) the {OBJECT} {REGION}(?:,| and) not {REGION}",
         (
             r"in candidate \1, the \2 is \3 instead of \4",
             r"candidate \1 places the \2 \3 rather than \4",
@@ -132,7 +135,7 @@ RULES: list[tuple[str, tuple[str, ...]]] = [
         ),
     ),
     (
-        rf"{NAME}(?: wrongly)? (?:does not show|lacks) the {THING}\b",
+        rf"{NAME}(?: wrongly)? (?:does not show|lacks) the {OBJECT}\b",
         (
             r"the \2 is missing from candidate \1",
             r"candidate \1 leaves out the \2",
@@ -141,7 +144,7 @@ RULES: list[tuple[str, tuple[str, ...]]] = [
         ),
     ),
     (
-        rf"{NAME}(?: wrongly)? shows the {THING}(?:, which should not be seen| by mistake)",
+        rf"{NAME}(?: wrongly)? shows the {OBJECT}(?:, which should not be seen| by mistake)",
         (
             r"candidate \1 shows the \2, although it should not be visible",
             r"candidate \1 adds the \2",
@@ -149,7 +152,7 @@ RULES: list[tuple[str, tuple[str, ...]]] = [
         ),
     ),
     (
-        rf"{NAME}(?: wrongly)? has the {THING} (slightly|clearly) off toward the {WAY}",
+        rf"{NAME}(?: wrongly)? has the {OBJECT} (slightly|clearly) off toward the {DIRECTION}",
         (
             r"in candidate \1 the \2 is \3 too far \4",
             r"candidate \1 places the \2 \3 \4 of its place",
@@ -175,7 +178,7 @@ COMPILED = [(re.compile(pattern, re.IGNORECASE), options) for pattern, options i
 
 
 def paraphrase(text: str, rng: Random) -> str:
-    """A rationale of the built-in narrator in other words and with some sentences joined."""
+    """Paraphrase a rationale of the built-in narrator and join some of its sentences."""
     return "\n".join(_line(line, rng) for line in text.splitlines())
 
 
@@ -183,9 +186,9 @@ def _line(line: str, rng: Random) -> str:
     heading, _, body = line.partition(": ")
     if heading == "Answer":
         return line
-    told = [_said(s, rng) for s in re.split(r"(?<=\.) ", body)]
-    joined = [told[0]]
-    for sentence in told[1:]:
+    sentences = [_paraphrase_sentence(s, rng) for s in re.split(r"(?<=\.) ", body)]
+    joined = [sentences[0]]
+    for sentence in sentences[1:]:
         if rng.random() < 0.3 and heading != "Outcome":
             link = rng.choice([", and ", "; ", ", while "])
             start = sentence if sentence[:2] in ("A ", "B ") else sentence[0].lower() + sentence[1:]
@@ -195,13 +198,13 @@ def _line(line: str, rng: Random) -> str:
     return f"{heading}: {' '.join(joined)}"
 
 
-def _said(sentence: str, rng: Random) -> str:
+def _paraphrase_sentence(sentence: str, rng: Random) -> str:
     if rng.random() < 0.2:
         return sentence
     for pattern, options in COMPILED:
         match = pattern.search(sentence)
         if match:
-            found = match.expand(rng.choice(options))
-            sentence = sentence[: match.start()] + found + sentence[match.end() :]
+            words = match.expand(rng.choice(options))
+            sentence = sentence[: match.start()] + words + sentence[match.end() :]
             break
     return sentence[0].upper() + sentence[1:]

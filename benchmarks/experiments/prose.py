@@ -1,4 +1,4 @@
-"""Single words of a true rationale exchanged for false ones, wherever they stand."""
+"""Replaces single words of a true rationale by false ones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from data.records import COLORS, LETTERS
 from teacher.predicates import COMPASS, Predicates
 
 Edit = tuple[str, tuple[int, int]]
-"""A mutated text and where the false word stands in it."""
+"""A mutated text and the span of the false word."""
 
 
 def _swap(text: str, match: re.Match[str], word: str) -> Edit:
@@ -24,8 +24,8 @@ def _words(words: list[str] | tuple[str, ...]) -> re.Pattern[str]:
 
 
 def _is_known(text: str, at: int, predicates: Predicates) -> bool:
-    """Whether the predicates tell how the object named last in a sentence moves: of one out of
-    view at the cut they do not, so that no word for its motion is false."""
+    """Whether the predicates know the motion of the last object named before `at`. They do not for
+    an object out of view at the cut, so no word for its motion is false."""
     before = text[text.rfind(".", 0, at) + 1 : at].lower()
     last = max(predicates.objects, key=lambda o: before.rfind(o.object))
     return last.object not in before or last.speed is not None
@@ -60,16 +60,16 @@ def colors(text: str, predicates: Predicates, rng: Random) -> Iterator[Edit]:
 
 
 def pairs(text: str, predicates: Predicates, rng: Random) -> Iterator[Edit]:
-    """A partner exchanged in each sentence of the motion analysis that tells of exactly a pair."""
+    """Replace the partner in each sentence of the motion analysis that states exactly one pair."""
     names = [o.object for o in predicates.objects]
     met = {frozenset(m.objects) for m in (*predicates.courses, *predicates.contacts)}
     start, stop = text.find("Motion analysis:"), text.find("Prediction:")
-    for found in re.finditer(r"[^.;]+[.;]", text[start:stop]):
-        inside = list(_words(names).finditer(text, start + found.start(), start + found.end()))
+    for clause in re.finditer(r"[^.;]+[.;]", text[start:stop]):
+        inside = list(_words(names).finditer(text, start + clause.start(), start + clause.end()))
         pair = frozenset(m[0] for m in inside)
-        denied = re.search(r"\b(?:not?|never|without|avoid|misse?s?|clear)\b", found[0])
-        told = re.search(r"contact|colli|meet|hit|strik|struck|touch|run|course|path", found[0])
-        if len(inside) == 2 and pair in met and told and not denied:
+        denied = re.search(r"\b(?:not?|never|without|avoid|misse?s?|clear)\b", clause[0])
+        stated = re.search(r"contact|colli|meet|hit|strik|struck|touch|run|course|path", clause[0])
+        if len(inside) == 2 and pair in met and stated and not denied:
             kept = inside[0][0]
             free = [n for n in names if n not in pair and frozenset((kept, n)) not in met]
             if free:
@@ -89,4 +89,4 @@ EDITS: dict[str, Callable[[str, Predicates, Random], Iterator[Edit]]] = {
     "pair": pairs,
     "answer": answers,
 }
-"""What can be exchanged, by kind."""
+"""The generators of false words, by kind of fact."""

@@ -1,12 +1,11 @@
-"""How long a benchmark takes to build without its frames, and how that grows with its scenes.
+"""The time and memory of building a benchmark without frames, by number of scenes.
 
     python -m benchmarks.speed.build 100 1000 10000
 
-For each number of scenes the dynapix preset is built with its quotas in proportion, stage by stage:
-scenes with their oracle, then items and queries, then databases. Given are seconds, scenes a second
-and a worker, and the most memory that all processes held together. The last one's report is printed
-whole. Builds go on below FOLDER (store/growth) where they were stopped, so a figure holds only for
-one that ran through.
+For each number of scenes, the dynapix preset is built with proportional quotas in three stages:
+scenes with their oracle, items and queries, databases. Prints the seconds of each stage, scenes per
+second and worker, and the peak memory of all processes together. An interrupted build resumes below
+FOLDER (store/growth), so only an uninterrupted run is a measurement.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ PAPER_SCENES = 10_000
 
 
 def preset(scenes: int) -> BenchmarkConfig:
-    """The dynapix preset at another size, its quotas and databases in proportion."""
+    """The dynapix preset for another number of scenes, with proportional quotas and databases."""
     cfg = compose("data.build", BuildCommand, ["benchmark=dynapix"]).benchmark
     cfg.name, cfg.scenes, share = f"growth-{scenes}", scenes, scenes / PAPER_SCENES
 
@@ -54,7 +53,7 @@ def preset(scenes: int) -> BenchmarkConfig:
 
 
 class Peak:
-    """The most memory (GiB) that this process and its children held at once since it was begun."""
+    """Samples the memory (GiB) of this process and its children and keeps the maximum."""
 
     def __init__(self) -> None:
         self.gib = 0.0

@@ -1,16 +1,14 @@
-"""GPU hours of the paper-scale training runs, by arithmetic over measured rates.
+"""Estimates the GPU hours of the paper-scale training runs from measured rates.
 
     python -m benchmarks.speed.hours
     python -m benchmarks.speed.hours --student qwen3_vl_2b --retriever qwen3_vl_emb_2b
 
 A run passes its training samples or queries once an epoch, so its hours are
-passes / (passes a second) / 3600. The rates are lines of benchmarks/rates.jsonl, which
-benchmarks.speed.sft_gpu and benchmarks.speed.contrastive_gpu add to on the card that they run on;
-of each card
-the last line of a preset counts. Where there is no rate, the benchmark that measures it is named.
-A little too long by design: a tenth of the training scenes is held out, and answers alone are
-shorter than the half rationales, half answers whose rate is measured. What a run's own evaluations
-take is not in it, nor are narration and measuring, whose rates no benchmark takes yet.
+passes / (passes per second) / 3600. The rates are lines of rates.jsonl beside this file, to which
+benchmarks.speed.sft_gpu and benchmarks.speed.contrastive_gpu append; the last line of a card and a
+preset counts. If a rate is missing, the output names the benchmark that measures it. The estimate
+is slightly high: a tenth of the training scenes is held out, and answer-only samples are shorter
+than the measured mix of rationales and answers. Evaluation and narration are not included.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ REGIMES = ("answer_only", "cot", "cot_no_candidate_analysis", "cot_no_match_layo
 
 @dataclass(frozen=True)
 class Rate:
-    """What a card trained: `rate` samples or queries a second of a preset over a base."""
+    """A measured rate: samples or queries per second of a preset over a base on a card."""
 
     benchmark: str
     preset: str
@@ -44,7 +42,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class Step:
-    """A training run of the paper's scale, and what measures its rate."""
+    """A training run of the paper's scale and the benchmark that measures its rate."""
 
     name: str
     passes: float
@@ -55,7 +53,7 @@ class Step:
 
     @property
     def command(self) -> str:
-        """What measures its rate."""
+        """The command that measures the rate."""
         size = self.preset.replace("emb_", "")
         return f"python -m benchmarks.speed.{self.benchmark} {size} --base {self.base}"
 
@@ -73,14 +71,14 @@ def main() -> None:
 
 
 def steps(student: str, retriever: str) -> list[Step]:
-    """The training runs that `make paper` makes."""
+    """The training runs of `make paper`."""
     found = []
     for regime in REGIMES:
         overrides = [f"+exp={regime}", "benchmark=dynapix", f"student={student}"]
         cfg = compose("train.sft", SftCommand, overrides)
         track = cfg.benchmark.selection
         items = _training(q for by in (track.event, track.time, track.window) for q in by.values())
-        # Each item is answered, and reasoned about where the regime has rationales.
+        # A CoT regime has two samples an item: one in answer mode, one in reasoning mode.
         samples = items * (1 if regime == "answer_only" else 2)
         base = _base(cfg.student.quantization)
         passes = samples * cfg.train.epochs
@@ -101,13 +99,13 @@ def _base(quantization: str) -> str:
 
 
 def hours(passes: float, rate: float) -> float:
-    """Hours of so many passes at a rate a second."""
+    """Hours of `passes` at `rate` passes per second."""
     return passes / rate / 3600
 
 
 def table(wanted: list[Step], rates: list[Rate]) -> str:
-    """Hours by step and card, and what to run where there is no rate."""
-    # The last line of a card stands for it.
+    """Format the hours by step and card, and the commands that measure missing rates."""
+    # Later lines of a card replace earlier ones.
     latest = {(r.benchmark, r.preset, r.base, r.card): r for r in rates}.values()
     lines: list[str] = []
     missing: dict[str, list[str]] = {}
@@ -132,10 +130,10 @@ def table(wanted: list[Step], rates: list[Rate]) -> str:
 
 
 def read(path: Path) -> list[Rate]:
-    """The measured rates, oldest first; none where there is no file.
+    """Read the measured rates, oldest first; an absent file has none.
 
     Raises:
-        UserError: a line is no rate.
+        UserError: A line is not a valid rate.
     """
     if not path.exists():
         return []
@@ -147,14 +145,15 @@ def read(path: Path) -> list[Rate]:
                 raise ValueError
         except (ValueError, TypeError) as error:
             raise UserError(
-                f"{path}, line {number} is no measured rate above 0: delete it, or measure again"
+                f"{path}, line {number} is not a valid rate: delete the line or measure again",
+                code="damaged-file",
             ) from error
         found.append(rate)
     return found
 
 
 def add(benchmark: str, preset: str, base: str, rate: float, card: str, path: Path = RATES) -> None:
-    """Keep what was measured today."""
+    """Append a rate measured today."""
     line = Rate(benchmark, preset, base, round(rate, 4), card, date.today().isoformat())
     with path.open("a") as file:
         file.write(json.dumps(asdict(line)) + "\n")

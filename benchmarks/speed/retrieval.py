@@ -1,21 +1,20 @@
-"""Ranking a database: its time beside one bare matrix product, its memory, and faiss beside it.
+"""The time and memory of ranking a database, beside one matrix product and beside faiss.
 
     python -m benchmarks.speed.retrieval ranks
     python -m benchmarks.speed.retrieval large
     python -m benchmarks.speed.retrieval index
 
-`ranks` counts the exact ranks of 2,002 queries over 10,000 frames at all seven widths up to 4,096,
-beside one fp32 product of the same two tables, in turns: medians of the rounds.
+`ranks` computes the exact ranks of 2,002 queries over 10,000 frames at all seven widths up to
+4,096, alternating with one fp32 product of the same two tables; medians of the rounds.
 
-`large` does it over 1,000,000 frames in the files of `evaluation.embedders.cache`, which it writes
-to a
-folder first (16 GiB; deleted at the end): seconds, and the process's peak of resident memory from
-start to end. It takes 256 queries; time grows with their number, memory by 100 KiB each.
+`large` ranks 256 queries over 1,000,000 frames in cache files, which it writes first (16 GiB,
+deleted at the end): seconds and the peak of resident memory. Time is linear in the queries; memory
+grows by 100 KiB a query.
 
-`index` (extra `index`) holds faiss against exact ranks over 100,000 frames: recall, size, seconds.
+`index` (extra `index`) compares faiss with exact ranks over 100,000 frames: recall, size, seconds.
 
-Embeddings are random, but not without order: a scene has 128 frames around one place, and a query
-is near its target. OMP_NUM_THREADS=1 keeps it to one thread; what was used is printed.
+Embeddings are random but clustered: the 128 frames of a scene lie around one point, and a query
+lies near its target. OMP_NUM_THREADS=1 restricts it to one thread.
 """
 
 from __future__ import annotations
@@ -76,32 +75,32 @@ def measure_ranks(args: argparse.Namespace) -> None:
     bare, ours, ratio = map(statistics.median, zip(*rounds[1:], strict=True))
     print(f"{args.queries:,} queries, {args.frames:,} frames, widths {args.widths}")
     print(f"one fp32 product {bare:.2f} s, ranks at all widths {ours:.2f} s, {ratio:.2f} times it")
-    tell(ranks)
+    print_ranks(ranks)
 
 
 def measure_large(args: argparse.Namespace) -> None:
     folder = new_folder(args)
     try:
-        writing, shown = timed(lambda: written(folder, args))
+        writing, shown = timed(lambda: write_embeddings(folder, args))
         asked, targets = queries_near(args)
         gold = shown.rows([name(k) for k in targets])
         names = [name(k) for k in range(args.frames)]
         parts = (rows for _, rows in shown.parts(names))
-        opening, _ = timed(lambda: written(folder, args))
+        opening, _ = timed(lambda: write_embeddings(folder, args))
         ranking, ranks = timed(lambda: exact_ranks(asked, gold, parts, args.widths))
     finally:
         shutil.rmtree(folder)
     print(f"{args.queries:,} queries, {args.frames:,} frames, widths {args.widths}")
     print(f"written in {writing:.0f} s, checked in {opening:.1f} s, ranked in {ranking:.1f} s")
     print(f"peak of resident memory {peak():.2f} GiB")
-    tell(ranks)
+    print_ranks(ranks)
 
 
 def measure_index(args: argparse.Namespace) -> None:
     import_faiss()
     folder = new_folder(args)
     try:
-        shown = written(folder, args)
+        shown = write_embeddings(folder, args)
         names = [name(k) for k in range(args.frames)]
         asked, targets = queries_near(args)
         golds = [name(k) for k in targets]
@@ -118,15 +117,14 @@ def measure_index(args: argparse.Namespace) -> None:
     for t in told:
         recalls = ", ".join(f"{key} {t[key]:.3f}" for key in t if key.startswith("recall"))
         print(f"width {t['width']}: {recalls}; {t['bytes'] / 2**20:.0f} MiB, {t['seconds']:.2f} s")
-    tell(ranks)
+    print_ranks(ranks)
 
 
-def written(folder: Path, args: argparse.Namespace) -> EmbeddingCache:
-    """Random embeddings where `evaluation.embedders.cache` has a model's; those that are there are
-    kept."""
+def write_embeddings(folder: Path, args: argparse.Namespace) -> EmbeddingCache:
+    """Write random embeddings in the files of the embedding cache, and open them."""
     shown = EmbeddingCache(folder, "frame", {"weights": "random", "entries": args.widths[0]})
-    things = {name(k): k for k in range(args.frames)}
-    shown.complete(things, lambda some: vectors(some, args.widths[0]), SCENE)
+    frames = {name(k): k for k in range(args.frames)}
+    shown.complete(frames, lambda part: vectors(part, args.widths[0]), SCENE)
     return shown
 
 
@@ -146,7 +144,7 @@ def name(frame: int) -> str:
 
 
 def vectors(frames: range | list[int], entries: int) -> np.ndarray:
-    """Each frame's own, whatever others are asked for with it."""
+    """(frames, entries) embeddings; a frame's row does not depend on the other frames."""
     rows = np.empty((len(frames), entries), np.float32)
     places: dict[int, np.ndarray] = {}
     for k, frame in enumerate(frames):
@@ -159,7 +157,7 @@ def vectors(frames: range | list[int], entries: int) -> np.ndarray:
 
 
 def queries_near(args: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
-    """Queries, and the numbers of their targets."""
+    """Query embeddings, and the indices of their target frames."""
     rng = np.random.default_rng(2)
     targets = np.sort(rng.choice(args.frames, args.queries, replace=args.queries > args.frames))
     near = vectors(targets.tolist(), args.widths[0])
@@ -173,12 +171,12 @@ def timed(work: Callable) -> tuple[float, object]:
 
 
 def peak() -> float:
-    """GiB of this process, the most so far."""
+    """The peak of resident memory of this process so far, in GiB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
-def tell(ranks: Ranks) -> None:
-    """That something was ranked, and not by chance."""
+def print_ranks(ranks: Ranks) -> None:
+    """Print how often the target is first, as a check that the ranks are not random."""
     for k, width in enumerate(ranks.widths):
         first = (ranks.found[k] & (ranks.greater[k] == 0)).mean()
         print(f"  width {width}: target first {first:.1%}, tied {(ranks.tied[k] > 0).mean():.1%}")
