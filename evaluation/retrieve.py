@@ -36,7 +36,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
 
     from data.render.frame_cache import Frames
     from evaluation.embedders import embed
-    from evaluation.metrics.accuracy import breakdown
+    from evaluation.metrics import breakdown
     from evaluation.reporting import tables
     from evaluation.retrieval import faiss_index, standard_test
     from models.precision import resolve_precision
@@ -66,7 +66,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
         rows += breakdown.retrieval_rows(store.name, name, ranks, queries, cfg.seed)
         curves += breakdown.recall_curves(name, ranks, queries)
 
-    apart = breakdown.ranks_apart(found, queries, cfg.seed)
+    apart = breakdown.compare_retrievers(found, queries, cfg.seed)
     told = [tables.rank_differences_table(apart)] if apart else []
     told += [tables.index_table(indexes)] if indexes else []
     standard_test.write_ranks(run.folder, found, queries)

@@ -46,7 +46,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from data.render.frame_cache import Frames
     from evaluation.embedders.embed import embedders
     from evaluation.generators.model_source import open_generator
-    from evaluation.metrics.accuracy import breakdown
+    from evaluation.metrics import breakdown
     from evaluation.reporting import reference, tables
     from evaluation.reporting.results import UNTRAINED
     from evaluation.retrieval import predicted_texts, standard_test, text_matching

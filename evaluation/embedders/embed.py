@@ -23,16 +23,15 @@ from data.render.frame_cache import Frames, resized
 from data.store import Store
 from evaluation.embedders.cache import EmbeddingCache
 from evaluation.reporting.results import UNTRAINED
-from models.checks import (
-    check_base,
-    check_pooling,
-    check_widths,
+from models.checks import check_pooling, check_widths
+from models.fingerprints import (
     image_model_id,
     model_id,
     pin_revisions,
     processor_digest,
     weights_digest,
 )
+from models.resolved import check_base
 from models.trained_runs import product_folder, run_title
 
 if TYPE_CHECKING:

@@ -11,16 +11,9 @@ import numpy as np
 
 from data.records import RetrievalQuery, SelectionItem
 from data.tracks.selection.time import CELLS
-from evaluation.metrics.accuracy import (
-    Interval,
-    SceneBootstrap,
-    accuracy_by_family,
-    accuracy_by_group,
-    expected_hits,
-    macro_by_scene,
-    query_measures,
-    summary,
-)
+from evaluation.metrics.accuracy import accuracy_by_family, accuracy_by_group
+from evaluation.metrics.intervals import Interval, SceneBootstrap, macro_by_scene
+from evaluation.metrics.ranking import expected_hits, query_metrics, summary
 from evaluation.reporting.results import RECALLS, RetrievalResult, SelectionResult
 from evaluation.retrieval.exact_search import Ranks
 
@@ -64,7 +57,7 @@ def retrieval_rows(
         scenes = SceneBootstrap([queries[k].scene_id for k in of], seed)
         for k, width in enumerate(ranks.widths):
             counts = (ranks.greater[k, of], ranks.tied[k, of], ranks.found[k, of])
-            each = query_measures(*counts, ranks.frames, RECALLS)
+            each = query_metrics(*counts, ranks.frames, RECALLS)
             found = [_measured(measure, values, scenes) for measure, values in each.items()]
             sizes = (len(of), ranks.frames)
             cost = (ranks.bytes and ranks.bytes[k], ranks.seconds and ranks.seconds[k])
@@ -84,7 +77,7 @@ def compare_retrievers(
     for right, other in others:
         for k, width in enumerate(one.widths):
             each = [
-                query_measures(r.greater[k], r.tied[k], r.found[k], r.frames, RECALLS)
+                query_metrics(r.greater[k], r.tied[k], r.found[k], r.frames, RECALLS)
                 for r in (one, other)
             ]
             names = [*(f"recall@{k}" for k in RECALLS), "mrr"]

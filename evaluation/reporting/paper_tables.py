@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from conf.errors import UserError
 from conf.multirun.summary import AT_START_SUFFIX
-from evaluation.metrics.accuracy import Interval
+from evaluation.metrics.intervals import Interval
 from evaluation.reporting import reference as paper
 from evaluation.reporting.measurements import SUITES, Measured
 from evaluation.reporting.results import SIMILARITY

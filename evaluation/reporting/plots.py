@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from data.records import LETTERS
-from evaluation.metrics.accuracy import Interval, wilson
+from evaluation.metrics.intervals import Interval, wilson_interval
 from evaluation.reporting import reference as paper
 from evaluation.reporting.figures import FAINT, INK, color_of, legend_above, literal
 from evaluation.reporting.results import UNTRAINED
@@ -44,7 +44,7 @@ def by_horizon(subtypes: Mapping[str, Interval]) -> dict[str, Interval]:
             right, n = hits.get(horizon, (0.0, 0))
             hits[horizon] = (right + found.value * found.n, n + found.n)
     return {
-        horizon: Interval(right / n, *wilson(right, n), n)
+        horizon: Interval(right / n, *wilson_interval(right, n), n)
         for horizon, (right, n) in sorted(hits.items(), key=lambda found: _how_far(found[0]))
     }
 

@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from evaluation.metrics.accuracy import Interval
 from evaluation.metrics.calibration import Calibration, PositionBias
+from evaluation.metrics.intervals import Interval
 from evaluation.metrics.significance import PairedComparison
 from evaluation.reporting import figures, plots, tables
 from evaluation.reporting import paper_tables as shaped

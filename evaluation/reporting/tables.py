@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from data.records import FAMILIES, LETTERS
-from evaluation.metrics.accuracy import Interval
 from evaluation.metrics.calibration import Calibration, PositionBias
+from evaluation.metrics.intervals import Interval
 from evaluation.metrics.significance import PairedComparison
 from evaluation.reporting import reference as paper
 from evaluation.reporting.results import RECALLS, SIMILARITY, RetrievalResult, SelectionResult

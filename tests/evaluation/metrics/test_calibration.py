@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from evaluation.metrics.accuracy import wilson
 from evaluation.metrics.calibration import BINS, measure_calibration, measure_position_bias
+from evaluation.metrics.intervals import wilson_interval
 from evaluation.reporting.tables import calibration_table, parsing_table, position_table
 
 
@@ -25,7 +25,7 @@ def test_one_who_always_says_the_same_is_off_by_the_difference():
     # The Brier score is the outcome's variance and the square of the bias.
     assert found.brier == pytest.approx(0.65 * 0.35 + 0.15**2)
     [only] = found.bins
-    assert (only.accuracy.low, only.accuracy.high) == wilson(13, 20)
+    assert (only.accuracy.low, only.accuracy.high) == wilson_interval(13, 20)
 
 
 def test_one_who_knows_how_sure_to_be_comes_close_to_zero():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from evaluation.metrics.accuracy import Interval
+from evaluation.metrics.intervals import Interval
 from evaluation.reporting import item_browser as shown
 from evaluation.reporting.page import embedded
 from evaluation.reporting.plots import by_horizon, confusion

@@ -8,14 +8,11 @@ import pytest
 from PIL import Image
 
 from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
-from evaluation.metrics.accuracy import (
-    accuracy_by_family,
-    metrics_from_counts,
-    query_measures,
-    wilson,
-)
+from evaluation.metrics.accuracy import accuracy_by_family
 from evaluation.metrics.breakdown import compare_retrievers, recall_curves, selection_row
 from evaluation.metrics.breakdown import retrieval_rows as retrieval_rows_of
+from evaluation.metrics.intervals import wilson_interval
+from evaluation.metrics.ranking import query_metrics, ranking_metrics
 from evaluation.reporting import reference as paper
 from evaluation.reporting.figures import (
     builders_figure,
@@ -92,13 +89,13 @@ def test_rows_are_the_metrics_of_their_queries_with_an_interval_around(ranks, qu
         of = [k for k, q in enumerate(queries) if row.builder in (None, q.builder)]
         k = ranks.widths.index(row.width)
         counts = (ranks.greater[k, of], ranks.tied[k, of], ranks.found[k, of])
-        metrics = metrics_from_counts(*counts, 10_000, RECALLS)
+        metrics = ranking_metrics(*counts, 10_000, RECALLS)
         assert {name: found.value for name, found in row.measures.items()} == metrics
         assert (row.queries, row.frames) == (len(of), 10_000)
         for found in row.measures.values():
             assert found.low <= found.value <= found.high
             assert found.n == len(of)
-    each = query_measures(ranks.greater[1], ranks.tied[1], ranks.found[1], 10_000, RECALLS)
+    each = query_metrics(ranks.greater[1], ranks.tied[1], ranks.found[1], 10_000, RECALLS)
     scenes = [q.scene_id for q in queries]
     for name, statistic in (("mrr", np.mean), ("median_rank", np.median), ("recall@10", np.mean)):
         found = rows[1].measures[name]
@@ -211,7 +208,9 @@ def test_a_row_holds_the_time_items_by_their_distance_and_macros_interval():
     for k, horizon in enumerate(("1 s", "2 s")):
         of = [c for n, c in enumerate(credits) if families[n] == "time" and n % 2 == k]
         assert row.horizons[horizon].value == pytest.approx(np.mean(of))
-        assert (row.horizons[horizon].low, row.horizons[horizon].high) == wilson(sum(of), len(of))
+        assert (row.horizons[horizon].low, row.horizons[horizon].high) == wilson_interval(
+            sum(of), len(of)
+        )
     assert row.families == accuracy_by_family(families, credits).families
     assert row.macro_interval.value == pytest.approx(row.macro)
     assert SelectionResult.from_dict(json.loads(json.dumps(row.to_dict()))) == row
