@@ -14,27 +14,27 @@ from conf.errors import SettingsError, UserError
 from conf.keys import nearest
 from conf.schema import BenchmarkConfig, BuildCommand
 from data.parallel import Workers
-from data.partial_build import flat, growing_folder
-from data.render.prerender import RECORD, render_ahead
+from data.partial_build import flatten, lock_partial_build
+from data.render.prerender import RECORD, prerender_frames
 from data.store import (
     FRAMES,
     MANIFEST,
     PARTS,
     PLAN,
     Store,
-    digests,
+    add_checksum,
+    component_versions,
+    hash_files,
     load_scene,
     open_store,
     save_rows,
     scene_path,
-    sealed,
-    versions,
     write_atomically,
 )
-from data.tracks.build_items import family_quotas, make_items_and_queries, recipes, suite
+from data.tracks.build_items import family_quotas, item_builders, make_items_and_queries, suite_name
 from data.tracks.retrieval import future
 from data.tracks.retrieval.database import make_databases
-from data.tracks.shortfalls import count, shortfalls, summary
+from data.tracks.shortfalls import count_records, find_shortfalls, summarize_store
 from data.world.scenes import make_scenes
 
 log = logging.getLogger(__name__)
@@ -44,8 +44,8 @@ log = logging.getLogger(__name__)
 def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
     workers = Workers(cfg.workers, cfg.parallel)
     store = ensure_items(cfg.benchmark, Path(cfg.store), workers, cfg.strict)
-    render_ahead(store, cfg.frames, cfg.frames_gb, workers)
-    log.info(summary(store))
+    prerender_frames(store, cfg.frames, cfg.frames_gb, workers)
+    log.info(summarize_store(store))
     return {name: float(count) for name, count in store.manifest["counts"].items()}
 
 
@@ -54,7 +54,7 @@ def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
     that it names; see `ensure_items`."""
     store = ensure_items(cfg, root, Workers(workers))
     if not (store.folder / FRAMES / RECORD).exists():
-        render_ahead(store, "named", None, Workers(workers))
+        prerender_frames(store, "named", None, Workers(workers))
     return store
 
 
@@ -80,7 +80,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
     bad record of a release stops it where `strict`."""
     check_names(cfg)
     log.info("building benchmark %s in %s", cfg.name, folder)
-    with growing_folder(cfg, folder) as growing:
+    with lock_partial_build(cfg, folder) as growing:
         if growing is None:
             return
         scene_ids, unread = make_scenes(cfg, growing, workers, strict)
@@ -94,16 +94,19 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         save_rows(rows, growing / "database.parquet")
         manifest = {
             "name": cfg.name,
-            "suite": suite(cfg),
+            "suite": suite_name(cfg),
             "seed": cfg.seed,
-            **versions(cfg.simulator, cfg.renderer, cfg.standin),
+            **component_versions(cfg.simulator, cfg.renderer, cfg.standin),
             "config": asdict(cfg),
-            "counts": count(scene_ids, items, queries, databases) | unread | dropped | left_out,
-            "shortfalls": shortfalls(cfg, items, queries, databases),
+            "counts": count_records(scene_ids, items, queries, databases)
+            | unread
+            | dropped
+            | left_out,
+            "shortfalls": find_shortfalls(cfg, items, queries, databases),
             "scenes": scene_ids,
-            "files": digests(growing),
+            "files": hash_files(growing),
         }
-        write_atomically(growing / MANIFEST, json.dumps(sealed(manifest), indent=1).encode())
+        write_atomically(growing / MANIFEST, json.dumps(add_checksum(manifest), indent=1).encode())
         growing.rename(folder)
         shutil.rmtree(folder / PARTS)
         (folder / PLAN).unlink()
@@ -112,9 +115,9 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
 def check_names(cfg: BenchmarkConfig) -> None:
     """Raises SettingsError where a quota names a family, cell or builder that does not exist."""
     named = [
-        (f"benchmark.selection.{family}", quotas, list(recipes(cfg)[family].CELLS))
+        (f"benchmark.selection.{family}", quotas, list(item_builders(cfg)[family].CELLS))
         for family, quotas in family_quotas(cfg).items()
-        if family in recipes(cfg)
+        if family in item_builders(cfg)
     ]
     builders = [str(b) for b in future.BUILDERS]
     named.append(("benchmark.retrieval.builders", cfg.retrieval.builders, builders))
@@ -126,9 +129,10 @@ def check_names(cfg: BenchmarkConfig) -> None:
         if name not in known
     ]
     problems += [
-        f"benchmark.selection.{family}: suite {suite(cfg)} has no items of it, leave the family out"
+        f"benchmark.selection.{family}: suite {suite_name(cfg)} has no items of it, "
+        "leave the family out"
         for family, quotas in family_quotas(cfg).items()
-        if quotas and family not in recipes(cfg)
+        if quotas and family not in item_builders(cfg)
     ]
     if problems:
         raise SettingsError("\n".join(problems))
@@ -144,7 +148,7 @@ def _check_not_empty(cfg: BenchmarkConfig, items: list, queries: list) -> None:
 
 
 def _check_same_settings(store: Store, cfg: BenchmarkConfig) -> None:
-    built, asked = flat(store.manifest["config"]), flat(asdict(cfg))
+    built, asked = flatten(store.manifest["config"]), flatten(asdict(cfg))
     for key in (built | asked).keys() - {"folder"}:
         old, new = built.get(key), asked.get(key)
         if old != new:

@@ -31,8 +31,8 @@ from conf.schema import ExportCommand
 from data.parallel import Workers
 from data.publish.columns import Rows, features
 from data.records import POOLS, SPLITS, FrameRef, RetrievalQuery, SelectionItem
-from data.store import DATABASES, Store, digest, sealed, write_atomically
-from data.tracks.controls import MATCHED
+from data.store import DATABASES, Store, add_checksum, hash_file, write_atomically
+from data.tracks.controls import MATCHED_ANCHOR
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -147,15 +147,18 @@ def export(store: Store, folder: Path, plan: dict[str, Any]) -> None:
             write_atomically(growing / name, text.encode())
         record = plan | {
             "shards": [vars(s) for s in shards],
-            "described": {name: digest(growing / name) for name in described},
+            "described": {name: hash_file(growing / name) for name in described},
         }
-        write_atomically(growing / RECORD, json.dumps(sealed(record), indent=1).encode())
+        write_atomically(growing / RECORD, json.dumps(add_checksum(record), indent=1).encode())
         growing.rename(folder)
 
 
 def parts(store: Store) -> list[Part]:
     """What an export holds: every split of every track and every database that is not empty."""
-    items = {split: [*store.selection(split), *store.selection(split, MATCHED)] for split in SPLITS}
+    items = {
+        split: [*store.selection(split), *store.selection(split, MATCHED_ANCHOR)]
+        for split in SPLITS
+    }
     queries = {
         split: [q for pool in POOLS for q in store.retrieval(split, pool)] for split in SPLITS
     }
@@ -219,7 +222,7 @@ def _shard(growing: Path, name: str, part: Part) -> Shard:
         rows=told.num_rows,
         bytes=path.stat().st_size,
         uncompressed=sum(told.row_group(k).total_byte_size for k in range(told.num_row_groups)),
-        sha256=digest(path),
+        sha256=hash_file(path),
     )
 
 
@@ -229,14 +232,14 @@ def _begin(growing: Path, plan: dict[str, Any]) -> None:
     if there is None or _differing(there, plan):
         for path in growing.iterdir():
             shutil.rmtree(path) if path.is_dir() else path.unlink()
-    write_atomically(growing / RECORD, json.dumps(sealed(plan)).encode())
+    write_atomically(growing / RECORD, json.dumps(add_checksum(plan)).encode())
 
 
 def _record(folder: Path) -> dict[str, Any] | None:
     """What an export's folder says of itself; None where it says nothing that can be relied on."""
     try:
         record = json.loads((folder / RECORD).read_text())
-        return record if record == sealed(record) else None
+        return record if record == add_checksum(record) else None
     except (OSError, ValueError, AttributeError):
         return None
 
@@ -261,7 +264,7 @@ def _check_there(folder: Path, plan: dict[str, Any]) -> None:
     expected = there["described"] | {s["path"]: s["sha256"] for s in there["shards"]}
     for name, sha256 in expected.items():
         path = folder / name
-        if not path.exists() or digest(path) != sha256:
+        if not path.exists() or hash_file(path) != sha256:
             what = "damaged" if path.exists() else "missing"
             raise UserError(f"{path} is {what}: delete {folder} and export it again")
 

@@ -24,14 +24,14 @@ from data.records import (
     FrameRef,
     RetrievalQuery,
     SelectionItem,
-    shown_frames,
+    sample_prefix_frames,
 )
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import Store, write_atomically
-from data.tracks.controls import MATCHED
-from data.tracks.retrieval.counterfactual import consequence
+from data.tracks.controls import MATCHED_ANCHOR
+from data.tracks.retrieval.counterfactual import removal_displacement
 from data.tracks.selection.distractors import cell_rng
-from data.world.geometry import displacement_across
+from data.world.displacement import cross_scene_displacement
 
 log = logging.getLogger(__name__)
 
@@ -90,11 +90,11 @@ def sheets(store: Store, examples: int, seed: int) -> Iterator[Sheet]:
         rows = [look.absence(q) for q in _some(every, 2 * examples, seed, "counterfactual")]
         title = f"the scene as it was, and without an object ({len(every):,} queries)"
         yield Sheet("Retrieval: counterfactual", title, "counterfactual.png", sheet(rows))
-    if every := store.selection(suite=MATCHED):
+    if every := store.selection(suite=MATCHED_ANCHOR):
         pairs = [every[k : k + 2] for k in range(0, len(every), 2)]
-        rows = [look.item(i) for pair in _some(pairs, examples, seed, MATCHED) for i in pair]
+        rows = [look.item(i) for pair in _some(pairs, examples, seed, MATCHED_ANCHOR) for i in pair]
         title = f"pairs that differ in their anchor alone ({len(pairs):,} pairs)"
-        yield Sheet("Controls", title, f"controls-{MATCHED}.png", sheet(rows))
+        yield Sheet("Controls", title, f"controls-{MATCHED_ANCHOR}.png", sheet(rows))
     names = [name for split in SPLITS for name in store.scene_ids(split)]
     scenes = [store.scene(name) for name in _some(names, 2 * examples, seed, "paths")]
     # Another simulator's camera stands elsewhere, and so does a stand-in's.
@@ -122,7 +122,7 @@ class Looker:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._frames = Frames(store)
+        self._frames = FrameReader(store)
 
     def item(self, item: SelectionItem) -> Row:
         """A selection item: its prefix and its candidates, the answer marked."""
@@ -155,7 +155,7 @@ class Looker:
         scene, absent = (self._store.scene(i) for i in (query.scene_id, query.target.scene_id))
         removed = [look.phrase for look in scene.objects].index(query.removed_object)
         factual, *others = query.hard_negatives
-        shift = consequence(scene, absent, removed)[query.target.frame]
+        shift = removal_displacement(scene, absent, removed)[query.target.frame]
         moment = _told(query, query.target)
         return Row(
             query.query_id,
@@ -174,7 +174,7 @@ class Looker:
     def _observed(
         self, asked: SelectionItem | RetrievalQuery, ringed: int | None = None
     ) -> list[Cell]:
-        shown = shown_frames(asked.prefix_start, asked.prefix_stop, OBSERVED)
+        shown = sample_prefix_frames(asked.prefix_start, asked.prefix_stop, OBSERVED)
         refs = [FrameRef(asked.scene_id, frame) for frame in shown]
         return [self._cell(ref, f"frame {ref.frame}", ringed=ringed) for ref in refs]
 
@@ -218,7 +218,7 @@ class Looker:
     def _apart(self, one: FrameRef, two: FrameRef) -> float:
         """How far two frames are apart, px at 336 x 336."""
         here, there = self._store.scene(one.scene_id), self._store.scene(two.scene_id)
-        return displacement_across(here, one.frame, there, two.frame)
+        return cross_scene_displacement(here, one.frame, there, two.frame)
 
 
 def _told(asked: SelectionItem | RetrievalQuery, frame: FrameRef) -> str:

@@ -19,7 +19,7 @@ from data.world.standins import generator_version
 
 
 @contextmanager
-def growing_folder(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | None]:
+def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | None]:
     """The folder beside `folder` that a build fills, held by this process alone; while another
     process holds it, this one waits. None where that one has built `folder` meanwhile.
 
@@ -68,7 +68,7 @@ def _plan(cfg: BenchmarkConfig) -> dict[str, Any]:
 
 def _check_same_plan(there: dict[str, Any], plan: dict[str, Any], growing: Path) -> None:
     """Scenes that took hours are not thrown away for a changed setting."""
-    was, now = flat(there), flat(plan)
+    was, now = flatten(there), flatten(plan)
     for key in was | now:
         if was.get(key) != now.get(key):
             name = key.replace("config.", "benchmark.", 1)
@@ -79,10 +79,10 @@ def _check_same_plan(there: dict[str, Any], plan: dict[str, Any], growing: Path)
             )
 
 
-def flat(config: dict[str, Any], above: str = "") -> dict[str, Any]:
+def flatten(config: dict[str, Any], above: str = "") -> dict[str, Any]:
     """Nested settings by dotted key."""
     found: dict[str, Any] = {}
     for key, value in config.items():
         name = f"{above}{key}"
-        found |= flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+        found |= flatten(value, f"{name}.") if isinstance(value, dict) else {name: value}
     return found

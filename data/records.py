@@ -295,7 +295,7 @@ class Rationale:
         return cls(**{**row, "reasons": tuple(row["reasons"])})
 
 
-def shown_frames(start: int, stop: int, count: int) -> list[int]:
+def sample_prefix_frames(start: int, stop: int, count: int) -> list[int]:
     """The frames of the inclusive range [start, stop] that a model is shown: `count` of them,
     evenly spread with both ends in; every frame where there are no more than `count`."""
     available = stop - start + 1

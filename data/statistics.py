@@ -20,8 +20,8 @@ from conf.runs import write_text
 from conf.schema import StatisticsCommand
 from data.records import LETTERS, SPLITS, Candidate, SelectionItem
 from data.store import Store
-from data.world.geometry import DIAGONAL, MODEL_SIZE, displacement_across
-from data.world.standins import view_of
+from data.world.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displacement
+from data.world.standins import standin_view
 
 log = logging.getLogger(__name__)
 PAPER = {
@@ -127,7 +127,7 @@ def _medians(values: dict[str, list[float]]) -> dict[str, float]:
 def between(item: SelectionItem, store: Store) -> np.ndarray:
     """(4, 4) displacements between an item's candidates, px at 336 x 336."""
     shown = [(store.scene(c.scene_id), c.frame) for c in item.candidates]
-    return np.array([[displacement_across(*one, *two) for two in shown] for one in shown])
+    return np.array([[cross_scene_displacement(*one, *two) for two in shown] for one in shown])
 
 
 def strategy_accuracy(items: list[SelectionItem], store: Store) -> dict[str, dict[str, float]]:
@@ -161,7 +161,7 @@ def _groups(item: SelectionItem) -> Iterable[str]:
 def nearest(item: SelectionItem, candidate: Candidate, store: Store) -> float:
     """How far a candidate is from the last observed frame: what stays as it was."""
     scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
-    return displacement_across(scene, item.prefix_stop, other, candidate.frame)
+    return cross_scene_displacement(scene, item.prefix_stop, other, candidate.frame)
 
 
 def farthest(item: SelectionItem, candidate: Candidate, store: Store) -> float:
@@ -183,7 +183,7 @@ def typical(item: SelectionItem, candidate: Candidate, store: Store) -> float:
     """The candidate most like the others. It looks at no prefix."""
     scene = store.scene(candidate.scene_id)
     return sum(
-        displacement_across(scene, candidate.frame, store.scene(c.scene_id), c.frame)
+        cross_scene_displacement(scene, candidate.frame, store.scene(c.scene_id), c.frame)
         for c in item.candidates
     )
 
@@ -195,7 +195,7 @@ def constant_velocity(item: SelectionItem, candidate: Candidate, store: Store) -
     scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
     seconds = (item.target_frame - item.prefix_stop) / scene.fps
     places = scene.positions[item.prefix_stop] + seconds * scene.velocities[item.prefix_stop]
-    expected, _ = view_of(store.manifest["config"].get("standin")).camera.project(places)
+    expected, _ = standin_view(store.manifest["config"].get("standin")).camera.project(places)
     there = {o: other.image_positions[candidate.frame, k] for k, o in enumerate(other.objects)}
     scale = MODEL_SIZE / np.array(scene.image_size)
     apart = [

@@ -43,17 +43,17 @@ from data.tracks.selection.distractors import BUILDERS_VERSION
 from data.world.standins import generator_version
 
 MANIFEST = "manifest.json"
-SEAL = "sha256"
+CHECKSUM_KEY = "sha256"
 PLAN = "plan.json"
 """What a build in progress is to become; gone from a whole store."""
 
 
-def versions(simulator: str, renderer: str, standin: str | None) -> dict[str, str]:
+def component_versions(simulator: str, renderer: str, standin: str | None) -> dict[str, str]:
     """What makes the same config give another benchmark: scenes, pixels, items and queries."""
     rendered = simulator == "bullet"
     return {
         "generator": generator_version(standin),
-        "renderer": render.version(renderer) if rendered else f"{simulator}'s own frames",
+        "renderer": render.renderer_version(renderer) if rendered else f"{simulator}'s own frames",
         "builders": BUILDERS_VERSION,
     }
 
@@ -140,24 +140,24 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
     return pq.ParquetFile(path).read().to_pylist()
 
 
-def digest(path: Path) -> str:
+def hash_file(path: Path) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def digests(folder: Path) -> dict[str, str]:
+def hash_files(folder: Path) -> dict[str, str]:
     """SHA-256 of every file that makes a store, by relative path."""
     paths = [*(folder / SCENES).glob("*.npz"), *folder.glob("*.parquet")]
     names = sorted(p.relative_to(folder).as_posix() for p in paths)
     with ThreadPoolExecutor(4) as pool:
-        found = pool.map(lambda name: digest(folder / name), names)
+        found = pool.map(lambda name: hash_file(folder / name), names)
         return dict(zip(names, found, strict=True))
 
 
-def sealed(manifest: dict[str, Any]) -> dict[str, Any]:
+def add_checksum(manifest: dict[str, Any]) -> dict[str, Any]:
     """A manifest with the SHA-256 of its own content."""
-    content = {key: value for key, value in manifest.items() if key != SEAL}
-    return content | {SEAL: hashlib.sha256(json.dumps(content).encode()).hexdigest()}
+    content = {key: value for key, value in manifest.items() if key != CHECKSUM_KEY}
+    return content | {CHECKSUM_KEY: hashlib.sha256(json.dumps(content).encode()).hexdigest()}
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ def open_store(folder: Path) -> Store:
     try:
         manifest = json.loads(path.read_text())
         config = manifest.get("config", {})
-        current = versions(
+        current = component_versions(
             config.get("simulator", "bullet"),
             config.get("renderer", "bullet"),
             config.get("standin"),
@@ -245,10 +245,10 @@ def open_store(folder: Path) -> Store:
                 f"{folder} was built by {key} version {built[key]}, this is version {version}; "
                 f"{rebuild}"
             )
-    if manifest != sealed(manifest):
+    if manifest != add_checksum(manifest):
         raise UserError(f"{path} is damaged (it was changed after the build); {rebuild}")
     files = manifest["files"]
-    found = digests(folder)
+    found = hash_files(folder)
     missing = [name for name in files if name not in found]
     damaged = [name for name in files if name in found and found[name] != files[name]]
     if missing or damaged:

@@ -34,7 +34,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
-    from data.render.frame_cache import Frames
+    from data.render.frame_cache import FrameReader
     from evaluation.embedders import embed
     from evaluation.metrics import breakdown
     from evaluation.reporting import tables
@@ -42,7 +42,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     from models.precision import resolve_precision
 
     queries, database = standard_test.load_standard_test(store)
-    frames = Frames(store, preset.image_size)
+    frames = FrameReader(store, preset.image_size)
     ids = [q.query_id for q in queries]
     names = [f.name for f in database]
     targets = [q.target.name for q in queries]

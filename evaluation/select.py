@@ -33,12 +33,12 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
-    from data.render.frame_cache import Frames
+    from data.render.frame_cache import FrameReader
     from evaluation.generators import model_source, response_log
     from evaluation.reporting import selection_report
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
-    frames = Frames(store, student.image_size)
+    frames = FrameReader(store, student.image_size)
     model = model_source.open_generator(cfg, folder, trained)
     given, keys, runs = {}, {}, Path(cfg.checkpoints, "select")
     # What a control changes shows only beside the same items as they are.
@@ -65,7 +65,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
         given, items, model.name, store.name, cfg, run.folder, about
     )
     letter = given[modes[0], cfg.control][0].letter
-    draw_item(items[0], letter, Frames(store), run.folder / "item.png")
+    draw_item(items[0], letter, FrameReader(store), run.folder / "item.png")
     return metrics
 
 
@@ -80,10 +80,10 @@ def default_modes(cfg: SelectCommand, regime: str) -> list[str]:
 
 def draw_item(item, chosen, frames, path: Path) -> None:
     """An item's prefix and candidates at full size, with what was chosen."""
-    from data.records import LETTERS, shown_frames
+    from data.records import LETTERS, sample_prefix_frames
     from evaluation.reporting.figures import item_figure
 
-    shown = shown_frames(item.prefix_start, item.prefix_stop, 6)
+    shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, 6)
     item_figure(
         [frames.image(item.scene_id, f) for f in shown],
         [frames.image(c.scene_id, c.frame) for c in item.candidates],
@@ -103,7 +103,7 @@ def select_items(
     Raises:
         UserError: the benchmark has none.
     """
-    from data.tracks.controls import MATCHED
+    from data.tracks.controls import MATCHED_ANCHOR
 
     items = store.selection("test", suite)
     if not items:
@@ -112,7 +112,7 @@ def select_items(
         )
         raise UserError(
             f"{store.folder} has no test items of the {suite or store.suite} suite to measure on"
-            f"{hint if suite == MATCHED else ''}"
+            f"{hint if suite == MATCHED_ANCHOR else ''}"
         )
     return limit_items(items, limit, seed)
 
@@ -122,12 +122,12 @@ def limit_items(items: list[SelectionItem], limit: int | None, seed: int) -> lis
     matched-anchor pairs it takes both items or neither."""
     import numpy as np
 
-    from data.tracks.controls import MATCHED, pairs
+    from data.tracks.controls import MATCHED_ANCHOR, pair_items
 
     if limit is None:
         return items
-    if items[0].suite == MATCHED:
-        matched = pairs(items)
+    if items[0].suite == MATCHED_ANCHOR:
+        matched = pair_items(items)
         order = np.random.default_rng(seed).permutation(len(matched))
         return [item for k in order[: limit // 2] for item in matched[k]]
     order = np.random.default_rng(seed).permutation(len(items))

@@ -29,8 +29,8 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.records import FrameRef
-    from data.render.frame_cache import Frames
-    from data.tracks.controls import MATCHED
+    from data.render.frame_cache import FrameReader
+    from data.tracks.controls import MATCHED_ANCHOR
     from evaluation.embedders import embed
     from evaluation.metrics.breakdown import accuracy_by_subtype, selection_row
     from evaluation.metrics.calibration import measure_position_bias
@@ -43,7 +43,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     candidates = {FrameRef(c.scene_id, c.frame) for item in items for c in item.candidates}
-    frames = Frames(store, preset.image_size)
+    frames = FrameReader(store, preset.image_size)
     precision = resolve_precision(trained.train.precision)
     rows, told, subtypes, letters, apart = [], [], {}, {}, []
     for embedder in embed.embedders(folder, preset, precision, store, run.folder):
@@ -60,7 +60,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         letters[name] = measure_position_bias(
             nearest_candidate.letters(scores), [item.letter for item in items]
         )
-        if cfg.suite == MATCHED:
+        if cfg.suite == MATCHED_ANCHOR:
             credits = {item.item_id: credit for item, credit in zip(items, right, strict=True)}
             apart.append((name, compare_anchors(items, credits, cfg.seed)))
 

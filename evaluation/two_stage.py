@@ -43,7 +43,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
-    from data.render.frame_cache import Frames
+    from data.render.frame_cache import FrameReader
     from evaluation.embedders.embed import embedders
     from evaluation.generators.model_source import open_generator
     from evaluation.metrics import breakdown
@@ -57,7 +57,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     precision = resolve_precision(frozen.train.precision)
     matcher = next(embedders(matched_by, frozen.retriever, precision, store, run.folder))
     student = trained.student
-    sample_of = partial(text_sample, Frames(store, student.image_size), student)
+    sample_of = partial(text_sample, FrameReader(store, student.image_size), student)
     model = open_generator(cfg, folder, trained)
     name = model.name
     log.info("asking %s", name)

@@ -21,7 +21,7 @@ from conf.schema import (
     TeacherConfig,
 )
 from data.records import RetrievalQuery
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.tiny_qwen3_vl import build_model, build_processor
 from train.student import dataset
@@ -89,8 +89,8 @@ def nf4_cfg(saved_base: str) -> StudentConfig:
 
 
 @pytest.fixture(scope="session")
-def frames(micro_store: Store) -> Frames:
-    return Frames(micro_store, 96)
+def frames(micro_store: Store) -> FrameReader:
+    return FrameReader(micro_store, 96)
 
 
 @pytest.fixture(scope="session")

@@ -69,7 +69,7 @@ class Trained:
 def main(cfg: ExportModelCommand, run: Run) -> Measured:
     trained = find(cfg)
 
-    from data.store import digest
+    from data.store import hash_file
     from models.resolved import check_base
     from models.trained_runs import EXPORT, export_record
     from train.common.model_card import text
@@ -78,7 +78,7 @@ def main(cfg: ExportModelCommand, run: Run) -> Measured:
     if not adapters.exists():
         raise UserError(f"{trained.saved} holds no adapters: delete the run and train again")
     check_base(trained.folder, trained.preset)
-    weights = digest(adapters)
+    weights = hash_file(adapters)
     folder = run.folder / trained.product
     if folder.exists():
         record = export_record(folder)

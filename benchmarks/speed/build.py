@@ -24,11 +24,11 @@ import psutil
 from conf.compose import compose
 from conf.schema import BenchmarkConfig, BuildCommand, Quota
 from data.parallel import Workers
-from data.partial_build import growing_folder
+from data.partial_build import lock_partial_build
 from data.store import load_scene, scene_path
 from data.tracks.build_items import family_quotas, make_items_and_queries
 from data.tracks.retrieval.database import make_databases
-from data.tracks.shortfalls import count, shortfalls
+from data.tracks.shortfalls import count_records, find_shortfalls
 from data.world.scenes import make_scenes
 
 PAPER_SCENES = 10_000
@@ -82,7 +82,7 @@ def timed(times: dict[str, float], stage: str) -> Iterator[None]:
 def measure(scenes: int, folder: Path, workers: int) -> str:
     cfg, pool, peak = preset(scenes), Workers(workers), Peak()
     times: dict[str, float] = {}
-    with growing_folder(cfg, folder / cfg.name) as growing:
+    with lock_partial_build(cfg, folder / cfg.name) as growing:
         with timed(times, "scenes"):
             scene_ids, _ = make_scenes(cfg, growing, pool, strict=True)
         with timed(times, "items"):
@@ -90,8 +90,8 @@ def measure(scenes: int, folder: Path, workers: int) -> str:
         with timed(times, "databases"):
             scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(growing, name)))
             queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
-    found = count(scene_ids, items, queries, databases) | dropped | left_out
-    short = shortfalls(cfg, items, queries, databases)
+    found = count_records(scene_ids, items, queries, databases) | dropped | left_out
+    short = find_shortfalls(cfg, items, queries, databases)
     print("\n".join(f"  {name:<40}{many:>8,}" for name, many in found.items()))
     print("\n".join(f"  short: {cell} has {has}" for cell, has in short.items()))
     absent = len(list(growing.glob("scenes/*-without-*.npz")))

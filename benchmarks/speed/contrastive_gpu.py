@@ -166,7 +166,7 @@ def asked(count: int) -> list[RetrievalQuery]:
 
 
 class Noise:
-    """Frames of noise, by scene and number, as `data.render.frame_cache.Frames` gives them."""
+    """Frames of noise, by scene and number, as `data.render.frame_cache.FrameReader` gives them."""
 
     def __init__(self, size: int) -> None:
         self._size = size

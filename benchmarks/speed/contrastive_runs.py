@@ -24,7 +24,7 @@ from conf.entry import Run
 from conf.schema import ContrastiveCommand
 from data.build import ensure_benchmark
 from data.records import RetrievalQuery
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
 from models import memory
 from models.lora_kernels import fuse, unfuse
@@ -73,7 +73,7 @@ def train(
     )
     if not helped:
         model[0].model.set_attn_implementation("sdpa")
-    frames = Frames(store, cfg.retriever.image_size)
+    frames = FrameReader(store, cfg.retriever.image_size)
     return trained(cfg, model, queries, frames, store, steps, plain, folder)
 
 
@@ -98,7 +98,7 @@ def trained(
     plain: bool,
     folder: Path,
 ) -> Figures:
-    """Train `steps` steps of a model and queries. `frames` are `data.render.frame_cache.Frames`,
+    """Train `steps` steps of a model and queries. `frames` are `data.render.frame_cache.FrameReader`,
     or what gives
     pixels like them; `store` is asked for a scene's oracle where the objective needs it."""
     cfg = replace(cfg, train=replace(cfg.train, max_steps=steps))
@@ -193,7 +193,7 @@ class LateFrames(SentenceTransformerDataCollator):
         self,
         queries: Sequence[RetrievalQuery],
         columns: Sequence[str],
-        frames: Frames,
+        frames: FrameReader,
         cfg: ContrastiveCommand,
     ) -> None:
         self._queries, self._columns = queries, columns

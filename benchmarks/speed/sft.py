@@ -247,7 +247,7 @@ def train_one(
 
     from benchmarks.speed import sft_runs
     from data.build import ensure_benchmark
-    from data.render.frame_cache import Frames
+    from data.render.frame_cache import FrameReader
     from models import loading, memory
     from models.precision import resolve_precision
     from teacher.narrate import ensure_rationales
@@ -263,7 +263,7 @@ def train_one(
         memory.keep_freed_memory()
     set_seed(sft_runs.SEED)
     model, processor = loading.load_student(cfg.student, cfg.train.precision, list)
-    training, _ = dataset.splits(built, rationales, cfg, Frames(built, cfg.student.image_size))
+    training, _ = dataset.splits(built, rationales, cfg, FrameReader(built, cfg.student.image_size))
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
     order = islice(LengthSampler(lengths, cfg.train.batch, cfg.seed), steps * cfg.train.batch)
     shown = sft_runs.AsImages(training) if images else training

@@ -11,8 +11,8 @@ from dataclasses import asdict
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from data.records import FrameRef, RetrievalQuery, SelectionItem, shown_frames
-from data.render.frame_cache import Frames
+from data.records import FrameRef, RetrievalQuery, SelectionItem, sample_prefix_frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ class Rows:
 
     def __init__(self, store: Store, images: bool) -> None:
         self._images = images
-        self._frames = Frames(store)
+        self._frames = FrameReader(store)
         self._shown = store.manifest["config"]["prefix_frames"]
         # Questions about one scene share many frames, and encoding takes longer than all else.
         self._encoded = lru_cache(maxsize=ENCODED)(self._encode)
@@ -125,7 +125,7 @@ class Rows:
         if isinstance(record, FrameRef):
             row = {**asdict(record), "database": split}
             return row | ({"image": self._picture(record)} if self._images else {})
-        shown = shown_frames(record.prefix_start, record.prefix_stop, self._shown)
+        shown = sample_prefix_frames(record.prefix_start, record.prefix_stop, self._shown)
         row = record.to_row() | {"shown_frames": shown}
         if not self._images:
             return row

@@ -14,7 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from data.records import FPS, Scene
 from data.render.appearance import RGB
-from data.world.geometry import RADIUS, Camera
+from data.world.camera import Camera
+from data.world.shapes import RADIUS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from data.publish.columns import MEANING
 from data.records import FAMILIES, POOLS, SPLITS
-from data.store import Store, versions
+from data.store import Store, component_versions
 
 if TYPE_CHECKING:
     from datasets import Features
@@ -150,7 +150,9 @@ def _columns(name: str, kinds: Features) -> str:
 
 def _making(store: Store) -> str:
     settings = store.manifest["config"]
-    made_by = versions(settings["simulator"], settings["renderer"], settings.get("standin"))
+    made_by = component_versions(
+        settings["simulator"], settings["renderer"], settings.get("standin")
+    )
     told = ", ".join(f"{name} {version}" for name, version in made_by.items())
     config = OmegaConf.to_yaml(OmegaConf.create(settings))
     return (

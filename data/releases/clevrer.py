@@ -29,7 +29,8 @@ from data.releases.validation import (
     get_field,
     scene_id,
 )
-from data.world.geometry import Camera, visibility
+from data.world.camera import Camera
+from data.world.visibility import compute_visibility
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -76,7 +77,7 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     poses = states["location"].astype(np.float64), quaternions(states["orientation"])
     camera = Camera()
     image_positions, _ = camera.project(poses[0])
-    _, fraction = visibility(looks, *poses, camera)
+    _, fraction = compute_visibility(looks, *poses, camera)
     video = get_field(record, "video_filename", str, str(path))
     beside = Path(str(path.relative_to(folder)).replace("annotation", "video"))
     scene = Scene(

@@ -18,9 +18,9 @@ import numpy as np
 
 from data.records import Candidate, FrameRef, Scene
 from data.tracks.selection import event, time
-from data.tracks.selection.distractors import Draft, Picker, of_scene
-from data.tracks.selection.event import Moment
-from data.world.events import onsets
+from data.tracks.selection.distractors import DistractorPicker, Draft, scene_candidates
+from data.tracks.selection.event import EventTiming
+from data.world.events import find_motion_onsets
 
 MOVI_A_STEP, MOVI_A_GAP = 10, 5
 """Frames from an event item's prefix's start to its end, and on to the event: at 12 fps nearly the
@@ -36,7 +36,7 @@ ELSEWHERE = 8
 @dataclass(frozen=True)
 class Cell:
     question: str
-    moments: Callable[[Scene], list[Moment]]
+    moments: Callable[[Scene], list[EventTiming]]
     """The moments of a scene that the cell can ask about, in order of time."""
 
 
@@ -56,7 +56,7 @@ class Recipe:
     CELLS: dict[str, Cell]
 
     def draft(
-        self, subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker
+        self, subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
     ) -> Draft | None:
         """An item of the cell at one of the scene's moments, tried in a random order."""
         cell = self.CELLS[subtype]
@@ -67,7 +67,7 @@ class Recipe:
             wrong = rng.permutation(unseen[unseen != moment.target])
             picked = picker.pick_each(
                 FrameRef(scene.scene_id, moment.target),
-                (of_scene(scene, wrong, "same_time"), self.same),
+                (scene_candidates(scene, wrong, "same_time"), self.same),
                 (elsewhere(cell, scene, rng, picker), 3 - self.same),
             )
             if picked is None:
@@ -93,7 +93,7 @@ class Recipe:
 
 
 def elsewhere(
-    cell: Cell, scene: Scene, rng: np.random.Generator, picker: Picker
+    cell: Cell, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
 ) -> Iterator[Candidate]:
     """The first such moment of some other scenes of the scenario, those that share most of the
     scene's looks first."""
@@ -109,13 +109,13 @@ def elsewhere(
 def around(events: Callable[[Scene], list[int]], step: int, gap: int) -> Cell:
     """Asks for the frame of an event, `gap` frames after a prefix of `step` frames and one."""
 
-    def moments(scene: Scene) -> list[Moment]:
+    def moments(scene: Scene) -> list[EventTiming]:
         found = []
         for frame in sorted(set(events(scene))):
             stop = frame - gap
             start = max(stop - step, 0)
             if stop - start + 1 >= LEAST_PREFIX:
-                found.append(Moment(frame, start, stop, frame))
+                found.append(EventTiming(frame, start, stop, frame))
         return found
 
     return Cell(event.QUESTION, moments)
@@ -124,10 +124,10 @@ def around(events: Callable[[Scene], list[int]], step: int, gap: int) -> Cell:
 def ahead(seconds: int) -> Cell:
     """Asks for the frame so many seconds after the scene's first."""
 
-    def moments(scene: Scene) -> list[Moment]:
+    def moments(scene: Scene) -> list[EventTiming]:
         second = round(scene.fps)
         target = second - 1 + second * seconds
-        return [Moment(target, 0, second - 1, target)] if target < scene.frames else []
+        return [EventTiming(target, 0, second - 1, target)] if target < scene.frames else []
 
     return Cell(time.question(seconds), moments)
 
@@ -139,7 +139,7 @@ def contacts(scene: Scene) -> list[int]:
 
 def motions(scene: Scene) -> list[int]:
     """Frames at which an object at rest is set in motion."""
-    return [frame for frame, _ in onsets(scene)]
+    return [frame for frame, _ in find_motion_onsets(scene)]
 
 
 def landings(scene: Scene) -> list[int]:

@@ -39,7 +39,7 @@ RENDERERS: dict[str, type[Renderer]] = {
 }
 
 
-def version(name: str) -> str:
+def renderer_version(name: str) -> str:
     """A renderer's version, whether or not it can run here.
 
     Raises:
@@ -53,22 +53,22 @@ def version(name: str) -> str:
     return RENDERERS[name].version
 
 
-def check(name: str) -> None:
+def check_renderer(name: str) -> None:
     """Find out whether a renderer can run here, before the work that leads up to it.
 
     Raises:
         UserError: it cannot, for want of a driver or a package, or there is no such renderer.
     """
-    version(name)
+    renderer_version(name)
     RENDERERS[name].check()
 
 
 @cache
-def renderer(name: str, width: int, height: int, view: View = STANDARD_VIEW) -> Renderer:
+def get_renderer(name: str, width: int, height: int, view: View = STANDARD_VIEW) -> Renderer:
     """This process's renderer of a name, a frame size (px) and a view.
 
     Raises:
         UserError: it cannot run here, or there is no such renderer.
     """
-    check(name)
+    check_renderer(name)
     return RENDERERS[name](width, height, view)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from data.records import COLORS
-from data.world.geometry import CUBE_HALF, RADIUS, STANDARD_CAMERA, Camera
+from data.world.camera import STANDARD_CAMERA, Camera
+from data.world.shapes import CUBE_HALF, RADIUS
 
 
 @dataclass(frozen=True)

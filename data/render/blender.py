@@ -20,7 +20,7 @@ from PIL import Image
 from conf.errors import UserError
 from data.records import Scene
 from data.render.appearance import RGB, STANDARD_VIEW, View
-from data.world.geometry import CUBE_HALF, RADIUS
+from data.world.shapes import CUBE_HALF, RADIUS
 
 BPY = "4.2.23"
 """The release of Blender's module that the extra `blender` installs; another draws other pixels."""

@@ -18,7 +18,7 @@ from PIL import Image
 from data.records import MATERIALS, Scene, SceneObject
 from data.render.appearance import RGB, STANDARD_VIEW, View, mesh, texture
 from data.render.floor import Floor
-from data.world.geometry import Camera
+from data.world.camera import Camera
 from data.world.physics import connect
 
 if TYPE_CHECKING:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from data.world.geometry import RADIUS, Camera
+from data.world.camera import Camera
+from data.world.shapes import RADIUS
 
 SHADOW_DEPTH = 0.55
 

@@ -24,9 +24,9 @@ from PIL import Image
 
 from data.records import Scene
 from data.releases.readers import READERS
-from data.render import renderer
+from data.render import get_renderer
 from data.store import Store, cached_scene, scene_path, write_atomically
-from data.world.standins import view_of
+from data.world.standins import standin_view
 
 log = logging.getLogger(__name__)
 
@@ -119,11 +119,13 @@ class FrameCache:
         if scene.footage is not None:
             images = READERS[self.simulator].load_images(scene, Path(self.release), frames)
             return {frame: np.asarray(image) for frame, image in images.items()}
-        render = renderer(self.renderer, self.width, self.height, view_of(self.standin)).render
+        render = get_renderer(
+            self.renderer, self.width, self.height, standin_view(self.standin)
+        ).render
         return {frame: np.asarray(render(scene, frame)) for frame in frames}
 
 
-class Frames:
+class FrameReader:
     """Pixels of a store's frames, decoded once and kept as long as they are used."""
 
     def __init__(self, store: Store, size: int | None = None) -> None:
@@ -164,10 +166,10 @@ class Frames:
         missing = [f for f in frames if f not in found]
         found |= self._cache.draw(scene_id, missing)
         pixels = np.stack([found[f] for f in frames])
-        return pixels if self._size is None else resized(pixels, self._size)
+        return pixels if self._size is None else resize_frames(pixels, self._size)
 
 
-def resized(pixels: np.ndarray, size: int) -> np.ndarray:
+def resize_frames(pixels: np.ndarray, size: int) -> np.ndarray:
     """(T, size, size, 3) uint8 of (T, height, width, 3), as models are shown frames."""
     import torch
     from torchvision.transforms.v2 import InterpolationMode
@@ -175,5 +177,5 @@ def resized(pixels: np.ndarray, size: int) -> np.ndarray:
 
     # Pillow gives the same to two levels of 255, frame by frame and five times as slowly.
     channels_first = torch.from_numpy(pixels).permute(0, 3, 1, 2)
-    resized = resize(channels_first, [size, size], InterpolationMode.BICUBIC, antialias=True)
-    return resized.permute(0, 2, 3, 1).contiguous().numpy()
+    resize_frames = resize(channels_first, [size, size], InterpolationMode.BICUBIC, antialias=True)
+    return resize_frames.permute(0, 2, 3, 1).contiguous().numpy()

@@ -10,11 +10,11 @@ from functools import partial
 from typing import Any
 
 from data.parallel import Workers
-from data.records import FrameRef, shown_frames
-from data.render import check
+from data.records import FrameRef, sample_prefix_frames
+from data.render import check_renderer
 from data.render.frame_cache import FrameCache, load_frames, save_frames
 from data.store import DATABASES, Store, write_atomically
-from data.tracks.controls import MATCHED
+from data.tracks.controls import MATCHED_ANCHOR
 
 log = logging.getLogger(__name__)
 
@@ -22,7 +22,7 @@ RECORD = "frames.json"
 GB = 1e9
 
 
-def render_ahead(store: Store, which: str, bound_gb: float | None, workers: Workers) -> None:
+def prerender_frames(store: Store, which: str, bound_gb: float | None, workers: Workers) -> None:
     """Render the frames that are not there yet: all, or those named by items, queries and
     databases, until they take `bound_gb` of disk space. What is left is drawn when it is asked for.
     """
@@ -32,7 +32,7 @@ def render_ahead(store: Store, which: str, bound_gb: float | None, workers: Work
         return
     config = store.manifest["config"]
     if which != "none" and config["simulator"] == "bullet":
-        check(config["renderer"])
+        check_renderer(config["renderer"])
     wanted = frames_to_render(store, which)
     databases = {name: set(store.database(name)) for name in DATABASES}
     ranked = set().union(*databases.values())
@@ -62,7 +62,7 @@ def frames_to_render(store: Store, which: str) -> dict[str, list[int]]:
     """Frames by scene, the test split's scenes first."""
     if which == "none":
         return {}
-    named = named_frames(store)
+    named = referenced_frames(store)
     if which == "all":
         named |= {
             scene: set(range(store.scene(scene).frames))
@@ -74,14 +74,14 @@ def frames_to_render(store: Store, which: str) -> dict[str, list[int]]:
     return {scene: sorted(named[scene]) for scene in order}
 
 
-def named_frames(store: Store) -> dict[str, set[int]]:
+def referenced_frames(store: Store) -> dict[str, set[int]]:
     """The frames of each scene that items, queries and databases name."""
     named: dict[str, set[int]] = defaultdict(set)
     count = store.manifest["config"]["prefix_frames"]
-    items = [*store.selection(), *store.selection(suite=MATCHED)]
+    items = [*store.selection(), *store.selection(suite=MATCHED_ANCHOR)]
     queries = [q for pool in ("future", "counterfactual") for q in store.retrieval(pool=pool)]
     for asked in (*items, *queries):
-        shown = shown_frames(asked.prefix_start, asked.prefix_stop, count)
+        shown = sample_prefix_frames(asked.prefix_start, asked.prefix_stop, count)
         named[asked.scene_id].update(shown)
     for frame in (
         *(c for i in items for c in i.candidates),

@@ -23,7 +23,7 @@ from data.parallel import Workers
 from data.records import RetrievalQuery, Scene, SelectionItem
 from data.releases import transfer_suites as transfer
 from data.store import PARTS, load_scene, scene_path, write_atomically
-from data.tracks.controls import MATCHED, fill_pairs
+from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
 from data.tracks.retrieval import counterfactual, future
 from data.tracks.selection import distractors, event, time, window
 from data.world.physics import GENERATOR_VERSION
@@ -70,12 +70,12 @@ def make_items_and_queries(
     return items, queries, dict(dropped)
 
 
-def recipes(cfg: BenchmarkConfig) -> Mapping[str, Any]:
+def item_builders(cfg: BenchmarkConfig) -> Mapping[str, Any]:
     """How the items of a benchmark's suite are made, by family: each has `CELLS` and `draft`."""
-    return transfer.TRANSFER_SUITES.get(suite(cfg), RECIPES)
+    return transfer.TRANSFER_SUITES.get(suite_name(cfg), RECIPES)
 
 
-def suite(cfg: BenchmarkConfig) -> str:
+def suite_name(cfg: BenchmarkConfig) -> str:
     """What the benchmark's items belong to."""
     if cfg.standin is not None:
         return f"standin_{cfg.standin}"
@@ -96,7 +96,7 @@ def _cells(cfg: BenchmarkConfig) -> dict[str, Quota]:
             for family, quotas in family_quotas(cfg).items()
             for subtype, quota in quotas.items()
         },
-        f"controls/{MATCHED}/pairs": cfg.selection.matched,
+        f"controls/{MATCHED_ANCHOR}/pairs": cfg.selection.matched,
         **{f"retrieval/future/{b}": _more(quota) for b, quota in cfg.retrieval.builders.items()},
         "retrieval/counterfactual/all": _more(cfg.retrieval.counterfactual),
     }
@@ -139,7 +139,7 @@ def _make_cell(
     track, group, cell = name.split("/")
     least = cfg.selection.min_displacement
     if track == "selection":
-        draw = partial(recipes(cfg)[group].draft, cell)
+        draw = partial(item_builders(cfg)[group].draft, cell)
         found, dropped = distractors.fill(cell, draw, scene_ids, scene_of, quota, cfg.seed, least)
     elif track == "controls":
         found, dropped = fill_pairs(scene_ids, scene_of, quota, cfg.seed, least)

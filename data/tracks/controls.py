@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from conf.schema import Quota
-from data.records import SELECTION_SECOND, FrameRef, Scene, SelectionItem, shown_frames
+from data.records import SELECTION_SECOND, FrameRef, Scene, SelectionItem, sample_prefix_frames
 from data.tracks.selection import distractors, event, time
-from data.tracks.selection.distractors import Draft, Picker, of_scene
+from data.tracks.selection.distractors import DistractorPicker, Draft, scene_candidates
 from data.world.events import collisions_in
 
-MATCHED = "matched_anchor"
+MATCHED_ANCHOR = "matched_anchor"
 """The suite of the pairs' items."""
 EVENT_QUESTION = (
     "Watch the 1-second observation video. Which image best shows what the scene will look like "
@@ -30,7 +30,7 @@ SECONDS = (1, 2)
 
 
 @dataclass(frozen=True)
-class Moment:
+class AnchorTiming:
     """An observation's inclusive range and the collision that comes `seconds` after it."""
 
     start: int
@@ -39,7 +39,7 @@ class Moment:
     seconds: int
 
 
-def moments(scene: Scene) -> Iterator[Moment]:
+def anchor_timings(scene: Scene) -> Iterator[AnchorTiming]:
     """The moments at which the next collision comes whole seconds after a second of observation."""
     for target in dict.fromkeys(c.frame for c in scene.collisions):
         for seconds in SECONDS:
@@ -47,21 +47,21 @@ def moments(scene: Scene) -> Iterator[Moment]:
             start = stop - SELECTION_SECOND + 1
             alone = not collisions_in(scene, stop + 1, target - 1)
             if start >= 0 and alone and target <= scene.frames - 1 - event.TAIL:
-                yield Moment(start, stop, target, seconds)
+                yield AnchorTiming(start, stop, target, seconds)
 
 
-def draft(scene: Scene, rng: np.random.Generator, picker: Picker) -> Draft | None:
+def draft(scene: Scene, rng: np.random.Generator, picker: DistractorPicker) -> Draft | None:
     """The item of a pair that names the time, at a random moment of the scene; its distractors are
     other moments after the observation."""
-    found = list(moments(scene))
+    found = list(anchor_timings(scene))
     for k in rng.permutation(len(found)):
         moment = found[k]
         later = rng.permutation(np.arange(moment.stop + 1, scene.frames))
-        pool = of_scene(scene, later[later != moment.target], "same_time")
+        pool = scene_candidates(scene, later[later != moment.target], "same_time")
         prefix = (moment.start, moment.stop)
         target = FrameRef(scene.scene_id, moment.target)
         picked = picker.pick(
-            target, pool, distractors.observed(scene, prefix), int(rng.integers(4))
+            target, pool, distractors.visible_objects(scene, prefix), int(rng.integers(4))
         )
         if picked is not None:
             return Draft(
@@ -89,16 +89,18 @@ def fill_pairs(
     least: float,
 ) -> tuple[list[SelectionItem], int]:
     """Pairs up to the quota, each as two items one after the other; see `drafts.fill`."""
-    items, dropped = distractors.fill(MATCHED, draft, scene_ids, scene_of, quota, seed, least)
+    items, dropped = distractors.fill(
+        MATCHED_ANCHOR, draft, scene_ids, scene_of, quota, seed, least
+    )
     return [each for item in items for each in _pair(item)], dropped
 
 
 def _pair(item: SelectionItem) -> tuple[SelectionItem, SelectionItem]:
     place = _place(item)
-    by_time = replace(item, suite=MATCHED, item_id=f"{MATCHED}-time-{place}")
+    by_time = replace(item, suite=MATCHED_ANCHOR, item_id=f"{MATCHED_ANCHOR}-time-{place}")
     by_event = replace(
         by_time,
-        item_id=f"{MATCHED}-event-{place}",
+        item_id=f"{MATCHED_ANCHOR}-event-{place}",
         family="event",
         subtype="next_collision",
         question=EVENT_QUESTION,
@@ -106,7 +108,7 @@ def _pair(item: SelectionItem) -> tuple[SelectionItem, SelectionItem]:
     return by_event, by_time
 
 
-def pairs(items: Sequence[SelectionItem]) -> list[tuple[SelectionItem, SelectionItem]]:
+def pair_items(items: Sequence[SelectionItem]) -> list[tuple[SelectionItem, SelectionItem]]:
     """The matched-anchor pairs among items, in their order: that which names the event, and that
     which names the time."""
     by_time = {_place(item): item for item in items if item.family == "time"}
@@ -117,12 +119,12 @@ def _place(item: SelectionItem) -> str:
     return f"{item.scene_id}-{item.prefix_stop}-{item.target_frame}"
 
 
-def observed(item: SelectionItem, count: int, control: str | None) -> list[int]:
+def prefix_under_control(item: SelectionItem, count: int, control: str | None) -> list[int]:
     """The frames that are shown as an item's prefix, in the order in which they are shown: `count`
     of them, in another order for `shuffled_prefix`, none for `candidate_only`."""
     if control == "candidate_only":
         return []
-    shown = shown_frames(item.prefix_start, item.prefix_stop, count)
+    shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, count)
     if control == "shuffled_prefix":
         digest = hashlib.sha256(item.item_id.encode()).digest()
         rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))

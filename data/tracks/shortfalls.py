@@ -8,10 +8,10 @@ from conf.schema import BenchmarkConfig
 from data.records import SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from data.store import Store
 from data.tracks.build_items import family_quotas
-from data.tracks.controls import MATCHED
+from data.tracks.controls import MATCHED_ANCHOR
 
 
-def count(
+def count_records(
     scene_ids: dict[str, list[str]],
     items: list[SelectionItem],
     queries: list[RetrievalQuery],
@@ -26,16 +26,20 @@ def count(
     return dict(tally)
 
 
-def shortfalls(
+def find_shortfalls(
     cfg: BenchmarkConfig,
     items: list[SelectionItem],
     queries: list[RetrievalQuery],
     databases: dict[str, list[FrameRef]],
 ) -> dict[str, str]:
     """What every cell, builder and database has, where that is less than its quota."""
-    found = Counter((f"{i.family}/{i.subtype}", i.split) for i in items if i.suite != MATCHED)
+    found = Counter(
+        (f"{i.family}/{i.subtype}", i.split) for i in items if i.suite != MATCHED_ANCHOR
+    )
     # A pair is two items.
-    found.update((MATCHED, i.split) for i in items if i.suite == MATCHED and i.family == "time")
+    found.update(
+        (MATCHED_ANCHOR, i.split) for i in items if i.suite == MATCHED_ANCHOR and i.family == "time"
+    )
     found.update((_builder(q), q.split) for q in queries)
     wanted = {
         **{
@@ -43,7 +47,7 @@ def shortfalls(
             for family, quotas in family_quotas(cfg).items()
             for cell, quota in quotas.items()
         },
-        MATCHED: cfg.selection.matched,
+        MATCHED_ANCHOR: cfg.selection.matched,
         **{f"builder {b}": quota for b, quota in cfg.retrieval.builders.items()},
         "counterfactual": cfg.retrieval.counterfactual,
     }
@@ -66,14 +70,14 @@ def shortfalls(
 
 
 def _track(item: SelectionItem) -> str:
-    return MATCHED if item.suite == MATCHED else "selection"
+    return MATCHED_ANCHOR if item.suite == MATCHED_ANCHOR else "selection"
 
 
 def _builder(query: RetrievalQuery) -> str:
     return "counterfactual" if query.builder is None else f"builder {query.builder}"
 
 
-def summary(store: Store) -> str:
+def summarize_store(store: Store) -> str:
     """What a store holds and where it fell short, as a small table."""
     lines = [f"{store.folder} ({len(store.manifest['files'])} files, {store.identity})"]
     lines += [f"  {name:<36}{many:>8,}" for name, many in store.manifest["counts"].items()]

@@ -66,7 +66,7 @@ def first_contacts(touching: Iterable[tuple[int, tuple[int, int]]]) -> tuple[Col
     return tuple(sorted(found, key=lambda c: (c.frame, c.objects)))
 
 
-def onsets(scene: Scene) -> list[tuple[int, int]]:
+def find_motion_onsets(scene: Scene) -> list[tuple[int, int]]:
     """(frame, object) of every object that is set in motion after a rest from the beginning, in
     order of frame: the first frame at which it is away from where it began, and stays away."""
     moved = np.linalg.norm(scene.positions - scene.positions[0], axis=-1)

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data.records import FPS, FRAMES, Collision, Landing, SceneObject
-from data.world.geometry import BOUNDING_RADIUS, CUBE_HALF, RADIUS
+from data.world.shapes import BOUNDING_RADIUS, CUBE_HALF, RADIUS
 
 if TYPE_CHECKING:
     from pybullet_utils.bullet_client import BulletClient
@@ -62,7 +62,7 @@ class Physics:
         return 2 * max(BOUNDING_RADIUS.values()) + CLOSING / self.fps
 
 
-STANDARD = Physics()
+STANDARD_PHYSICS = Physics()
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class World:
         self._bullet = connect()
 
     def simulate(
-        self, bodies: list[Body], frames: int = FRAMES, physics: Physics = STANDARD
+        self, bodies: list[Body], frames: int = FRAMES, physics: Physics = STANDARD_PHYSICS
     ) -> Motion:
         """Run `bodies` for `frames` frames. The same bodies give the same bits every time."""
         ground, handles = self._place(bodies, physics)
@@ -241,7 +241,7 @@ class World:
 
 
 @cache
-def world() -> World:
+def shared_world() -> World:
     """This process's world."""
     return World()
 

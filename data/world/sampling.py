@@ -13,8 +13,17 @@ import numpy as np
 
 from conf.schema import BenchmarkConfig
 from data.records import COLORS, FPS, MATERIALS, SHAPES, Scene, SceneObject
-from data.world.geometry import BOUNDING_RADIUS, RADIUS, STANDARD_CAMERA, Camera, visibility
-from data.world.physics import FRICTION_DECELERATION, STANDARD, Body, Motion, Physics, world
+from data.world.camera import STANDARD_CAMERA, Camera
+from data.world.physics import (
+    FRICTION_DECELERATION,
+    STANDARD_PHYSICS,
+    Body,
+    Motion,
+    Physics,
+    shared_world,
+)
+from data.world.shapes import BOUNDING_RADIUS, RADIUS
+from data.world.visibility import compute_visibility
 
 AT_REST = 0.35
 """Share of the added objects that start at rest."""
@@ -42,7 +51,7 @@ def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> tuple[list[
         goal = int(rng.choice(list(COLLISIONS), p=list(COLLISIONS.values())))
         most = limits.max_collisions
         bodies = [_entering(looks[0], rng)]
-        motion = world().simulate(bodies)
+        motion = shared_world().simulate(bodies)
         for look in looks[1:]:
             grown = _add_body(bodies, motion, look, rng, min(goal, most), most)
             if grown is None:
@@ -62,7 +71,7 @@ def sample_looks(rng: np.random.Generator, limits: BenchmarkConfig) -> list[Scen
 def _entering(look: SceneObject, rng: np.random.Generator) -> Body:
     """A body that comes in from outside the view, towards its middle."""
     bearing = rng.uniform(0, 2 * np.pi)
-    start = np.array([-0.7, 0.0]) + rng.uniform(2.6, 4.0) * unit(bearing)
+    start = np.array([-0.7, 0.0]) + rng.uniform(2.6, 4.0) * unit_vector(bearing)
     goal = np.array([-0.7, 0.0]) + rng.uniform(-1, 1, 2)
     direction = (goal - start) / np.linalg.norm(goal - start)
     return _moving(look, start, direction, rng.uniform(*SPEED), rng)
@@ -85,7 +94,7 @@ def _add_body(
             continue
         trial = [*bodies, body]
         # A body that is to meet another needs them all; it seldom stays out of reach.
-        result = (None if wanted else _beside(motion, body)) or world().simulate(trial)
+        result = (None if wanted else _beside(motion, body)) or shared_world().simulate(trial)
         met = any(len(bodies) in c.objects for c in result.collisions)
         if (
             not result.touching_at_start
@@ -101,7 +110,7 @@ def _beside(motion: Motion, body: Body) -> Motion | None:
     """What `body` and the bodies of `motion` do together, where it stays out of reach of them all:
     what each does alone, to the bit, for Bullet solves what does not touch apart. None where it may
     touch one."""
-    alone = world().simulate([body]).states
+    alone = shared_world().simulate([body]).states
     apart = np.linalg.norm(motion.positions - alone[..., :3], axis=-1)
     if apart.min() < CLEAR:
         return None
@@ -114,18 +123,18 @@ def _meeting(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Bod
     other = int(rng.integers(motion.positions.shape[1]))
     frame = int(rng.integers(15, 111))
     place = motion.positions[frame, other, :2] + rng.normal(0, 0.1, 2)
-    if not shows(place):
+    if not is_on_screen(place):
         return None
     if rng.random() < AT_REST:
         if np.linalg.norm(motion.velocities[frame, other]) < 0.3:
             return None
-        return Body(look, pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
+        return Body(look, as_pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
     seconds = frame / FPS
     speed = rng.uniform(*SPEED)
     if speed - FRICTION_DECELERATION * seconds < 0.3:
         return None
     travel = speed * seconds - FRICTION_DECELERATION * seconds**2 / 2
-    direction = unit(rng.uniform(0, 2 * np.pi))
+    direction = unit_vector(rng.uniform(0, 2 * np.pi))
     return _moving(look, place - travel * direction, direction, speed, rng)
 
 
@@ -133,9 +142,9 @@ def _standing_by(look: SceneObject, motion: Motion, rng: np.random.Generator) ->
     """A body at rest on screen, clear of every path."""
     place = np.array([rng.uniform(-3.5, 1.2), rng.uniform(-2.2, 2.2)])
     clear = np.linalg.norm(motion.positions[..., :2] - place, axis=-1).min() > 0.7
-    if not (clear and shows(place)):
+    if not (clear and is_on_screen(place)):
         return None
-    return Body(look, pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
+    return Body(look, as_pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
 
 
 def _moving(
@@ -145,10 +154,12 @@ def _moving(
     speed: float,
     rng: np.random.Generator,
 ) -> Body:
-    return Body(look, pair(start), rng.uniform(0, 2 * np.pi), pair(speed * direction))
+    return Body(look, as_pair(start), rng.uniform(0, 2 * np.pi), as_pair(speed * direction))
 
 
-def shows(place: np.ndarray, height: float = RADIUS, camera: Camera = STANDARD_CAMERA) -> bool:
+def is_on_screen(
+    place: np.ndarray, height: float = RADIUS, camera: Camera = STANDARD_CAMERA
+) -> bool:
     """Whether an object's centre at a ground position and height shows, with some margin."""
     pixel, depth = camera.project(np.array([*place, height]))
     margin = 20
@@ -159,42 +170,42 @@ def shows(place: np.ndarray, height: float = RADIUS, camera: Camera = STANDARD_C
     )
 
 
-def unit(angle: float) -> np.ndarray:
+def unit_vector(angle: float) -> np.ndarray:
     return np.array([np.cos(angle), np.sin(angle)])
 
 
-def pair(values: np.ndarray) -> tuple[float, float]:
+def as_pair(values: np.ndarray) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 
-def scene_id(seed: int, index: int) -> str:
+def format_scene_id(seed: int, index: int) -> str:
     return f"s{seed}-{index:06d}"
 
 
 def simulate_scene(seed: int, index: int, split: str, limits: BenchmarkConfig) -> Scene:
     """Scene `index` of `seed` with its whole oracle."""
-    return record(scene_id(seed, index), split, *sample_bodies(seed, index, limits))
+    return record_scene(format_scene_id(seed, index), split, *sample_bodies(seed, index, limits))
 
 
-def without(name: str, split: str, bodies: list[Body], removed: int) -> Scene:
+def simulate_without(name: str, split: str, bodies: list[Body], removed: int) -> Scene:
     """The counterfactual of a scene of `bodies`: run again with object `removed` absent. What that
     object never touched, directly or through others, moves bit for bit as before."""
     rest = bodies[:removed] + bodies[removed + 1 :]
-    return record(name, split, rest, world().simulate(rest))
+    return record_scene(name, split, rest, shared_world().simulate(rest))
 
 
-def record(
+def record_scene(
     name: str,
     split: str,
     bodies: list[Body],
     motion: Motion,
-    physics: Physics = STANDARD,
+    physics: Physics = STANDARD_PHYSICS,
     camera: Camera = STANDARD_CAMERA,
     scenario: str = "",
 ) -> Scene:
     """What bodies did, observed by a camera: a scene."""
     objects = tuple(body.look for body in bodies)
-    in_view, fraction = visibility(objects, motion.positions, motion.quaternions, camera)
+    in_view, fraction = compute_visibility(objects, motion.positions, motion.quaternions, camera)
     image_positions, _ = camera.project(motion.positions)
     scene = Scene(
         scene_id=name,

@@ -21,7 +21,7 @@ from data.releases.readers import READERS
 from data.releases.validation import RecordError
 from data.store import PARTS, save_scene, scene_path, write_atomically
 from data.tracks.retrieval import counterfactual
-from data.world.sampling import record, sample_bodies, scene_id, without
+from data.world.sampling import format_scene_id, record_scene, sample_bodies, simulate_without
 from data.world.standins import simulate_standin
 
 log = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ def make_scenes(
 
 def scene_name(cfg: BenchmarkConfig, index: int) -> str:
     """The id of a simulated scene. A stand-in's is no standard scene's."""
-    name = scene_id(cfg.seed, index)
+    name = format_scene_id(cfg.seed, index)
     return name if cfg.standin is None else f"standin_{cfg.standin}-{name}"
 
 
@@ -106,12 +106,14 @@ def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> N
         save_scene(simulate_standin(path.stem, index, split, cfg), path)
         return
     bodies, motion = sample_bodies(cfg.seed, index, cfg)
-    scene = record(path.stem, split, bodies, motion)
+    scene = record_scene(path.stem, split, bodies, motion)
     if getattr(cfg.retrieval.counterfactual, split):
         removed = counterfactual.removed_object(scene, cfg.seed)
         if removed is not None:
             name = counterfactual.absent_id(scene.scene_id, removed)
-            save_scene(without(name, split, bodies, removed), path.with_name(f"{name}.npz"))
+            save_scene(
+                simulate_without(name, split, bodies, removed), path.with_name(f"{name}.npz")
+            )
     # Last, for where it stands the whole job is done.
     save_scene(scene, path)
 

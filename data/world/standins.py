@@ -16,9 +16,10 @@ import numpy as np
 from conf.schema import BenchmarkConfig
 from data.records import Scene, SceneObject
 from data.render.appearance import STANDARD_VIEW, View
-from data.world.geometry import RADIUS, Camera
-from data.world.physics import GENERATOR_VERSION, Body, Physics, world
-from data.world.sampling import pair, record, sample_looks, shows, unit
+from data.world.camera import Camera
+from data.world.physics import GENERATOR_VERSION, Body, Physics, shared_world
+from data.world.sampling import as_pair, is_on_screen, record_scene, sample_looks, unit_vector
+from data.world.shapes import RADIUS
 
 STANDINS_VERSION = "2"
 """Changes whenever a stand-in would have other scenes or another look."""
@@ -47,11 +48,11 @@ def thrown(looks: list[SceneObject], view: View, rng: np.random.Generator) -> St
     for look in looks:
         place = rng.uniform([-1.5, -1.6], [0.9, 1.6])
         height = rng.uniform(0.5, 1.5)
-        if not shows(place, height, view.camera):
+        if not is_on_screen(place, height, view.camera):
             return None
         toward = rng.uniform(-0.5, 0.5, 2) - place
         velocity = rng.uniform(0.6, 1.6) * toward / np.linalg.norm(toward)
-        bodies.append(Body(look, pair(place), rng.uniform(0, np.pi), pair(velocity), height))
+        bodies.append(Body(look, as_pair(place), rng.uniform(0, np.pi), as_pair(velocity), height))
     return "", bodies
 
 
@@ -64,22 +65,22 @@ def struck(looks: list[SceneObject], view: View, rng: np.random.Generator) -> St
     place = rng.uniform([-0.8, -1.0], [1.0, 1.0])
     first, bodies = place, []
     for look in row:
-        if not shows(place, RADIUS, view.camera):
+        if not is_on_screen(place, RADIUS, view.camera):
             return None
-        bodies.append(Body(look, pair(place), rng.uniform(0, np.pi), (0.0, 0.0)))
-        place = place + rng.uniform(*ROW_STEP) * unit(bearing + rng.normal(0, 0.15))
+        bodies.append(Body(look, as_pair(place), rng.uniform(0, np.pi), (0.0, 0.0)))
+        place = place + rng.uniform(*ROW_STEP) * unit_vector(bearing + rng.normal(0, 0.15))
     if rng.random() < 0.5:
-        start = first - rng.uniform(1.5, 3.0) * unit(bearing + rng.normal(0, 0.05))
+        start = first - rng.uniform(1.5, 3.0) * unit_vector(bearing + rng.normal(0, 0.05))
         velocity = first - start
         velocity *= rng.uniform(1.5, 3.0) / np.linalg.norm(velocity)
-        bodies.append(Body(last, pair(start), rng.uniform(0, np.pi), pair(velocity)))
+        bodies.append(Body(last, as_pair(start), rng.uniform(0, np.pi), as_pair(velocity)))
         return "Collide", bodies
     start = first + rng.normal(0, 0.25, 2)
     height = rng.uniform(0.9, 1.6)
-    if not shows(start, height, view.camera):
+    if not is_on_screen(start, height, view.camera):
         return None
-    velocity = rng.uniform(0.2, 0.8) * unit(rng.uniform(0, 2 * np.pi))
-    bodies.append(Body(last, pair(start), rng.uniform(0, np.pi), pair(velocity), height))
+    velocity = rng.uniform(0.2, 0.8) * unit_vector(rng.uniform(0, 2 * np.pi))
+    bodies.append(Body(last, as_pair(start), rng.uniform(0, np.pi), as_pair(velocity), height))
     return "Drop", bodies
 
 
@@ -109,7 +110,7 @@ def generator_version(standin: str | None) -> str:
     return GENERATOR_VERSION + (f", stand-ins {STANDINS_VERSION}" if standin else "")
 
 
-def view_of(standin: str | None) -> View:
+def standin_view(standin: str | None) -> View:
     """How a stand-in's scenes are watched and lit, or standard ones."""
     return STANDINS[standin].view if standin else STANDARD_VIEW
 
@@ -124,6 +125,8 @@ def simulate_standin(name: str, index: int, split: str, cfg: BenchmarkConfig) ->
         if began is None:
             continue
         scenario, bodies = began
-        motion = world().simulate(bodies, kind.frames, kind.physics)
+        motion = shared_world().simulate(bodies, kind.frames, kind.physics)
         if motion.collisions and not motion.touching_at_start:
-            return record(name, split, bodies, motion, kind.physics, kind.view.camera, scenario)
+            return record_scene(
+                name, split, bodies, motion, kind.physics, kind.view.camera, scenario
+            )

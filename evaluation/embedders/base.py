@@ -10,7 +10,7 @@ from PIL import Image
 
 from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery, SelectionItem
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from evaluation.retrieval.late_interaction import embedded_rows
 from models.memory import keep_freed_memory
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
@@ -30,10 +30,10 @@ into many more, and the mask of 64 such texts takes many GB."""
 class Encoder(Protocol):
     """Gives (things, entries) fp32 embeddings; pixels come from `frames` at the preset's size."""
 
-    def queries(self, asked: list[Query], frames: Frames) -> np.ndarray:
+    def queries(self, asked: list[Query], frames: FrameReader) -> np.ndarray:
         """Of prefixes with their questions."""
 
-    def frames(self, shown: list[FrameRef], frames: Frames) -> np.ndarray: ...
+    def frames(self, shown: list[FrameRef], frames: FrameReader) -> np.ndarray: ...
 
     def drawn(self, shown: list[np.ndarray]) -> np.ndarray:
         """Of (S, S, 3) uint8 pixels at the preset's size, as of frames."""
@@ -49,11 +49,11 @@ class JointEncoder:
     def __init__(self, model: Retriever, preset: RetrieverConfig) -> None:
         self._model, self._preset = model, preset
 
-    def queries(self, asked: list[Query], frames: Frames) -> np.ndarray:
+    def queries(self, asked: list[Query], frames: FrameReader) -> np.ndarray:
         shown = [query_input(query, frames, self._preset) for query in asked]
         return self._embedded(shown, self._preset.query_instruction, "query")
 
-    def frames(self, shown: list[FrameRef], frames: Frames) -> np.ndarray:
+    def frames(self, shown: list[FrameRef], frames: FrameReader) -> np.ndarray:
         return self._pictures([frame_input(frame, frames) for frame in shown])
 
     def drawn(self, shown: list[np.ndarray]) -> np.ndarray:

@@ -28,7 +28,7 @@ from tqdm import tqdm
 from conf.errors import UserError
 from conf.runs import lock_folder, write_json
 from data.parallel import batched
-from data.store import digest, write_atomically
+from data.store import hash_file, write_atomically
 
 log = logging.getLogger(__name__)
 
@@ -163,7 +163,7 @@ class EmbeddingCache:
         taken = [int(note.stem) for note in self.folder.glob(NOTES)]
         array = self.folder / f"{max(taken, default=-1) + 1:05d}.npy"
         write_atomically(array, buffer.getvalue())
-        note = {"names": names, "sha256": digest(array)}
+        note = {"names": names, "sha256": hash_file(array)}
         write_atomically(array.with_suffix(".json"), json.dumps(note).encode())
         self._know(Part(array, names))
 
@@ -191,6 +191,6 @@ def _whole(note: Path) -> Part | None:
     array = note.with_suffix(".npy")
     try:
         there = json.loads(note.read_text())
-        return Part(array, there["names"]) if digest(array) == there["sha256"] else None
+        return Part(array, there["names"]) if hash_file(array) == there["sha256"] else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -17,8 +17,8 @@ from transformers import AutoConfig, AutoModel, AutoProcessor, PreTrainedModel
 
 from conf.errors import UserError
 from conf.schema import RetrieverConfig
-from data.records import FrameRef, shown_frames
-from data.render.frame_cache import Frames
+from data.records import FrameRef, sample_prefix_frames
+from data.render.frame_cache import FrameReader
 from evaluation.embedders.base import Query
 from models.loading import DTYPES, UNREADABLE, check_reachable, load_error
 
@@ -48,17 +48,17 @@ class DualEncoder:
     image_processor: Any
     watch: Clips | None = None
 
-    def queries(self, asked: list[Query], frames: Frames) -> np.ndarray:
+    def queries(self, asked: list[Query], frames: FrameReader) -> np.ndarray:
         clips = [
             frames.stack(
-                q.scene_id, shown_frames(q.prefix_start, q.prefix_stop, self.preset.frames)
+                q.scene_id, sample_prefix_frames(q.prefix_start, q.prefix_stop, self.preset.frames)
             )
             for q in asked
         ]
         prefixes = self.watch(clips) if self.watch else self._means(clips)
         return unit_rows(prefixes + self.texts([q.question for q in asked]))
 
-    def frames(self, shown: list[FrameRef], frames: Frames) -> np.ndarray:
+    def frames(self, shown: list[FrameRef], frames: FrameReader) -> np.ndarray:
         return self.drawn([frames.array(f.scene_id, f.frame) for f in shown])
 
     def drawn(self, shown: list[np.ndarray]) -> np.ndarray:

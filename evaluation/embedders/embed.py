@@ -19,7 +19,7 @@ from PIL import Image
 
 from conf.schema import RetrieverConfig
 from data.records import FrameRef
-from data.render.frame_cache import Frames, resized
+from data.render.frame_cache import FrameReader, resize_frames
 from data.store import Store
 from evaluation.embedders.cache import EmbeddingCache
 from evaluation.reporting.results import UNTRAINED
@@ -150,7 +150,7 @@ def untrained_embedder(preset: RetrieverConfig, precision: str, run: Path) -> Em
 
 
 def embed_queries(
-    embedder: Embedder, queries: Sequence[Query], store: Store, frames: Frames, batch: int
+    embedder: Embedder, queries: Sequence[Query], store: Store, frames: FrameReader, batch: int
 ) -> EmbeddingCache:
     """The embeddings of prefixes with their questions, by name; pixels are read a batch at
     a time.
@@ -169,7 +169,7 @@ def embed_queries(
 
 
 def embed_frames(
-    embedder: Embedder, database: Iterable[FrameRef], store: Store, frames: Frames, batch: int
+    embedder: Embedder, database: Iterable[FrameRef], store: Store, frames: FrameReader, batch: int
 ) -> EmbeddingCache:
     """The embeddings of frames, by name. Errors are those of `embed_queries`."""
     about = {"instruction": embedder.preset.frame_instruction}
@@ -208,7 +208,7 @@ def embed_images(
 def image_pixels(path: Path, size: int) -> np.ndarray:
     """(size, size, 3) uint8 of an image in a file, as a frame is shown."""
     with Image.open(path) as image:
-        return resized(np.array(image.convert("RGB"))[None], size)[0]
+        return resize_frames(np.array(image.convert("RGB"))[None], size)[0]
 
 
 def _embedded(

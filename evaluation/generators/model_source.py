@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from conf.errors import UserError
 from conf.schema import SelectCommand, SftCommand, StudentConfig, TwoStageCommand
 from data.records import SelectionItem
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from evaluation.generators import local, openai_server
 from evaluation.generators.response_log import RECORD_MODES, Respond, SaveResponses, Subject
 from evaluation.generators.response_schema import instruction as record_instruction
@@ -172,7 +172,7 @@ def told(mode: str, regime: str) -> str:
 
 def shown(
     regime: str,
-    frames: Frames,
+    frames: FrameReader,
     cfg: StudentConfig,
     control: str | None,
     mode: str,

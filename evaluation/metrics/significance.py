@@ -9,7 +9,7 @@ import numpy as np
 
 from conf.errors import UserError
 from data.records import FAMILIES, SelectionItem
-from data.tracks.controls import pairs
+from data.tracks.controls import pair_items
 from evaluation.metrics.intervals import macro_by_scene
 
 NAMED = 3
@@ -79,7 +79,7 @@ def compare_anchors(
 ) -> list[PairedComparison]:
     """Hold the two questions of matched-anchor pairs against each other, that which names the event
     (left) and that which names the time (right); `credits` is each item's by its id."""
-    matched = pairs(items)
+    matched = pair_items(items)
     left = {by_event.item_id: credits[by_event.item_id] for by_event, _ in matched}
     right = {by_event.item_id: credits[by_time.item_id] for by_event, by_time in matched}
     return compare_runs([by_event for by_event, _ in matched], left, right, ("event", "time"), seed)

@@ -11,7 +11,7 @@ import numpy as np
 
 from conf.errors import UserError
 from data.store import Store, open_store
-from data.tracks.controls import MATCHED
+from data.tracks.controls import MATCHED_ANCHOR
 from evaluation.metrics.significance import PairedComparison
 from evaluation.reporting import item_browser, plots
 from evaluation.reporting.comparisons import apart
@@ -76,7 +76,9 @@ def _add(
     seed: int,
 ) -> None:
     """Add a benchmark's items and what `answered` models said to them."""
-    every = {i.item_id: i for suite in (None, MATCHED) for i in store.selection("test", suite)}
+    every = {
+        i.item_id: i for suite in (None, MATCHED_ANCHOR) for i in store.selection("test", suite)
+    }
     answers: dict[str, Mapping[str, Said | Scored]] = {}
     models: dict[str, dict[str, tuple[Measured, Mapping[str, Said | Scored]]]] = {}
     for m in answered:

@@ -12,8 +12,8 @@ import numpy as np
 from tqdm import tqdm
 
 from conf.errors import UserError
-from data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, shown_frames
-from data.render.frame_cache import Frames
+from data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, sample_prefix_frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
 from evaluation.reporting.run_responses import Said, Scored
 
@@ -59,7 +59,7 @@ def entries(
 ) -> Iterator[dict[str, Any]]:
     """What the page tells of each item, frames by the names that `pictures` gives them."""
     for item in items:
-        shown = shown_frames(item.prefix_start, item.prefix_stop, OBSERVED)
+        shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, OBSERVED)
         yield {
             "id": item.item_id,
             "benchmark": store.name,
@@ -127,11 +127,11 @@ def pictures(items: Sequence[SelectionItem], store: Store) -> tuple[dict[str, st
     gone why, in a sentence each."""
     wanted: dict[str, set[int]] = {}
     for item in items:
-        prefix = shown_frames(item.prefix_start, item.prefix_stop, OBSERVED)
+        prefix = sample_prefix_frames(item.prefix_start, item.prefix_stop, OBSERVED)
         wanted.setdefault(item.scene_id, set()).update(prefix)
         for c in item.candidates:
             wanted.setdefault(c.scene_id, set()).add(c.frame)
-    frames, found, gone = Frames(store), {}, []
+    frames, found, gone = FrameReader(store), {}, []
     for scene_id, indices in tqdm(wanted.items(), desc=f"frames of {store.name}", unit="scene"):
         ordered = sorted(indices)
         try:

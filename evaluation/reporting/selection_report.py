@@ -12,7 +12,7 @@ from typing import Any
 from conf.runs import write_text
 from conf.schema import SelectCommand
 from data.records import SelectionItem
-from data.tracks.controls import MATCHED
+from data.tracks.controls import MATCHED_ANCHOR
 from evaluation.generators.response_log import Answer
 from evaluation.metrics.breakdown import accuracy_by_subtype, selection_row
 from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
@@ -118,6 +118,6 @@ def differences(
         if control is not None:
             names = ("as they are", control)
             found.append((mode, compare_runs(items, credits[mode, None], own, names, cfg.seed)))
-        if cfg.suite == MATCHED:
+        if cfg.suite == MATCHED_ANCHOR:
             found.append((way(mode, control), compare_anchors(items, own, cfg.seed)))
     return found

@@ -12,7 +12,7 @@ import numpy as np
 from conf.errors import UserError
 from conf.schema import TwoStageCommand
 from data.records import FrameRef, RetrievalQuery
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
 from evaluation.embedders.embed import Embedder, embed_frames, embed_images, embed_texts
 from evaluation.metrics.ranking import query_metrics
@@ -65,7 +65,7 @@ def ranks(
         # Frames of one caption tie, and each of them counts.
         found = rank_targets(preset, asked, goals, [shown.rows(told)])
     else:
-        frames = Frames(store, preset.image_size)
+        frames = FrameReader(store, preset.image_size)
         shown = embed_frames(matcher, database, store, frames, batch)
         found = rank_targets(preset, asked, shown.rows(targets), in_parts(shown, names))
     return with_misses(found, np.array(there), len(names))

@@ -10,7 +10,7 @@ import numpy as np
 
 from conf.errors import UserError
 from data.records import SelectionItem
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 
 VIDEO, IMAGE = "video/mp4", "image/png"
 PREFIX = -1
@@ -30,7 +30,7 @@ class Medium:
     content: bytes
 
 
-def media_of(item: SelectionItem, frames: Frames) -> list[Medium]:
+def media_of(item: SelectionItem, frames: FrameReader) -> list[Medium]:
     """An item's prefix as a video at the scene's own rate, every frame of it, and its candidates as
     images that are all of one size in bytes."""
     shown = list(range(item.prefix_start, item.prefix_stop + 1))

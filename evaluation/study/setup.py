@@ -12,7 +12,7 @@ from conf.errors import UserError
 from conf.schema import StudyCommand
 from data.build import ensure_benchmark
 from data.records import SelectionItem
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
 from evaluation.study import auth, sampling, storage
 from evaluation.study.assignment import plan
@@ -56,7 +56,7 @@ def add_media(cfg: StudyCommand, db: sqlite3.Connection, path: Path) -> None:
             "benchmark than the one it was begun with: begin another study with run=NAME"
         )
     item_of = {i.item_id: i for suite in suites(store) for i in store.selection(suite=suite)}
-    frames = Frames(store)
+    frames = FrameReader(store)
     total = len(storage.item_ids(db, False)) + len(storage.item_ids(db, True))
     with tqdm(total=total, initial=total - len(lacking), desc="encoding items", unit="item") as bar:
         for item_id in lacking:
@@ -100,6 +100,6 @@ def check_names(cfg: StudyCommand, db: sqlite3.Connection) -> None:
 
 def suites(store: Store) -> list[str]:
     """Suites whose items a study may ask."""
-    from data.tracks.controls import MATCHED
+    from data.tracks.controls import MATCHED_ANCHOR
 
-    return [store.suite, MATCHED]
+    return [store.suite, MATCHED_ANCHOR]

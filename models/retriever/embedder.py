@@ -21,8 +21,8 @@ from sentence_transformers.sentence_transformer.modules import Normalize, Poolin
 from transformers import AutoConfig
 
 from conf.schema import LoraConfig, RetrieverConfig
-from data.records import FrameRef, RetrievalQuery, shown_frames
-from data.render.frame_cache import Frames
+from data.records import FrameRef, RetrievalQuery, sample_prefix_frames
+from data.render.frame_cache import FrameReader
 from models.attention import choose_attention
 from models.checks import (
     PEFT,
@@ -237,14 +237,14 @@ def longest_query(queries: list[RetrievalQuery], tokenizer: Any) -> RetrievalQue
     return queries[max(range(len(queries)), key=lambda k: len(encoded[k]))]
 
 
-def query_input(query: RetrievalQuery, frames: Frames, cfg: RetrieverConfig) -> dict[str, Any]:
+def query_input(query: RetrievalQuery, frames: FrameReader, cfg: RetrieverConfig) -> dict[str, Any]:
     """A query as sentence-transformers takes it: the prefix with its true times, then the text."""
-    shown = shown_frames(query.prefix_start, query.prefix_stop, cfg.frames)
+    shown = sample_prefix_frames(query.prefix_start, query.prefix_stop, cfg.frames)
     clip = load_clip(query.scene_id, shown, frames)
     array = torch.from_numpy(clip.pixels).permute(0, 3, 1, 2)
     return {"video": {"array": array, "video_metadata": clip.metadata}, "text": query.question}
 
 
-def frame_input(frame: FrameRef, frames: Frames) -> Any:
+def frame_input(frame: FrameRef, frames: FrameReader) -> Any:
     """A database frame as sentence-transformers takes it: an image."""
     return frames.image(frame.scene_id, frame.frame)

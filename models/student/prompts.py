@@ -18,9 +18,17 @@ from typing import Any
 import numpy as np
 
 from conf.schema import StudentConfig
-from data.records import FPS, FRAMES, LETTERS, FrameRef, RetrievalQuery, SelectionItem, shown_frames
-from data.render.frame_cache import Frames
-from data.tracks.controls import observed
+from data.records import (
+    FPS,
+    FRAMES,
+    LETTERS,
+    FrameRef,
+    RetrievalQuery,
+    SelectionItem,
+    sample_prefix_frames,
+)
+from data.render.frame_cache import FrameReader
+from data.tracks.controls import prefix_under_control
 from teacher.sections import remove_section
 
 MODES = ("reasoning", "answer")
@@ -138,7 +146,7 @@ def selection_sample(
     item: SelectionItem,
     mode: str,
     regime: str,
-    frames: Frames,
+    frames: FrameReader,
     cfg: StudentConfig,
     response: str | None = None,
     control: str | None = None,
@@ -153,13 +161,13 @@ def instructed_sample(
     item: SelectionItem,
     mode: str,
     asked: str,
-    frames: Frames,
+    frames: FrameReader,
     cfg: StudentConfig,
     response: str | None = None,
     control: str | None = None,
 ) -> Sample:
     """A selection item with what is `asked` about it, as `selection_sample` shows it."""
-    shown = observed(item, cfg.frames, control)
+    shown = prefix_under_control(item, cfg.frames, control)
     parts: list[str | np.ndarray] = [item.question]
     for letter, c in zip(LETTERS, item.candidates, strict=True):
         parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
@@ -168,19 +176,19 @@ def instructed_sample(
 
 
 def text_sample(
-    frames: Frames, cfg: StudentConfig, mode: str, thing: RetrievalQuery | FrameRef
+    frames: FrameReader, cfg: StudentConfig, mode: str, thing: RetrievalQuery | FrameRef
 ) -> Sample:
     """A prompt of `TEXT_INSTRUCTIONS` about a query (its prefix and question) or about a frame."""
     name, asked = f"{thing.name} ({mode})", f"\n{TEXT_INSTRUCTIONS[mode]}"
     if isinstance(thing, FrameRef):
         pixels = frames.array(thing.scene_id, thing.frame)
         return conversation(name, [pixels, asked], None)
-    shown = shown_frames(thing.prefix_start, thing.prefix_stop, cfg.frames)
+    shown = sample_prefix_frames(thing.prefix_start, thing.prefix_stop, cfg.frames)
     clip = load_clip(thing.scene_id, shown, frames)
     return conversation(name, [thing.question, asked], None, clip)
 
 
-def load_clip(scene_id: str, shown: list[int], frames: Frames) -> Clip:
+def load_clip(scene_id: str, shown: list[int], frames: FrameReader) -> Clip:
     """Frames of a scene as a clip, whose times run on in whatever order they are `shown`."""
     scene = frames.scene(scene_id)
     return Clip(frames.stack(scene_id, shown), sorted(shown), scene.fps, scene.frames)

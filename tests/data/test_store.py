@@ -18,9 +18,9 @@ from conf.errors import SettingsError, UserError
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from data.build import build, ensure_benchmark, ensure_items
 from data.parallel import Workers
-from data.partial_build import growing_folder
-from data.store import MANIFEST, digest, digests, open_store, write_atomically
-from data.world.sampling import scene_id
+from data.partial_build import lock_partial_build
+from data.store import MANIFEST, hash_file, hash_files, open_store, write_atomically
+from data.world.sampling import format_scene_id
 from data.world.scenes import split_scenes
 
 
@@ -50,8 +50,8 @@ def copy(built: Path, tmp_path: Path) -> Path:
 
 
 def contents(folder: Path) -> dict[str, str]:
-    frames = {p.name: digest(p) for p in (folder / "frames").glob("*.zip")}
-    return {**digests(folder), **frames, MANIFEST: (folder / MANIFEST).read_text()}
+    frames = {p.name: hash_file(p) for p in (folder / "frames").glob("*.zip")}
+    return {**hash_files(folder), **frames, MANIFEST: (folder / MANIFEST).read_text()}
 
 
 @pytest.mark.slow
@@ -104,7 +104,7 @@ def test_a_cluster_that_loses_a_worker_builds_the_same_bytes(built, tmp_path) ->
     store = ensure_items(small(), tmp_path, Workers(2, "ray"))
     killer.join()
     assert killed
-    assert digests(store.folder) == digests(built)
+    assert hash_files(store.folder) == hash_files(built)
 
 
 @pytest.mark.slow
@@ -133,7 +133,7 @@ def test_builds_at_once_make_one_store(tmp_path, built) -> None:
         )
         for _ in range(2)
     ]
-    with growing_folder(small(), tmp_path / "small"):
+    with lock_partial_build(small(), tmp_path / "small"):
         for other in others:
             other.start()
         time.sleep(0.5)
@@ -141,13 +141,13 @@ def test_builds_at_once_make_one_store(tmp_path, built) -> None:
     for other in others:
         other.join(timeout=300)
     assert len(stores) == 2
-    assert digests(tmp_path / "small") == digests(built)
+    assert hash_files(tmp_path / "small") == hash_files(built)
     assert os.listdir(tmp_path) == ["small"]
 
 
 @pytest.mark.parametrize("scenes", [10, 12, 100])
 def test_a_scene_has_one_split_in_every_size(scenes) -> None:
-    names = [scene_id(0, k) for k in range(500)]
+    names = [format_scene_id(0, k) for k in range(500)]
     some, more = split_scenes(small(), names[:scenes]), split_scenes(small(), names)
     for split in ("train", "test"):
         assert set(some[split]) <= set(more[split])

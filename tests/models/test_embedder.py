@@ -11,8 +11,8 @@ from sentence_transformers import SentenceTransformer
 
 from conf.errors import UserError
 from conf.schema import LateConfig, LoraConfig
-from data.records import FPS, FRAMES, FrameRef, shown_frames
-from data.tracks.retrieval.database import Album
+from data.records import FPS, FRAMES, FrameRef, sample_prefix_frames
+from data.tracks.retrieval.database import UniqueFrames
 from models.loading import keep_differentiable
 from models.parameter_counts import count_towers
 from models.retriever import embedder
@@ -44,7 +44,7 @@ def test_a_query_is_instruction_then_video_then_text_and_a_generation_prompt(
     assert text.index("<|video_pad|>") < text.index(query.question)
     assert text.endswith("<|im_start|>assistant\n")
     assert features["video_grid_thw"].tolist() == [[6, 6, 6]]
-    shown = shown_frames(query.prefix_start, query.prefix_stop, 12)
+    shown = sample_prefix_frames(query.prefix_start, query.prefix_stop, 12)
     assert f"<{(shown[0] + shown[1]) / 2 / FPS:.1f} seconds>" in text
     assert "of 6 x 3 x 3 tokens" in audit_retriever(model, retriever_cfg, query, frames)
 
@@ -59,7 +59,7 @@ def test_a_clip_is_told_at_its_own_rate(
     model = load(micro_store, retriever_cfg, tmp_path)
     features = model.preprocess([query_input(query, frames, retriever_cfg)])
     text = model[0].processor.tokenizer.decode(features["input_ids"][0])
-    shown = shown_frames(query.prefix_start, query.prefix_stop, 12)
+    shown = sample_prefix_frames(query.prefix_start, query.prefix_stop, 12)
     assert f"<{(shown[0] + shown[1]) / 2 / 12:.1f} seconds>" in text
 
 
@@ -146,7 +146,7 @@ def test_no_frame_of_a_slice_shows_what_another_shows(micro_store) -> None:
     targets = {q.target for q in queries}
     database = slice_database(queries, micro_store)
     assert targets < set(database)
-    album = Album(micro_store.scene)
+    album = UniqueFrames(micro_store.scene)
     for target in targets:
         album.add(target)
     assert all(album.add(frame) for frame in database if frame not in targets)

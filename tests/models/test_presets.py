@@ -32,8 +32,8 @@ from transformers.quantizers.auto import AutoHfQuantizer
 from conf.compose import compose
 from conf.errors import UserError
 from conf.schema import LoraConfig, SftCommand, StudentConfig, TeacherConfig
-from data.records import FPS, shown_frames
-from data.render.frame_cache import Frames
+from data.records import FPS, sample_prefix_frames
+from data.render.frame_cache import FrameReader
 from models import loading
 from models.parameter_counts import Tower, check_towers, count_towers
 from models.student.collator import Collator, encode
@@ -279,7 +279,7 @@ def test_frames_come_at_320_px_and_at_their_true_times(
     item = next(
         i for i in micro_store.selection("train") if i.prefix_stop - i.prefix_start >= cfg.frames
     )
-    frames = Frames(micro_store, cfg.image_size)
+    frames = FrameReader(micro_store, cfg.image_size)
     sample = selection_sample(item, "reasoning", "cot", frames, cfg)
     encoded = encode(sample, released, cfg.max_length)
     # 336 px are ten and a half cells of 32 px.
@@ -287,7 +287,7 @@ def test_frames_come_at_320_px_and_at_their_true_times(
     assert encoded.media["image_grid_thw"].tolist() == [[1, 20, 20]] * 4
     assert encoded.input_ids.count(released.video_token_id) == 6 * 100
     assert encoded.input_ids.count(released.image_token_id) == 4 * 100
-    shown = shown_frames(item.prefix_start, item.prefix_stop, cfg.frames)
+    shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, cfg.frames)
     assert len(shown) == cfg.frames
     # Two frames share a patch in time, which stands at the mean of their times.
     times = [(a + b) / 2 / FPS for a, b in zip(shown[::2], shown[1::2], strict=True)]
@@ -339,7 +339,7 @@ def test_the_longest_rationale_fits_and_the_whole_audit_needs_no_weights(
     text = f"{more}\n{longest.rationale}"
     assert len(text.split()) == MAX_SENTENCE_TAGS
     told = response(text, longest.matches, longest.item.letter, "reasoning", train.regime)
-    frames = Frames(micro_store, cfg.image_size)
+    frames = FrameReader(micro_store, cfg.image_size)
     sample = selection_sample(longest.item, "reasoning", train.regime, frames, cfg, told)
     seen = audit(adapted(preset), released, cfg, sample, Collator(released, cfg.max_length))
     assert "336 x 336 px become a video of 6 x 10 x 10 tokens and an image of 1 x 10 x 10" in seen

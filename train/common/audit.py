@@ -13,7 +13,7 @@ from transformers import ProcessorMixin
 from conf.errors import UserError
 from conf.schema import RetrieverConfig, StudentConfig
 from data.records import RetrievalQuery
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from models.checks import check_widths
 from models.parameter_counts import check_towers, count_towers, tower_table
 from models.retriever.embedder import Retriever, frame_input, query_input
@@ -54,7 +54,7 @@ def audit(
 
 
 def audit_retriever(
-    model: Retriever, cfg: RetrieverConfig, query: RetrievalQuery, frames: Frames
+    model: Retriever, cfg: RetrieverConfig, query: RetrievalQuery, frames: FrameReader
 ) -> str:
     """The same for a retriever: counts, grids, the longest query and a frame, decoded; where it has
     many vectors, what is scored of them between >>> and <<<.

@@ -17,9 +17,9 @@ from sentence_transformers.util.similarity import maxsim
 from conf.runs import world_size
 from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
-from data.tracks.retrieval.database import Album
+from data.tracks.retrieval.database import UniqueFrames
 from models.nonfinite_guard import check_finite
 from models.retriever.embedder import Retriever, frame_input, query_input
 from train.retriever.batches import frame_title, query_title
@@ -32,7 +32,7 @@ RECALLS = (1, 10, 50)
 def slice_database(queries: Sequence[RetrievalQuery], store: Store) -> list[FrameRef]:
     """The targets of the queries and, of their scenes, every few frames that show what no other
     frame of the database shows; in the order of their scenes."""
-    album = Album(store.scene)
+    album = UniqueFrames(store.scene)
     for query in queries:
         album.add(query.target)
     for scene_id in sorted({q.scene_id for q in queries}):
@@ -58,7 +58,7 @@ class Slice:
         self,
         queries: Sequence[RetrievalQuery],
         database: Sequence[FrameRef],
-        frames: Frames,
+        frames: FrameReader,
         cfg: RetrieverConfig,
         batch: int,
     ) -> None:

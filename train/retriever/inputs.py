@@ -11,7 +11,7 @@ from sentence_transformers import SentenceTransformer
 from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
 
 from conf.schema import RetrieverConfig
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from models.retriever.embedder import frame_input
 from models.student.collator import MEDIA
 from train.retriever.batches import Batch
@@ -26,7 +26,7 @@ class RetrieverInputs:
     """Makes inputs of a model, which is prepared to take them."""
 
     def __init__(
-        self, model: SentenceTransformer, frames: Frames, cfg: RetrieverConfig, precision: str
+        self, model: SentenceTransformer, frames: FrameReader, cfg: RetrieverConfig, precision: str
     ) -> None:
         self._model, self._frames, self._cfg = model, frames, cfg
         self._bf16 = precision == "bf16"

@@ -13,7 +13,7 @@ from conf.errors import UserError
 from conf.schema import ContrastiveCommand, ExportModelCommand, LoraConfig
 from data.build import ensure_benchmark
 from data.records import RetrievalQuery
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from models import loading
 from models.retriever.embedder import (
     Retriever,
@@ -49,7 +49,7 @@ def write_merged(
     preset, precision = settings.retriever, settings.train.precision
     store = ensure_benchmark(settings.benchmark, Path(cfg.store), cfg.workers)
     held_out = split(settings, store)[1][:CHECKED]
-    frames = Frames(store, preset.image_size)
+    frames = FrameReader(store, preset.image_size)
     log.info("asking the trained retriever")
     model = load_trained(preset, precision, saved)
     # As it was trained: packed for inference, some CPUs round 4-bit products another way.
@@ -94,7 +94,10 @@ class RetrieverOutputs:
 
 
 def outputs(
-    model: Retriever, settings: ContrastiveCommand, queries: list[RetrievalQuery], frames: Frames
+    model: Retriever,
+    settings: ContrastiveCommand,
+    queries: list[RetrievalQuery],
+    frames: FrameReader,
 ) -> RetrieverOutputs:
     """The outputs for queries and for their targets, each of these once."""
     preset = settings.retriever

@@ -22,8 +22,8 @@ from conf.runs import rank, write_text
 from conf.schema import ContrastiveTrainConfig
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
-from data.tracks.retrieval.database import TWIN
-from data.world.geometry import displacements
+from data.tracks.retrieval.database import TWIN_DISTANCE
+from data.world.displacement import frame_displacements
 from models.distributed import from_main
 from models.nonfinite_guard import check_finite
 from models.retriever.embedder import Retriever
@@ -138,8 +138,8 @@ def wrong(
 ) -> list[FrameRef]:
     """The first `count` of the ranked frames that are not the query's target, its twins, or nearer
     to it than `margin`; the benchmark's own where there are not so many."""
-    target, least = query.target, max(margin, TWIN)
-    apart = displacements(store.scene(target.scene_id))[target.frame]
+    target, least = query.target, max(margin, TWIN_DISTANCE)
+    apart = frame_displacements(store.scene(target.scene_id))[target.frame]
     far = [
         frame
         for frame in [*ranked, *query.hard_negatives]

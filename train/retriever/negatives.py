@@ -10,7 +10,7 @@ import torch
 
 from data.records import FrameRef
 from data.store import Store
-from data.world.geometry import displacements
+from data.world.displacement import frame_displacements
 
 
 @dataclass(frozen=True)
@@ -56,4 +56,4 @@ class Weighing:
         if not self.near:
             return False
         scene = self.store.scene(target.scene_id)
-        return bool(displacements(scene)[target.frame, frame.frame] < self.near)
+        return bool(frame_displacements(scene)[target.frame, frame.frame] < self.near)

@@ -27,7 +27,7 @@ from conf.errors import UserError
 from conf.runs import rank
 from conf.schema import ContrastiveCommand, ContrastiveTrainConfig
 from data.records import RetrievalQuery
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
 from data.tracks.retrieval.checks import check_training
 from models import distributed, memory
@@ -64,7 +64,7 @@ def train_retriever(
         precision, preset = resolve_run(run.folder, cfg.train.precision, cfg.retriever, data)
     cfg = replace(cfg, retriever=preset, train=replace(cfg.train, precision=precision))
     log.info("loading retriever %s, to compute in %s", preset.name, precision)
-    frames = Frames(store, cfg.retriever.image_size)
+    frames = FrameReader(store, cfg.retriever.image_size)
     with training_loop.loading(run.folder, "retriever"):
         model = embedder.load_retriever(
             cfg.retriever,

@@ -16,7 +16,7 @@ from sentence_transformers import SentenceTransformer
 
 from conf.schema import RetrieverConfig
 from data.records import RetrievalQuery
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from models.retriever.embedder import query_input
 
 OWN = "own"
@@ -42,7 +42,7 @@ class Row:
 def shared_input(
     model: SentenceTransformer,
     groups: Sequence[Sequence[RetrievalQuery]],
-    frames: Frames,
+    frames: FrameReader,
     cfg: RetrieverConfig,
 ) -> dict[str, Any]:
     """What the retriever's forward takes for queries in groups of one prefix each."""

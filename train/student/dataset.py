@@ -11,7 +11,7 @@ import numpy as np
 
 from conf.schema import SftCommand, SftTrainConfig, StudentConfig
 from data.records import LETTERS, Rationale, SelectionItem
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.student.prompts import (
     MODES,
@@ -64,12 +64,12 @@ class Supervised:
             matches=tuple(sorted(relabel_text(line, order) for line in self.matches)),
         )
 
-    def sample(self, frames: Frames, cfg: StudentConfig, epoch: int) -> Sample:
+    def sample(self, frames: FrameReader, cfg: StudentConfig, epoch: int) -> Sample:
         shown = self.in_epoch(epoch)
         told = response(shown.rationale, shown.matches, shown.item.letter, self.mode, self.regime)
         return selection_sample(shown.item, self.mode, self.regime, frames, cfg, told)
 
-    def planned(self, frames: Frames, cfg: StudentConfig) -> LazySample:
+    def planned(self, frames: FrameReader, cfg: StudentConfig) -> LazySample:
         media = cfg.frames // 2 + len(LETTERS)
         make = partial(self.sample, frames, cfg)
         return LazySample(self.text(), media, make, self.item.family)
@@ -130,7 +130,7 @@ def _matches(store: Store, item: SelectionItem, regime: str) -> tuple[str, ...]:
 
 
 def splits(
-    store: Store, rationales: list[Rationale], cfg: SftCommand, frames: Frames
+    store: Store, rationales: list[Rationale], cfg: SftCommand, frames: FrameReader
 ) -> tuple[Samples, dict[str, Samples]]:
     """Training samples of a regime, and what measures it on held-out training scenes, by mode."""
     held_out = held_out_scenes(store)

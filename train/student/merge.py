@@ -12,7 +12,7 @@ from transformers import PreTrainedModel, ProcessorMixin
 from conf.errors import UserError
 from conf.schema import ExportModelCommand, SftCommand
 from data.build import ensure_benchmark
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from models import loading
 from models.student.collator import Collator, letter_ids
 from teacher.narrate import ensure_rationales
@@ -73,7 +73,7 @@ def validation(settings: SftCommand, store_folder: Path, workers: int) -> dict[s
     store = ensure_benchmark(settings.benchmark, store_folder, workers)
     reasons = settings.train.regime not in ("answer_only", "describe")
     rationales = ensure_rationales(store, settings.teacher) if reasons else []
-    frames = Frames(store, settings.student.image_size)
+    frames = FrameReader(store, settings.student.image_size)
     return splits(store, rationales, settings, frames)[1]
 
 

@@ -19,7 +19,7 @@ from conf.errors import UserError
 from conf.runs import rank
 from conf.schema import SftCommand, SftTrainConfig
 from data.records import Rationale
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
 from models import checks, distributed, loading, memory
 from models.lora_kernels import fuse
@@ -112,7 +112,7 @@ def split(
         training_loop.check_not_empty(
             len(rationales), f"accepted rationales of teacher {cfg.teacher.name}"
         )
-    frames = Frames(store, cfg.student.image_size)
+    frames = FrameReader(store, cfg.student.image_size)
     training, validation = dataset.splits(store, rationales, cfg, frames)
     training_loop.check_not_empty(len(training), f"samples for train.regime={cfg.train.regime}")
     training_loop.check_not_empty(

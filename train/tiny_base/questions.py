@@ -18,8 +18,8 @@ from functools import partial
 import numpy as np
 
 from conf.schema import StudentConfig
-from data.records import LETTERS, Scene, SelectionItem, shown_frames
-from data.render.frame_cache import Frames
+from data.records import LETTERS, Scene, SelectionItem, sample_prefix_frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.student.prompts import Sample, Sight, answer_line, conversation, load_clip
 from teacher.narrator import write_description, write_match_lines
@@ -68,7 +68,7 @@ NAMED = 4
 
 
 def build_questions(
-    store: Store, items: list[SelectionItem], cfg: StudentConfig, frames: Frames, seed: int
+    store: Store, items: list[SelectionItem], cfg: StudentConfig, frames: FrameReader, seed: int
 ) -> dict[str, list[LazySample]]:
     """Samples of each kind from some items. Which frame is described or is the later, among which
     others, and in which order, is another in each epoch."""
@@ -99,7 +99,7 @@ def lettered(frames: list[tuple[str, int]]) -> list[Picture]:
 class _Maker:
     """Makes samples of items; what is left to chance follows from seed, epoch and item."""
 
-    def __init__(self, store: Store, cfg: StudentConfig, frames: Frames, seed: int) -> None:
+    def __init__(self, store: Store, cfg: StudentConfig, frames: FrameReader, seed: int) -> None:
         self.store, self.cfg, self.frames, self.seed = store, cfg, frames, seed
 
     def frame(self, item: SelectionItem, k: int) -> LazySample:
@@ -331,7 +331,7 @@ class _Maker:
         ]
 
     def _prefix(self, item: SelectionItem) -> list[int]:
-        return shown_frames(item.prefix_start, item.prefix_stop, self.cfg.frames)
+        return sample_prefix_frames(item.prefix_start, item.prefix_stop, self.cfg.frames)
 
 
 def _motion(instant: str, o: ObjectFacts) -> str:

@@ -15,9 +15,9 @@ import numpy as np
 from conf.schema import Quota
 from data.records import FPS, FrameRef, RetrievalQuery, Scene
 from data.tracks.retrieval import queries
-from data.tracks.retrieval.future import spelled
+from data.tracks.retrieval.future import spell_seconds
 from data.tracks.selection.distractors import cell_rng
-from data.world.geometry import DIAGONAL, displacement_across, on_screen
+from data.world.displacement import DIAGONAL, cross_scene_displacement, on_screen_positions
 
 LONGEST = 2 * FPS
 """Frames after which an observation ends at the latest."""
@@ -26,7 +26,7 @@ HORIZONS = (1, 2, 3)
 
 
 @dataclass(frozen=True)
-class Moment:
+class CounterfactualTiming:
     """A query's end of the observation and its target, both frames, and the seconds between."""
 
     stop: int
@@ -40,7 +40,7 @@ def removed_object(scene: Scene, seed: int) -> int | None:
     able = [
         k
         for k in range(len(scene.objects))
-        if (stop := _stop(scene, k)) is not None and on_screen(scene)[1][stop, k]
+        if (stop := _stop(scene, k)) is not None and on_screen_positions(scene)[1][stop, k]
     ]
     if not able:
         return None
@@ -58,19 +58,24 @@ def _stop(scene: Scene, removed: int) -> int | None:
     return stop if stop >= FPS else None
 
 
-def moments(scene: Scene, absent: Scene, removed: int, least: float) -> list[Moment]:
+def counterfactual_timings(
+    scene: Scene, absent: Scene, removed: int, least: float
+) -> list[CounterfactualTiming]:
     """The moments at which the absence shows: some other object is at least `least` px (at 336)
     from where it is in the scene as it was."""
     stop = _stop(scene, removed)
-    apart = consequence(scene, absent, removed)
-    asked = [Moment(stop, stop + seconds * FPS, seconds) for seconds in HORIZONS]
+    apart = removal_displacement(scene, absent, removed)
+    asked = [CounterfactualTiming(stop, stop + seconds * FPS, seconds) for seconds in HORIZONS]
     return [m for m in asked if m.target < scene.frames and apart[m.target] >= least]
 
 
-def consequence(scene: Scene, absent: Scene, removed: int) -> np.ndarray:
+def removal_displacement(scene: Scene, absent: Scene, removed: int) -> np.ndarray:
     """(F,) the largest image displacement that the absence of `removed` makes to another object,
     px at 336 x 336; an object counts where its centre is on screen in either scene."""
-    (places, shown), (other_places, other_shown) = on_screen(scene), on_screen(absent)
+    (places, shown), (other_places, other_shown) = (
+        on_screen_positions(scene),
+        on_screen_positions(absent),
+    )
     places, shown = np.delete(places, removed, axis=1), np.delete(shown, removed, axis=1)
     apart = np.linalg.norm(places - other_places, axis=-1)
     return np.minimum(np.where(shown | other_shown, apart, 0.0).max(axis=-1), DIAGONAL)
@@ -94,16 +99,18 @@ def fill(
         removed = removed_object(scene, seed)
         return None if removed is None else (scene_of(absent_id(scene.scene_id, removed)), removed)
 
-    def moments_of(scene: Scene) -> list[Moment]:
+    def moments_of(scene: Scene) -> list[CounterfactualTiming]:
         absent = absent_of(scene)
-        return [] if absent is None else moments(scene, *absent, least)
+        return [] if absent is None else counterfactual_timings(scene, *absent, least)
 
-    def ask(scene: Scene, moment: Moment, rng: np.random.Generator) -> RetrievalQuery | None:
+    def ask(
+        scene: Scene, moment: CounterfactualTiming, rng: np.random.Generator
+    ) -> RetrievalQuery | None:
         absent, removed = absent_of(scene)
         wrong = queries.wrong_times(absent, moment.target, hard_negatives - 1, least, rng)
         factual = (scene, moment.target)
         if wrong is None or any(
-            displacement_across(*factual, absent, frame) < least for frame in wrong
+            cross_scene_displacement(*factual, absent, frame) < least for frame in wrong
         ):
             return None
         phrase = scene.objects[removed].phrase
@@ -115,7 +122,7 @@ def fill(
             anchor="intervention",
             question=(
                 f"Had the {phrase} been absent, which frame would show the scene "
-                f"{spelled(moment.seconds)} after the observation ends?"
+                f"{spell_seconds(moment.seconds)} after the observation ends?"
             ),
             scene_id=scene.scene_id,
             prefix_start=0,

@@ -19,9 +19,9 @@ import numpy as np
 from conf.schema import BenchmarkConfig
 from data.records import POOLS, FrameRef, RetrievalQuery, Scene
 from data.tracks.selection.distractors import cell_rng
-from data.world.geometry import on_screen
+from data.world.displacement import on_screen_positions
 
-TWIN = 1.0
+TWIN_DISTANCE = 1.0
 """Frames in which every object is within this of its place in the other, px at 336 x 336, are
 twins."""
 SHOWING = (0.02, 0.08)
@@ -30,7 +30,7 @@ at either of them makes no twins differ."""
 
 
 @dataclass
-class Album:
+class UniqueFrames:
     """Frames no two of which are twins, and how many were left out as twins of one in it."""
 
     scene_of: Callable[[str], Scene]
@@ -44,7 +44,9 @@ class Album:
             return False
         looks = list(_appearances(self.scene_of(frame.scene_id), frame.frame))
         for shown, places in looks:
-            if any(np.abs(other - places).max(initial=0) < TWIN for other in self._seen[shown]):
+            if any(
+                np.abs(other - places).max(initial=0) < TWIN_DISTANCE for other in self._seen[shown]
+            ):
                 self.left_out += 1
                 return False
         for shown, places in looks:
@@ -79,7 +81,7 @@ def _appearances(scene: Scene, frame: int) -> Iterable[tuple[tuple, np.ndarray]]
     visible = scene.visible_fraction[frame]
     # Where a record does not tell how much of an object is visible, being in view has to do.
     visible = np.where(np.isnan(visible), 1.0, visible) * scene.in_view[frame]
-    places = on_screen(scene)[0][frame]
+    places = on_screen_positions(scene)[0][frame]
     order = sorted(range(len(scene.objects)), key=lambda k: str(scene.objects[k]))
     for bound in SHOWING:
         shown = [k for k in order if visible[k] >= bound]
@@ -98,7 +100,7 @@ def make_databases(
         The queries whose target is in its database under its own name, those of the standard test
         marked; frames by database; counts.
     """
-    albums = {pool: Album(scene_of) for pool in POOLS}
+    albums = {pool: UniqueFrames(scene_of) for pool in POOLS}
     kept = {
         pool: with_target(cfg, [q for q in queries if q.pool == pool], albums[pool])
         for pool in POOLS
@@ -122,7 +124,7 @@ def future_databases(
     cfg: BenchmarkConfig,
     queries: list[RetrievalQuery],
     scene_ids: dict[str, list[str]],
-    album: Album,
+    album: UniqueFrames,
 ) -> tuple[list[FrameRef], list[FrameRef]]:
     """The standard test's database, of test scenes alone, and the source of all future-state
     queries, of which it is a part."""
@@ -137,7 +139,7 @@ def future_databases(
 
 
 def counterfactual_database(
-    cfg: BenchmarkConfig, queries: list[RetrievalQuery], album: Album
+    cfg: BenchmarkConfig, queries: list[RetrievalQuery], album: UniqueFrames
 ) -> list[FrameRef]:
     """The source of the counterfactual queries: their targets, then their hard negatives, of each
     query first what happened instead, then other frames of the scenes without the object. The test
@@ -154,7 +156,7 @@ def counterfactual_database(
 
 
 def with_target(
-    cfg: BenchmarkConfig, queries: list[RetrievalQuery], album: Album
+    cfg: BenchmarkConfig, queries: list[RetrievalQuery], album: UniqueFrames
 ) -> list[RetrievalQuery]:
     """Queries up to their quotas whose target is no twin of another's, of which those of the test
     split come first: of two frames that look alike both would be right."""

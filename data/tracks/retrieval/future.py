@@ -22,7 +22,7 @@ ONE_A_SCENE = (4, 5, 6)
 
 
 @dataclass(frozen=True)
-class Moment:
+class FutureQuestion:
     """What a builder asks of a scene: an observation, a question, and the frame that answers."""
 
     anchor: str
@@ -31,64 +31,64 @@ class Moment:
     target: int
 
 
-def _clip_end(scene: Scene) -> Iterator[Moment]:
+def _clip_end(scene: Scene) -> Iterator[FutureQuestion]:
     for seconds in (2, 3, 4):
         text = "Which frame shows the scene at the end of the clip, {} after the observation ends?"
-        left = spelled(5 - seconds)
-        yield Moment("time", text.format(left), (0, seconds * FPS), scene.frames - 1)
+        left = spell_seconds(5 - seconds)
+        yield FutureQuestion("time", text.format(left), (0, seconds * FPS), scene.frames - 1)
 
 
-def _clock(scene: Scene) -> Iterator[Moment]:
+def _clock(scene: Scene) -> Iterator[FutureQuestion]:
     for seconds in (1, 2, 3):
-        text = f"Which frame shows the scene {spelled(seconds)} after the observation ends?"
-        yield Moment("time", text, (0, 2 * FPS), (2 + seconds) * FPS)
+        text = f"Which frame shows the scene {spell_seconds(seconds)} after the observation ends?"
+        yield FutureQuestion("time", text, (0, 2 * FPS), (2 + seconds) * FPS)
 
 
-def _at_event(scene: Scene) -> Iterator[Moment]:
+def _at_event(scene: Scene) -> Iterator[FutureQuestion]:
     text = "Which frame shows the scene at the moment of the next collision?"
     for event in list(dict.fromkeys(c.frame for c in scene.collisions))[:EVENTS_A_SCENE]:
         for early in range(6):
             # So many frames lie between: the event's own would show the target.
             stop = event - 1 - early
             if stop >= FPS and _is_next(scene, stop, event):
-                yield Moment("event", text, (stop - FPS, stop), event)
+                yield FutureQuestion("event", text, (stop - FPS, stop), event)
 
 
-def _after_event(scene: Scene) -> Iterator[Moment]:
+def _after_event(scene: Scene) -> Iterator[FutureQuestion]:
     text = (
         "The observation ends at a collision. Which frame shows the scene 1 second after that "
         "collision?"
     )
     for event in {c.frame: None for c in scene.collisions}:
         if event >= FPS and event + FPS < scene.frames:
-            yield Moment("event", text, (event - FPS, event), event + FPS)
+            yield FutureQuestion("event", text, (event - FPS, event), event + FPS)
 
 
-def _before_event(scene: Scene) -> Iterator[Moment]:
+def _before_event(scene: Scene) -> Iterator[FutureQuestion]:
     text = "Which frame shows the scene at the moment of the next collision?"
     for event in {c.frame: None for c in scene.collisions}:
         stop = event - FPS
         if stop >= FPS and _is_next(scene, stop, event):
-            yield Moment("event", text, (stop - FPS, stop), event)
+            yield FutureQuestion("event", text, (stop - FPS, stop), event)
 
 
-def _past_event(scene: Scene) -> Iterator[Moment]:
+def _past_event(scene: Scene) -> Iterator[FutureQuestion]:
     text = "Which frame shows the scene half a second after the next collision?"
     for event in {c.frame: None for c in scene.collisions}:
         stop = event - FPS // 2
         if stop >= FPS and stop + FPS < scene.frames and _is_next(scene, stop, event):
-            yield Moment("event", text, (stop - FPS, stop), stop + FPS)
+            yield FutureQuestion("event", text, (stop - FPS, stop), stop + FPS)
 
 
 def _is_next(scene: Scene, stop: int, event: int) -> bool:
     return min((c.frame for c in scene.collisions if c.frame > stop), default=None) == event
 
 
-def spelled(count: int) -> str:
+def spell_seconds(count: int) -> str:
     return "1 second" if count == 1 else f"{count} seconds"
 
 
-BUILDERS: dict[int, Callable[[Scene], Iterator[Moment]]] = {
+BUILDERS: dict[int, Callable[[Scene], Iterator[FutureQuestion]]] = {
     1: _clip_end,
     2: _clock,
     3: _at_event,
@@ -111,7 +111,9 @@ def fill(
     """Queries of one builder up to its quota, and how many moments were dropped; see
     `queries.fill`."""
 
-    def ask(scene: Scene, moment: Moment, rng: np.random.Generator) -> RetrievalQuery | None:
+    def ask(
+        scene: Scene, moment: FutureQuestion, rng: np.random.Generator
+    ) -> RetrievalQuery | None:
         negatives = queries.wrong_times(scene, moment.target, hard_negatives, least, rng)
         if negatives is None:
             return None
@@ -130,7 +132,7 @@ def fill(
             hard_negatives=tuple(FrameRef(scene.scene_id, frame) for frame in negatives),
         )
 
-    def moments(scene: Scene) -> list[Moment]:
+    def moments(scene: Scene) -> list[FutureQuestion]:
         return list(BUILDERS[builder](scene))
 
     once = builder in ONE_A_SCENE

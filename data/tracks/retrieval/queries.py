@@ -10,7 +10,7 @@ import numpy as np
 from conf.schema import Quota
 from data.records import SPLITS, RetrievalQuery, Scene
 from data.tracks.selection.distractors import cell_rng
-from data.world.geometry import displacements
+from data.world.displacement import frame_displacements
 
 OFFSETS = (16, 32, 48)
 """First choice of hard negatives, in frames on either side of the target."""
@@ -64,7 +64,7 @@ def wrong_times(
     scene: Scene, target: int, count: int, least: float, rng: np.random.Generator
 ) -> list[int] | None:
     """`count` frames of a scene that can be told apart from the target and each other."""
-    apart = displacements(scene)
+    apart = frame_displacements(scene)
     first = [target + side * offset for offset in OFFSETS for side in (-1, 1)]
     dense = list(range(target % DENSE_STEP, scene.frames, DENSE_STEP))
     chosen = [target]

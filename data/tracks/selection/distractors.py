@@ -16,7 +16,11 @@ import numpy as np
 
 from conf.schema import Quota
 from data.records import SPLITS, Candidate, FrameRef, Scene, SelectionItem
-from data.world.geometry import displacement_across, displacements, on_screen
+from data.world.displacement import (
+    cross_scene_displacement,
+    frame_displacements,
+    on_screen_positions,
+)
 
 BUILDERS_VERSION = "5"
 """Of the items' and queries' builders: changes whenever the same scenes would give others."""
@@ -39,7 +43,7 @@ class Draft:
 
 
 @dataclass
-class Picker:
+class DistractorPicker:
     """Picks distractors that can be told apart, and counts the targets for which it could not.
 
     `least` is the least displacement between two candidates (px at 336 x 336, in some object);
@@ -117,8 +121,8 @@ class Picker:
     def _apart(self, one: FrameRef, two: FrameRef, about: tuple[int, ...] | None) -> float:
         scene = self.scene_of(one.scene_id)
         if one.scene_id == two.scene_id:
-            return float(displacements(scene, about)[one.frame, two.frame])
-        return displacement_across(scene, one.frame, self.scene_of(two.scene_id), two.frame)
+            return float(frame_displacements(scene, about)[one.frame, two.frame])
+        return cross_scene_displacement(scene, one.frame, self.scene_of(two.scene_id), two.frame)
 
     def others(self, scene: Scene, rng: np.random.Generator, count: int) -> list[Scene]:
         """So many other scenes of the split in a random order, those that share most of the
@@ -129,24 +133,26 @@ class Picker:
         return sorted(scenes, key=lambda s: -len(looks & set(s.objects)))
 
 
-Draw = Callable[[Scene, np.random.Generator, Picker], Draft | None]
+Draw = Callable[[Scene, np.random.Generator, DistractorPicker], Draft | None]
 """Makes at most one draft of a cell from a scene."""
 
 
-def observed(scene: Scene, prefix: tuple[int, int]) -> tuple[int, ...]:
+def visible_objects(scene: Scene, prefix: tuple[int, int]) -> tuple[int, ...]:
     """The objects that show in a prefix. No other can tell candidates apart: nothing is known of
     where it comes in."""
     start, stop = prefix
-    return tuple(np.flatnonzero(on_screen(scene)[1][start : stop + 1].any(axis=0)).tolist())
+    return tuple(
+        np.flatnonzero(on_screen_positions(scene)[1][start : stop + 1].any(axis=0)).tolist()
+    )
 
 
-def unobserved(frames: Iterable[int], prefix: tuple[int, int]) -> list[int]:
+def outside_prefix(frames: Iterable[int], prefix: tuple[int, int]) -> list[int]:
     """The frames that are not in a prefix. One that was shown is told by comparing."""
     start, stop = prefix
     return [int(f) for f in frames if not start <= f <= stop]
 
 
-def of_scene(scene: Scene, frames: Iterable[int], source: str) -> Iterator[Candidate]:
+def scene_candidates(scene: Scene, frames: Iterable[int], source: str) -> Iterator[Candidate]:
     """Frames of a scene as candidates."""
     return (Candidate(scene.scene_id, int(frame), source) for frame in frames)
 
@@ -165,7 +171,7 @@ def fill(
     falls short is the caller's to report."""
     items, dropped = [], 0
     for split in SPLITS:
-        picker = Picker(least, scene_ids[split], scene_of)
+        picker = DistractorPicker(least, scene_ids[split], scene_of)
         rng = cell_rng(seed, subtype, split)
         drafts: list[Draft] = []
         for index in rng.permutation(len(scene_ids[split])):

@@ -12,8 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from data.records import Candidate, FrameRef, Scene
-from data.tracks.selection.distractors import Draft, Picker, observed, of_scene, unobserved
-from data.world.geometry import object_match
+from data.tracks.selection.distractors import (
+    DistractorPicker,
+    Draft,
+    outside_prefix,
+    scene_candidates,
+    visible_objects,
+)
+from data.world.displacement import object_match_scores
 
 QUESTION = "Which image is closest to the correct future state of the whole scene?"
 PREFIX_STEP = 20
@@ -46,7 +52,7 @@ CELLS = {
 
 
 @dataclass(frozen=True)
-class Moment:
+class EventTiming:
     """Where a collision at frame `event` puts an item's prefix and target."""
 
     event: int
@@ -55,19 +61,21 @@ class Moment:
     target: int
 
 
-def moments(scene: Scene, cell: EventCell) -> Iterator[Moment]:
+def event_timings(scene: Scene, cell: EventCell) -> Iterator[EventTiming]:
     """The moments of a scene that the cell can ask about, in order of time."""
     for event in dict.fromkeys(c.frame for c in scene.collisions):
         stop = event - cell.gap if cell.framing == "future" else event
-        moment = Moment(event, stop - PREFIX_STEP, stop, stop + cell.gap)
+        moment = EventTiming(event, stop - PREFIX_STEP, stop, stop + cell.gap)
         if moment.start >= 0 and moment.target <= scene.frames - 1 - TAIL:
             yield moment
 
 
-def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) -> Draft | None:
+def draft(
+    subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
+) -> Draft | None:
     """An item of the cell around one of the scene's collisions, tried in a random order."""
     cell = CELLS[subtype]
-    found = list(moments(scene, cell))
+    found = list(event_timings(scene, cell))
     for k in rng.permutation(len(found)):
         moment = found[k]
         pool = wrong_frames(cell, scene, moment, rng, picker)
@@ -75,7 +83,7 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) 
         picked = picker.pick(
             FrameRef(scene.scene_id, moment.target),
             pool,
-            observed(scene, (moment.start, moment.stop)),
+            visible_objects(scene, (moment.start, moment.stop)),
             None if across else int(rng.integers(4)),
         )
         if picked is None:
@@ -99,7 +107,11 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) 
 
 
 def wrong_frames(
-    cell: EventCell, scene: Scene, moment: Moment, rng: np.random.Generator, picker: Picker
+    cell: EventCell,
+    scene: Scene,
+    moment: EventTiming,
+    rng: np.random.Generator,
+    picker: DistractorPicker,
 ) -> Iterable[Candidate]:
     """Distractors of the cell's source, in the order in which they are wanted: the scene at
     offsets on either side, the scene's frames most alike to the target, or other scenes at such a
@@ -107,13 +119,15 @@ def wrong_frames(
     target, prefix = moment.target, (moment.start, moment.stop)
     if cell.distractors == "same_offset":
         pool = [f for o in OFFSETS for f in (target - o, target + o) if 0 <= f < scene.frames]
-        return of_scene(scene, rng.permutation(unobserved(pool, prefix)), cell.distractors)
+        return scene_candidates(
+            scene, rng.permutation(outside_prefix(pool, prefix)), cell.distractors
+        )
     if cell.distractors == "same_obj_match":
-        alike = np.argsort(object_match(scene, target), kind="stable")
-        wrong = unobserved(alike[alike != target], prefix)
-        return of_scene(scene, wrong, cell.distractors)
+        alike = np.argsort(object_match_scores(scene, target), kind="stable")
+        wrong = outside_prefix(alike[alike != target], prefix)
+        return scene_candidates(scene, wrong, cell.distractors)
     return (
         Candidate(other.scene_id, there.target, cell.distractors)
         for other in picker.others(scene, rng, ELSEWHERE)
-        for there in list(moments(other, cell))[:1]
+        for there in list(event_timings(other, cell))[:1]
     )

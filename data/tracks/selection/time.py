@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from data.records import SELECTION_SECOND, FrameRef, Scene
-from data.tracks.selection.distractors import Draft, Picker, observed, of_scene
+from data.tracks.selection.distractors import (
+    DistractorPicker,
+    Draft,
+    scene_candidates,
+    visible_objects,
+)
 
 CELLS = {"in_1s": 1, "in_2s": 2}
 """Seconds from the observation's end to the target, by subtype."""
@@ -19,15 +24,17 @@ def question(seconds: int) -> str:
     )
 
 
-def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) -> Draft | None:
+def draft(
+    subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
+) -> Draft | None:
     """An item whose prefix is the scene's first second; distractors are later moments of the same
     scene."""
     seconds = CELLS[subtype]
     start, stop = 0, SELECTION_SECOND - 1
     target = start + SELECTION_SECOND + SELECTION_SECOND * seconds
     later = rng.permutation(np.arange(stop + 1, scene.frames))
-    pool = of_scene(scene, later[later != target], "same_time")
-    about = observed(scene, (start, stop))
+    pool = scene_candidates(scene, later[later != target], "same_time")
+    about = visible_objects(scene, (start, stop))
     picked = picker.pick(FrameRef(scene.scene_id, target), pool, about, int(rng.integers(4)))
     if picked is None:
         return None

@@ -16,9 +16,15 @@ import numpy as np
 
 from conf.schema.benchmark import WINDOW_DIFFICULTIES, WINDOW_FAMILIES, WINDOW_HORIZONS
 from data.records import FrameRef, Scene
-from data.tracks.selection.distractors import Draft, Picker, observed, of_scene, unobserved
+from data.tracks.selection.distractors import (
+    DistractorPicker,
+    Draft,
+    outside_prefix,
+    scene_candidates,
+    visible_objects,
+)
+from data.world.displacement import object_match_scores, on_screen_positions
 from data.world.events import collisions_in, window_group
-from data.world.geometry import object_match, on_screen
 
 QUESTION = "Which image best matches the next scene state?"
 PREFIX_FRAMES = 16
@@ -39,7 +45,9 @@ CELLS = {
 }
 
 
-def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) -> Draft | None:
+def draft(
+    subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
+) -> Draft | None:
     """An item at one of the scene's windows that fall in the cell's group, tried in a random
     order."""
     cell = CELLS[subtype]
@@ -50,18 +58,18 @@ def draft(subtype: str, scene: Scene, rng: np.random.Generator, picker: Picker) 
             continue
         target = stop + cell.horizon
         about = built_around(cell, scene, stop, target)
-        seen = observed(scene, (start, stop))
+        seen = visible_objects(scene, (start, stop))
         about = seen if about is None else tuple(k for k in about if k in seen)
         if about == ():
             continue
-        alike = np.argsort(object_match(scene, target, about), kind="stable")
-        alike = np.array(unobserved(alike[alike != target], (start, stop)))
+        alike = np.argsort(object_match_scores(scene, target, about), kind="stable")
+        alike = np.array(outside_prefix(alike[alike != target], (start, stop)))
         if cell.difficulty == "hard":
             pool, source = alike, "same_near"
         else:
             # Any of the far half: the farthest of all are neighbours, which leaves the target odd.
             pool, source = rng.permutation(alike[len(alike) // 2 :]), "same_far"
-        wrong = of_scene(scene, pool, source)
+        wrong = scene_candidates(scene, pool, source)
         earlier = int(rng.integers(4))
         picked = picker.pick(FrameRef(scene.scene_id, target), wrong, about, earlier)
         if picked is None:
@@ -93,7 +101,7 @@ def built_around(cell: WindowCell, scene: Scene, stop: int, target: int) -> tupl
     if cell.window_family == "B":
         ahead = collisions_in(scene, stop + 1, target)
         return ahead[0].objects if ahead else ()
-    places, shown = on_screen(scene)
+    places, shown = on_screen_positions(scene)
     moved = np.linalg.norm(places[target] - places[stop], axis=-1)
     moved[~(shown[target] & shown[stop])] = 0
     return (int(moved.argmax()),) if moved.max() > 0 else ()

@@ -19,10 +19,10 @@ from conf.errors import UserError
 from data import export as exporter
 from data.export import ensure_export
 from data.publish.columns import CONFIGURATIONS, MEANING, Rows, features
-from data.records import POOLS, RetrievalQuery, SelectionItem, shown_frames
-from data.render.frame_cache import Frames
-from data.store import Store, digest
-from data.tracks.controls import MATCHED
+from data.records import POOLS, RetrievalQuery, SelectionItem, sample_prefix_frames
+from data.render.frame_cache import FrameReader
+from data.store import Store, hash_file
+from data.tracks.controls import MATCHED_ANCHOR
 
 pytestmark = pytest.mark.slow
 
@@ -55,7 +55,10 @@ def test_items_and_queries_come_back_as_they_are(micro_store, loaded) -> None:
         items, queries = loaded["selection"][split], loaded["retrieval"][split]
         kept = [f.name for f in fields(SelectionItem)]
         rows = [SelectionItem.from_row(r) for r in items.select_columns(kept)]
-        assert rows == [*micro_store.selection(split), *micro_store.selection(split, MATCHED)]
+        assert rows == [
+            *micro_store.selection(split),
+            *micro_store.selection(split, MATCHED_ANCHOR),
+        ]
         kept = [f.name for f in fields(RetrievalQuery)]
         rows = [RetrievalQuery.from_row(r) for r in queries.select_columns(kept)]
         assert rows == [q for pool in POOLS for q in micro_store.retrieval(split, pool)]
@@ -67,7 +70,7 @@ def test_items_and_queries_come_back_as_they_are(micro_store, loaded) -> None:
 
 
 def test_images_are_the_frames_that_the_row_names(micro_store, loaded) -> None:
-    frames = Frames(micro_store)
+    frames = FrameReader(micro_store)
 
     def same(image, scene_id: str, frame: int) -> None:
         assert np.array_equal(np.asarray(image), frames.array(scene_id, frame))
@@ -77,7 +80,7 @@ def test_images_are_the_frames_that_the_row_names(micro_store, loaded) -> None:
         return rows.select(range(0, rows.num_rows, 5))
 
     for row in some("selection"):
-        shown = shown_frames(row["prefix_start"], row["prefix_stop"], 12)
+        shown = sample_prefix_frames(row["prefix_start"], row["prefix_stop"], 12)
         assert row["shown_frames"] == shown
         for image, frame in zip(row["prefix_images"], shown, strict=True):
             same(image, row["scene_id"], frame)
@@ -95,7 +98,7 @@ def test_a_frame_that_was_not_rendered_ahead_is_drawn(micro_store, tmp_path) -> 
     rows = Rows(Store(tmp_path, micro_store.manifest), images=True)
     frame = micro_store.database("test")[0]
     drawn = PIL.Image.open(io.BytesIO(rows.row(frame, "test")["image"]["bytes"]))
-    assert np.array_equal(drawn, Frames(micro_store).array(frame.scene_id, frame.frame))
+    assert np.array_equal(drawn, FrameReader(micro_store).array(frame.scene_id, frame.frame))
 
 
 def test_without_images_a_row_has_the_records_fields(micro_store, tmp_path) -> None:
@@ -218,7 +221,7 @@ def test_croissant_keeps_to_its_vocabulary(micro_store, exported) -> None:
     sets = {d["@id"]: d for d in told["distribution"] if d["@type"] == "cr:FileSet"}
     on_disk = {p.relative_to(exported).as_posix(): p for p in exported.rglob("*.parquet")}
     assert {f["contentUrl"]: f["sha256"] for f in files} == {
-        name: digest(path) for name, path in on_disk.items()
+        name: hash_file(path) for name, path in on_disk.items()
     }
     ids = [*_ids(told["distribution"]), *_ids(told["recordSet"])]
     assert len(ids) == len(set(ids))

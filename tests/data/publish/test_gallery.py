@@ -13,9 +13,10 @@ from PIL import Image
 from data.gallery import Looker, page, sheets
 from data.publish.contact_sheets import BREAK, CELL, GAP, MARGIN, RADIUS, _seen_floor, paths, sheet
 from data.records import LETTERS
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
-from data.world.geometry import Camera, displacement_across
+from data.world.camera import Camera
+from data.world.displacement import cross_scene_displacement
 
 pytestmark = pytest.mark.slow
 
@@ -43,7 +44,7 @@ def test_a_seed_gives_the_same_sheets_and_another_seed_others(micro_store, drawn
 
 
 def test_an_item_is_shown_with_its_answer_and_its_displacements(micro_store) -> None:
-    look, frames = Looker(micro_store), Frames(micro_store)
+    look, frames = Looker(micro_store), FrameReader(micro_store)
     for item in micro_store.selection("test")[::7]:
         row = look.item(item)
         assert "".join(c.letter for c in row.others) == LETTERS
@@ -68,7 +69,7 @@ def test_axes_that_do_not_apply_are_not_told(micro_store) -> None:
 
 
 def test_a_counterfactual_pair_shows_one_moment_with_and_without(micro_store) -> None:
-    look, frames = Looker(micro_store), Frames(micro_store)
+    look, frames = Looker(micro_store), FrameReader(micro_store)
     for query in micro_store.retrieval(pool="counterfactual"):
         row = look.absence(query)
         factual, target = row.others[:2]
@@ -134,5 +135,5 @@ def test_displacements_on_a_sheet_are_the_geometrys(micro_store) -> None:
     scene = micro_store.scene(query.scene_id)
     for cell, frame in zip(Looker(micro_store).query(query).others[1:], query.hard_negatives,
                            strict=True):  # fmt: skip
-        away = displacement_across(scene, query.target.frame, scene, frame.frame)
+        away = cross_scene_displacement(scene, query.target.frame, scene, frame.frame)
         assert f"{away:.0f} px off" in cell.caption[1]

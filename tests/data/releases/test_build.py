@@ -13,7 +13,7 @@ from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionC
 from data.build import ensure_benchmark, ensure_items
 from data.parallel import Workers
 from data.publish.clevrer_format import export_clevrer
-from data.render.frame_cache import FrameCache, Frames
+from data.render.frame_cache import FrameCache, FrameReader
 from tests.data.releases.clevrer_files import clevrer_annotation, write_clevrer_scene
 from tests.data.releases.movi_a_files import movi_example, write_movi_folder
 from tests.data.releases.pictures import picture
@@ -58,7 +58,7 @@ def test_a_release_becomes_a_suite_with_its_own_frames(movi, tmp_path, caplog) -
     assert {i.suite for i in items} == {"movi_a"}
     assert store.selection("train") == store.retrieval() == store.database() == []
     # What the store keeps of a frame is what the release shows.
-    frames = Frames(store)
+    frames = FrameReader(store)
     for candidate in items[0].candidates:
         shown = np.asarray(picture(candidate.frame, (256, 256)))
         np.testing.assert_array_equal(frames.array(candidate.scene_id, candidate.frame), shown)

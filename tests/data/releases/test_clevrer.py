@@ -17,9 +17,9 @@ from data.publish.clevrer_format import write_clevrer
 from data.records import Collision
 from data.releases import clevrer
 from data.releases.validation import RecordError
-from data.render import renderer
-from data.world.geometry import rotation
+from data.render import get_renderer
 from data.world.sampling import simulate_scene
+from data.world.shapes import rotation_matrix
 from tests.data.releases.clevrer_files import clevrer_annotation, write_clevrer_scene
 
 
@@ -41,7 +41,7 @@ def test_a_scene_is_as_its_annotation_says(tmp_path: Path) -> None:
 
 def test_angles_turn_about_fixed_axes_x_first(tmp_path: Path) -> None:
     path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
-    turn = rotation(clevrer.read_scene(path, tmp_path, "test").quaternions[0, 0])
+    turn = rotation_matrix(clevrer.read_scene(path, tmp_path, "test").quaternions[0, 0])
     (a, b, c) = (0.3, -0.5, 1.1)
     x = [[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]
     y = [[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]]
@@ -154,7 +154,7 @@ def test_scenes_come_in_order_and_once(tmp_path: Path) -> None:
 def test_what_is_exported_is_read_back(tmp_path: Path) -> None:
     scene = simulate_scene(0, 0, "train", BenchmarkConfig(name="export"))
     assert not scene.in_view.all()
-    drawn = {f: renderer("bullet", 192, 128).render(scene, f) for f in range(scene.frames)}
+    drawn = {f: get_renderer("bullet", 192, 128).render(scene, f) for f in range(scene.frames)}
     annotation, video = write_clevrer(scene, drawn, tmp_path, 10_042)
     block = "validation/{0}_10000-11000/{0}_10042"
     assert annotation == tmp_path / f"annotation_{block.format('annotation')}.json"

@@ -13,7 +13,7 @@ import pytest
 from data.records import Collision, Landing, Scene
 from data.releases import movi_a, tfrecord
 from data.releases.validation import RecordError
-from data.world.geometry import rotation
+from data.world.shapes import rotation_matrix
 from tests.data.releases.movi_a_files import (
     movi_example,
     movi_features,
@@ -60,7 +60,7 @@ def test_quaternions_begin_with_their_real_part(read_form, tmp_path: Path) -> No
     scene = read_form(tmp_path, [])
     angle = 12 / 12
     turn = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-    np.testing.assert_allclose(rotation(scene.quaternions[11, 0]), turn, atol=1e-6)
+    np.testing.assert_allclose(rotation_matrix(scene.quaternions[11, 0]), turn, atol=1e-6)
 
 
 def test_image_positions_become_pixels(read_form, tmp_path: Path) -> None:

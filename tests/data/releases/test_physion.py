@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from data.records import Collision, Landing, Scene
 from data.releases import physion
 from data.releases.validation import RecordError
-from data.world.events import onsets
+from data.world.events import find_motion_onsets
 from tests.data.releases.physion_files import IDS, physion_trial, write_physion
 
 A, B, C = IDS
@@ -155,7 +155,7 @@ def onset_of(scene: Scene, way: np.ndarray) -> list[tuple[int, int]]:
     """Onsets where the second object goes so far from its place."""
     positions = scene.positions.copy()
     positions[:, 1, 0] += np.float32(way)
-    return onsets(replace(scene, positions=positions))
+    return find_motion_onsets(replace(scene, positions=positions))
 
 
 def test_motion_sets_in_where_an_object_leaves_its_place_for_good(at_rest: Scene) -> None:

@@ -18,8 +18,8 @@ from data.releases.transfer_suites import TRANSFER_SUITES
 from data.releases.validation import RecordError
 from data.tracks.selection import event, time
 from data.tracks.selection.distractors import fill
-from data.world.events import onsets
-from data.world.geometry import displacement_across
+from data.world.displacement import cross_scene_displacement
+from data.world.events import find_motion_onsets
 
 LEAST = 12.0
 SCENARIOS = ("Collide", "Drop", "Roll")
@@ -119,7 +119,7 @@ def test_candidates_can_be_told_apart_and_are_no_frame_of_the_prefix(
     scenes = SCENES[suite]
     for item in items:
         gaps = [
-            displacement_across(scenes[a.scene_id], a.frame, scenes[b.scene_id], b.frame)
+            cross_scene_displacement(scenes[a.scene_id], a.frame, scenes[b.scene_id], b.frame)
             for a, b in combinations(item.candidates, 2)
         ]
         assert item.min_displacement == pytest.approx(min(gaps))
@@ -156,7 +156,7 @@ def test_an_event_items_prefix_ends_before_its_event(suite: str, items: list) ->
     events_of = {
         "contact": lambda s: [c.frame for c in s.collisions],
         "A1_contact": lambda s: [c.frame for c in s.collisions],
-        "A2_motion": lambda s: [frame for frame, _ in onsets(s)],
+        "A2_motion": lambda s: [frame for frame, _ in find_motion_onsets(s)],
         "A3_landing": lambda s: [landing.frame for landing in s.landings],
     }
     for item in items:

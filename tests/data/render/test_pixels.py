@@ -10,10 +10,11 @@ import pytest
 
 from conf.schema import BenchmarkConfig
 from data.records import COLORS, MATERIALS, SHAPES, Scene, SceneObject
-from data.render import renderer
+from data.render import get_renderer
 from data.render.appearance import RGB
 from data.render.bullet import BulletRenderer
-from data.world.geometry import Camera, displacements, object_match
+from data.world.camera import Camera
+from data.world.displacement import frame_displacements, object_match_scores
 from data.world.sampling import simulate_scene
 
 LIMITS = BenchmarkConfig(name="pixels")
@@ -64,16 +65,16 @@ def alone(scene: Scene, k: int) -> Scene:
 
 
 def test_a_frame_is_no_distance_from_itself(scene: Scene) -> None:
-    apart = displacements(scene)
+    apart = frame_displacements(scene)
     np.testing.assert_array_equal(np.diag(apart), 0)
     np.testing.assert_array_equal(apart, apart.T)
-    assert object_match(scene, 40)[40] == 0
-    assert (object_match(scene, 40) <= 1).all()
+    assert object_match_scores(scene, 40)[40] == 0
+    assert (object_match_scores(scene, 40) <= 1).all()
 
 
 def test_the_same_frame_is_the_same_pixels(scene: Scene) -> None:
     first = BulletRenderer(192, 128).render(scene, 50).tobytes()
-    again = renderer("bullet", 192, 128)
+    again = get_renderer("bullet", 192, 128)
     again.render(simulate_scene(0, 1, "train", LIMITS), 3)
     assert again.render(scene, 50).tobytes() == first
 
@@ -89,7 +90,7 @@ def crop(look: SceneObject, place: tuple[float, float], yaw: float) -> np.ndarra
         f"{look}{place}{yaw}", "train", (look,), (), position, turn, none, none,
         none[..., :2], there, there.astype(np.float32),
     )  # fmt: skip
-    drawn = renderer("bullet", 192, 128)
+    drawn = get_renderer("bullet", 192, 128)
     drawn.pose(one, 0)
     pixels, mask = drawn.photograph()
     seen = (mask >= 0)[..., None]

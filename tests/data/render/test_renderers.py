@@ -17,13 +17,14 @@ from PIL import Image
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig
 from data.records import Scene
-from data.render import RENDERERS, blender, check, renderer
+from data.render import RENDERERS, blender, check_renderer, get_renderer
 from data.render.appearance import STANDARD_VIEW
 from data.render.bullet import BulletRenderer, _average
 from data.render.egl import EglRenderer
 from data.render.floor import Floor
-from data.world.geometry import Camera, hit_depth
+from data.world.camera import Camera
 from data.world.sampling import simulate_scene
+from data.world.shapes import intersect_rays
 
 LIMITS = BenchmarkConfig(name="renderers")
 
@@ -50,7 +51,7 @@ def test_versions_are_known_without_loading_what_draws() -> None:
 
 def test_an_unknown_renderer_is_told_the_known_ones() -> None:
     with pytest.raises(UserError, match=r"blendr.*bullet, egl, blender"):
-        renderer("blendr", 192, 128)
+        get_renderer("blendr", 192, 128)
 
 
 def test_objects_are_averaged_over_four_pixels_and_rounded_up_at_half() -> None:
@@ -126,7 +127,7 @@ def test_egl_gives_every_object_its_color_and_texture_or_says_what_is_missing(sc
 def sentence_of_egl() -> str | None:
     """Why egl cannot run here, None where it can."""
     try:
-        check("egl")
+        check_renderer("egl")
     except UserError as error:
         return str(error)
     return None
@@ -148,7 +149,7 @@ def nearest_objects(scene: Scene, frame: int, camera: Camera) -> np.ndarray:
     rays = camera.rays(columns.ravel().astype(float), rows.ravel().astype(float))
     depths = np.stack(
         [
-            hit_depth(look.shape, place, turn, np.asarray(camera.eye), rays)
+            intersect_rays(look.shape, place, turn, np.asarray(camera.eye), rays)
             for look, place, turn in zip(
                 scene.objects, scene.positions[frame], scene.quaternions[frame], strict=True
             )
@@ -177,7 +178,7 @@ def test_without_a_driver_egl_ends_in_a_sentence() -> None:
 def test_blender_without_its_module_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(blender, "BPY", "0.0.0")
     with pytest.raises(UserError, match=r"0\.0\.0.*pip install -e '\.\[blender\]'"):
-        renderer("blender", 48, 32)
+        get_renderer("blender", 48, 32)
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from data.records import shown_frames
-from data.tracks.controls import MATCHED, observed
+from data.records import sample_prefix_frames
+from data.tracks.controls import MATCHED_ANCHOR, prefix_under_control
 
 ALIKE = (
     "scene_id", "prefix_start", "prefix_stop", "target_frame", "event_frame", "candidates",
@@ -16,7 +16,7 @@ ALIKE = (
 
 
 def test_a_matched_pair_differs_in_its_anchor_alone(benchmark_store) -> None:
-    items = benchmark_store.selection(suite=MATCHED)
+    items = benchmark_store.selection(suite=MATCHED_ANCHOR)
     assert len(items) >= 4
     for by_event, by_time in zip(items[::2], items[1::2], strict=True):
         assert (by_event.family, by_time.family) == ("event", "time")
@@ -26,7 +26,7 @@ def test_a_matched_pair_differs_in_its_anchor_alone(benchmark_store) -> None:
 
 
 def test_both_questions_of_a_pair_are_answered_by_the_target(benchmark_store) -> None:
-    for item in benchmark_store.selection(suite=MATCHED):
+    for item in benchmark_store.selection(suite=MATCHED_ANCHOR):
         events = [c.frame for c in benchmark_store.scene(item.scene_id).collisions]
         assert item.target_frame == min(e for e in events if e > item.prefix_stop)
         seconds = (item.target_frame - item.prefix_stop) / 26
@@ -42,16 +42,18 @@ def test_the_benchmarks_own_items_hold_no_controls(benchmark_store) -> None:
 @pytest.mark.parametrize("count", [2, 5, 12])
 def test_a_shuffled_prefix_shows_the_same_frames_in_another_order(benchmark_store, count) -> None:
     for item in benchmark_store.selection("test"):
-        shown = shown_frames(item.prefix_start, item.prefix_stop, count)
-        shuffled = observed(item, count, "shuffled_prefix")
+        shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, count)
+        shuffled = prefix_under_control(item, count, "shuffled_prefix")
         assert shuffled != shown
         assert sorted(shuffled) == shown
-        assert observed(item, count, "shuffled_prefix") == shuffled
+        assert prefix_under_control(item, count, "shuffled_prefix") == shuffled
     other = replace(item, item_id="another")
-    assert count == 2 or observed(other, count, "shuffled_prefix") != shuffled
+    assert count == 2 or prefix_under_control(other, count, "shuffled_prefix") != shuffled
 
 
 def test_candidates_alone_come_without_a_prefix(benchmark_store) -> None:
     item = benchmark_store.selection("test")[0]
-    assert observed(item, 12, "candidate_only") == []
-    assert observed(item, 12, None) == shown_frames(item.prefix_start, item.prefix_stop, 12)
+    assert prefix_under_control(item, 12, "candidate_only") == []
+    assert prefix_under_control(item, 12, None) == sample_prefix_frames(
+        item.prefix_start, item.prefix_stop, 12
+    )

@@ -10,14 +10,18 @@ import numpy as np
 import pytest
 
 from data.records import FPS, FrameRef, SelectionItem
-from data.render.frame_cache import FrameCache, Frames, load_frames, save_frames
+from data.render.frame_cache import FrameCache, FrameReader, load_frames, save_frames
 from data.store import Store
-from data.tracks.retrieval.counterfactual import consequence
-from data.tracks.retrieval.database import Album
+from data.tracks.retrieval.counterfactual import removal_displacement
+from data.tracks.retrieval.database import UniqueFrames
 from data.tracks.selection import window
-from data.tracks.selection.distractors import observed, unobserved
+from data.tracks.selection.distractors import outside_prefix, visible_objects
+from data.world.displacement import (
+    cross_scene_displacement,
+    frame_displacements,
+    object_match_scores,
+)
 from data.world.events import window_group
-from data.world.geometry import displacement_across, displacements, object_match
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +53,9 @@ def test_candidates_can_be_told_apart(benchmark_store, items) -> None:
         gaps = []
         for a, b in combinations(item.candidates, 2):
             scene, other = benchmark_store.scene(a.scene_id), benchmark_store.scene(b.scene_id)
-            gap = displacement_across(scene, a.frame, other, b.frame)
+            gap = cross_scene_displacement(scene, a.frame, other, b.frame)
             if a.scene_id == b.scene_id:
-                assert gap == pytest.approx(displacements(scene)[a.frame, b.frame])
+                assert gap == pytest.approx(frame_displacements(scene)[a.frame, b.frame])
             gaps.append(gap)
         assert item.min_displacement == pytest.approx(min(gaps), rel=1e-5)
         assert min(gaps) >= least
@@ -86,13 +90,13 @@ def test_event_distractors_are_of_their_source(benchmark_store, items) -> None:
         if item.distractors == "same_obj_match":
             # No frame before or after the target that is more alike to it could stand here too.
             prefix = (item.prefix_start, item.prefix_stop)
-            score = object_match(scene, item.target_frame)
-            apart = displacements(scene, observed(scene, prefix))
+            score = object_match_scores(scene, item.target_frame)
+            apart = frame_displacements(scene, visible_objects(scene, prefix))
             chosen = [c.frame for c in item.candidates]
             for early in (True, False):
                 side = [c.frame for c in wrong if (c.frame < item.target_frame) == early]
                 closest = min((score[f] for f in side), default=0)
-                nearer = unobserved(np.flatnonzero(score < closest), prefix)
+                nearer = outside_prefix(np.flatnonzero(score < closest), prefix)
                 for frame in (f for f in nearer if (f < item.target_frame) == early):
                     assert frame == item.target_frame or apart[frame, chosen].min() < least
 
@@ -124,7 +128,7 @@ def test_families_b_and_c_are_told_apart_by_what_they_are_built_around(
         scene = benchmark_store.scene(item.scene_id)
         cell = window.CELLS[item.subtype]
         about = window.built_around(cell, scene, item.prefix_stop, item.target_frame)
-        shown = observed(scene, (item.prefix_start, item.prefix_stop))
+        shown = visible_objects(scene, (item.prefix_start, item.prefix_stop))
         if item.window_family == "B":
             assert item.group in ("G2", "G4")
             pairs = {c.objects for c in scene.collisions
@@ -134,7 +138,7 @@ def test_families_b_and_c_are_told_apart_by_what_they_are_built_around(
         else:
             assert item.group != "G4"
             assert len(about) == 1
-        apart = displacements(scene, about)
+        apart = frame_displacements(scene, about)
         for a, b in combinations(item.candidates, 2):
             assert apart[a.frame, b.frame] >= least
         built[item.window_family] += 1
@@ -153,8 +157,8 @@ def test_candidates_differ_in_an_object_that_was_observed(benchmark_store, items
     least = benchmark_store.manifest["config"]["selection"]["min_displacement"]
     for item in items:
         scene = benchmark_store.scene(item.scene_id)
-        seen = observed(scene, (item.prefix_start, item.prefix_stop))
-        apart = displacements(scene, seen)
+        seen = visible_objects(scene, (item.prefix_start, item.prefix_stop))
+        apart = frame_displacements(scene, seen)
         same = [c.frame for c in item.candidates if c.scene_id == item.scene_id]
         assert all(apart[a, b] >= least for a, b in combinations(same, 2))
 
@@ -173,7 +177,7 @@ def test_hard_is_more_alike_than_easy(benchmark_store, items) -> None:
     other."""
     score = {"easy": [], "hard": []}
     for item in (i for i in items if i.window_family == "A"):
-        match = object_match(benchmark_store.scene(item.scene_id), item.target_frame)
+        match = object_match_scores(benchmark_store.scene(item.scene_id), item.target_frame)
         score[item.difficulty] += [match[c.frame] for c in item.candidates if c.source != "target"]
     assert np.median(score["hard"]) < np.median(score["easy"])
 
@@ -181,8 +185,8 @@ def test_hard_is_more_alike_than_easy(benchmark_store, items) -> None:
 def test_scenes_are_as_far_apart_as_their_objects(benchmark_store) -> None:
     one, two = (benchmark_store.scene(s) for s in benchmark_store.scene_ids("train")[:2])
     assert one.objects != two.objects
-    assert displacement_across(one, 60, two, 60) == pytest.approx(336 * 2**0.5)
-    assert displacement_across(one, 60, one, 60) == 0
+    assert cross_scene_displacement(one, 60, two, 60) == pytest.approx(336 * 2**0.5)
+    assert cross_scene_displacement(one, 60, one, 60) == 0
 
 
 def test_each_builder_asks_what_it_may_of_a_scene(benchmark_store) -> None:
@@ -239,7 +243,7 @@ def test_builders_keep_the_papers_clock(benchmark_store) -> None:
 
 def test_hard_negatives_are_other_moments_of_the_scene(benchmark_store) -> None:
     for q in benchmark_store.retrieval():
-        apart = displacements(benchmark_store.scene(q.scene_id))
+        apart = frame_displacements(benchmark_store.scene(q.scene_id))
         frames = [q.target.frame, *(n.frame for n in q.hard_negatives)]
         assert len(frames) == 1 + benchmark_store.manifest["config"]["retrieval"]["hard_negatives"]
         assert {n.scene_id for n in q.hard_negatives} == {q.scene_id}
@@ -264,19 +268,19 @@ def test_counterfactuals_ask_for_what_the_absence_changes(benchmark_store) -> No
         kept = [i for i in range(len(scene.objects)) if i != k]
         before = slice(0, first)
         np.testing.assert_array_equal(scene.positions[before, kept], absent.positions[before])
-        assert consequence(scene, absent, k)[q.target.frame] >= least
-        assert consequence(scene, absent, k)[: q.prefix_stop].max() == 0
+        assert removal_displacement(scene, absent, k)[q.target.frame] >= least
+        assert removal_displacement(scene, absent, k)[: q.prefix_stop].max() == 0
         assert (q.target.frame - q.prefix_stop) % FPS == 0
         factual, *others = q.hard_negatives
         assert factual == FrameRef(q.scene_id, q.target.frame)
         assert {n.scene_id for n in others} == {absent.scene_id}
         for one, two in combinations([q.target, *q.hard_negatives], 2):
             ends = [(benchmark_store.scene(f.scene_id), f.frame) for f in (one, two)]
-            assert displacement_across(*ends[0], *ends[1]) >= least
+            assert cross_scene_displacement(*ends[0], *ends[1]) >= least
 
 
 def test_databases_hold_targets_and_no_twins(benchmark_store) -> None:
-    frames = Frames(benchmark_store)
+    frames = FrameReader(benchmark_store)
     for name, pool in (
         ("test", "standard"), ("future", "future"), ("counterfactual", "counterfactual")
     ):  # fmt: skip
@@ -301,7 +305,7 @@ def test_the_standard_test_is_of_test_scenes_alone(benchmark_store) -> None:
 
 def test_the_counterfactual_database_shows_what_happened_instead(benchmark_store) -> None:
     database = benchmark_store.database("counterfactual")
-    album = Album(benchmark_store.scene)
+    album = UniqueFrames(benchmark_store.scene)
     assert all(album.add(frame) for frame in database)
     queries = benchmark_store.retrieval(pool="counterfactual")
     test = [q.hard_negatives[0] for q in queries if q.split == "test"]
@@ -321,7 +325,7 @@ def test_twins_are_those_that_do_not_move(benchmark_store) -> None:
             name: np.repeat(getattr(scene, name)[:1], scene.frames, axis=0) for name in scene.ARRAYS
         },
     )
-    album = Album({"moving": scene, "still": still}.get)
+    album = UniqueFrames({"moving": scene, "still": still}.get)
     for frame in range(scene.frames):
         album.add(FrameRef("still", frame))
     assert list(album.frames) == [FrameRef("still", 0)]
@@ -329,7 +333,7 @@ def test_twins_are_those_that_do_not_move(benchmark_store) -> None:
     # The other scene begins as this one stands.
     assert not album.add(FrameRef("moving", 0))
     taken = [f.frame for f in album.fill(["moving"], 200, seed=0)]
-    apart = displacements(scene)[np.ix_(taken, taken)]
+    apart = frame_displacements(scene)[np.ix_(taken, taken)]
     assert len(taken) > 20
     assert apart[~np.eye(len(taken), dtype=bool)].min() > 0.9
 
@@ -337,7 +341,7 @@ def test_twins_are_those_that_do_not_move(benchmark_store) -> None:
 def test_a_stored_frame_is_the_frame_drawn_anew(benchmark_store) -> None:
     item = benchmark_store.selection("train")[0]
     drawn = FrameCache.of(benchmark_store).draw(item.scene_id, [item.target_frame])
-    stored = Frames(benchmark_store).array(item.scene_id, item.target_frame)
+    stored = FrameReader(benchmark_store).array(item.scene_id, item.target_frame)
     np.testing.assert_array_equal(drawn[item.target_frame], stored)
 
 

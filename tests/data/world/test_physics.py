@@ -10,8 +10,8 @@ import pytest
 
 from conf.schema import BenchmarkConfig
 from data.records import FPS, Collision, Scene, SceneObject
-from data.world.physics import FRICTION_DECELERATION, Body, _debounce, world
-from data.world.sampling import record, sample_bodies, simulate_scene, without
+from data.world.physics import FRICTION_DECELERATION, Body, _debounce, shared_world
+from data.world.sampling import record_scene, sample_bodies, simulate_scene, simulate_without
 
 LIMITS = BenchmarkConfig(name="laws")
 CUBE = SceneObject("cube", "rubber", "red")
@@ -37,7 +37,7 @@ def test_a_scene_is_the_same_bits_in_another_process_and_order() -> None:
 
 
 def test_a_sliding_cube_slows_down_by_friction_alone() -> None:
-    motion = world().simulate([Body(CUBE, (0.0, 0.0), 0.0, (-2.0, 0.0))], frames=26)
+    motion = shared_world().simulate([Body(CUBE, (0.0, 0.0), 0.0, (-2.0, 0.0))], frames=26)
     seconds = 25 / FPS
     lost = 2.0 - np.linalg.norm(motion.velocities[25, 0])
     travelled = np.linalg.norm(motion.positions[25, 0] - motion.positions[0, 0])
@@ -48,7 +48,7 @@ def test_a_sliding_cube_slows_down_by_friction_alone() -> None:
 def test_two_balls_on_a_line_swap_their_motion_when_they_meet() -> None:
     ball = [SceneObject("sphere", "metal", color) for color in ("red", "blue")]
     bodies = [Body(ball[0], (0.0, -1.0), 0, (0.0, 2.0)), Body(ball[1], (0.0, 0.0), 0, (0.0, 0.0))]
-    motion = world().simulate(bodies, frames=40)
+    motion = shared_world().simulate(bodies, frames=40)
     (hit,) = motion.collisions
     # The gap is 1 unit less two radii, travelled at about 2 units a second.
     assert hit.frame / FPS == pytest.approx(0.6 / 2, abs=0.06)
@@ -75,9 +75,9 @@ def test_scenes_keep_the_limits(index: int) -> None:
 @pytest.mark.parametrize("index", range(4))
 def test_removing_an_object_moves_nothing_it_never_touched(index: int) -> None:
     bodies, motion = sample_bodies(1, index, LIMITS)
-    factual = record("factual", "train", bodies, motion)
+    factual = record_scene("factual", "train", bodies, motion)
     for removed in range(len(factual.objects)):
-        other = without("other", "train", bodies, removed)
+        other = simulate_without("other", "train", bodies, removed)
         kept = [k for k in range(len(factual.objects)) if k != removed]
         reached = touched_by(factual, removed)
         for now, before in enumerate(kept):
@@ -111,6 +111,6 @@ def reached_in(scene: Scene, index: int, reached: dict[int, int], kept: list[int
 def test_a_motion_put_together_is_that_of_all_at_once(index: int) -> None:
     """What is sampled body by body, some of them simulated alone, is what Bullet does with all."""
     bodies, motion = sample_bodies(11, index, LIMITS)
-    together = world().simulate(bodies)
+    together = shared_world().simulate(bodies)
     assert np.array_equal(together.states, motion.states)
     assert together.collisions == motion.collisions

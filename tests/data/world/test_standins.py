@@ -16,9 +16,9 @@ from data.records import Scene, SceneObject
 from data.render.bullet import OVERSAMPLING, BulletRenderer
 from data.render.frame_cache import FrameCache
 from data.store import Store
-from data.world.events import onsets
-from data.world.geometry import RADIUS
-from data.world.physics import Body, Physics, world
+from data.world.events import find_motion_onsets
+from data.world.physics import Body, Physics, shared_world
+from data.world.shapes import RADIUS
 from data.world.standins import STANDINS, simulate_standin
 
 BALL = SceneObject("sphere", "rubber", "red")
@@ -39,7 +39,7 @@ def scenes(request: pytest.FixtureRequest) -> tuple[str, list[Scene]]:
 @pytest.mark.parametrize("gravity", [4.0, 9.81])
 def test_a_ball_falls_half_g_t_squared_and_lands_when_it_is_down(gravity: float) -> None:
     physics = Physics(fps=30, substeps=6, gravity=gravity)
-    motion = world().simulate([Body(BALL, (0, 0), 0, (0, 0), height=1.5)], 40, physics)
+    motion = shared_world().simulate([Body(BALL, (0, 0), 0, (0, 0), height=1.5)], 40, physics)
     (landing,) = motion.landings
     seconds = np.sqrt(2 * (1.5 - RADIUS) / gravity)
     assert landing.frame == pytest.approx(np.ceil(seconds * 30), abs=1)
@@ -52,7 +52,7 @@ def test_on_a_livelier_ground_a_ball_bounces_higher_and_on_one_of_0_it_stays() -
     rebounds = []
     for ground in (0.0, 0.5, 0.9):
         physics = Physics(ground_restitution=ground, rubber_restitution=0.8)
-        motion = world().simulate([Body(BALL, (0, 0), 0, (0, 0), height=1.0)], 40, physics)
+        motion = shared_world().simulate([Body(BALL, (0, 0), 0, (0, 0), height=1.0)], 40, physics)
         (landing,) = motion.landings
         rebounds.append(motion.positions[landing.frame + 1 :, 0, 2].max() - RADIUS)
     none, some, more = rebounds
@@ -62,7 +62,7 @@ def test_on_a_livelier_ground_a_ball_bounces_higher_and_on_one_of_0_it_stays() -
 
 
 def test_what_stands_on_the_ground_does_not_land() -> None:
-    motion = world().simulate([Body(BALL, (0, 0), 0, (1.0, 0))], 10)
+    motion = shared_world().simulate([Body(BALL, (0, 0), 0, (1.0, 0))], 10)
     assert motion.landings == ()
 
 
@@ -86,7 +86,7 @@ def test_scenes_are_of_the_length_and_events_of_their_suite(
         if suite == "movi_a":
             assert (scene.positions[0, :, 2] > RADIUS).all()
         elif scene.scenario == "Collide":
-            assert onsets(scene)
+            assert find_motion_onsets(scene)
             assert scene.landings == ()
 
 

@@ -11,7 +11,7 @@ from scipy.stats import binomtest
 
 from conf.errors import UserError
 from data.records import FAMILIES, Candidate, SelectionItem
-from data.tracks.controls import MATCHED
+from data.tracks.controls import MATCHED_ANCHOR
 from evaluation.metrics.accuracy import accuracy_by_family
 from evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
 from evaluation.reporting.tables import paired_table
@@ -130,7 +130,7 @@ def test_runs_over_other_items_are_refused_with_the_difference(items) -> None:
 
 
 def test_anchors_hold_the_questions_of_a_pair_against_each_other(benchmark_store) -> None:
-    matched = benchmark_store.selection(suite=MATCHED)
+    matched = benchmark_store.selection(suite=MATCHED_ANCHOR)
     by_family = {i.item_id: float(i.family == "event") for i in matched}
     [p] = compare_anchors(matched[::-1], by_family, seed=0)
     assert (p.left, p.right, p.n) == ("event", "time", len(matched) // 2)

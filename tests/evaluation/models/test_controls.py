@@ -12,7 +12,7 @@ import pytest
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig, SelectCommand, ServerConfig, StudentConfig
-from data.tracks.controls import MATCHED, pairs
+from data.tracks.controls import MATCHED_ANCHOR, pair_items
 from evaluation import select
 from evaluation.generators.response_log import score_response
 from evaluation.reporting.results import SelectionResult
@@ -101,7 +101,7 @@ def folder(root: Path, name: str) -> Path:
 
 
 def test_the_questions_of_a_pair_are_held_against_each_other(benchmark_store, tmp_path) -> None:
-    items = benchmark_store.selection(suite=MATCHED)
+    items = benchmark_store.selection(suite=MATCHED_ANCHOR)
     said = {"event": "Answer: A", "time": "Answer: B"}
     given = {
         ("answer", control): [
@@ -110,12 +110,12 @@ def test_the_questions_of_a_pair_are_held_against_each_other(benchmark_store, tm
         for control in (None, "candidate_only")
     }
     cfg = SelectCommand(
-        benchmark=BenchmarkConfig(name="any"), student=STUDENT, suite=MATCHED,
+        benchmark=BenchmarkConfig(name="any"), student=STUDENT, suite=MATCHED_ANCHOR,
         control="candidate_only",
     )  # fmt: skip
     metrics = write_report(given, items, "one", "any", cfg, tmp_path, {})
     told = json.loads((tmp_path / "report.json").read_text())["controls"]
-    truth = [by_event.letter for by_event, _ in pairs(items)]
+    truth = [by_event.letter for by_event, _ in pair_items(items)]
     matched = [p for p in told if p["left"] == "event"]
     assert [p["mode"] for p in matched] == ["answer", "answer, candidate_only"]
     for p in matched:
@@ -128,22 +128,24 @@ def test_the_questions_of_a_pair_are_held_against_each_other(benchmark_store, tm
 
 
 def test_a_limit_keeps_pairs_whole(benchmark_store) -> None:
-    items = benchmark_store.selection(suite=MATCHED)
-    assert len(items) == 2 * len(pairs(items))
+    items = benchmark_store.selection(suite=MATCHED_ANCHOR)
+    assert len(items) == 2 * len(pair_items(items))
     few = select.limit_items(items, 3, 0)
-    [(by_event, by_time)] = pairs(few)
+    [(by_event, by_time)] = pair_items(few)
     assert few == [by_event, by_time]
     assert sorted(select.limit_items(items, len(items), 0), key=items.index) == items
 
 
 def test_a_limit_that_leaves_no_pair_is_told() -> None:
     cfg = SelectCommand(
-        benchmark=BenchmarkConfig(name="any"), student=STUDENT, suite=MATCHED, limit=1
+        benchmark=BenchmarkConfig(name="any"), student=STUDENT, suite=MATCHED_ANCHOR, limit=1
     )
     assert cfg.check() == ["limit=1: suite=matched_anchor asks pairs of items, give 2 or more"]
 
 
-@pytest.mark.parametrize(("suite", "hint"), [("physion", "measure on$"), (MATCHED, "has pairs by")])
+@pytest.mark.parametrize(
+    ("suite", "hint"), [("physion", "measure on$"), (MATCHED_ANCHOR, "has pairs by")]
+)
 def test_a_suite_that_a_benchmark_lacks_is_told(micro_store, suite, hint) -> None:
     with pytest.raises(UserError, match=f"has no test items of the {suite} suite to .*{hint}"):
         select.select_items(micro_store, suite, None, 0)

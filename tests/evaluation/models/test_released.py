@@ -24,8 +24,8 @@ from conf.schema import (
     RetrieverConfig,
     SimilarityCommand,
 )
-from data.records import FPS, FRAMES, LETTERS, FrameRef, shown_frames
-from data.render.frame_cache import Frames
+from data.records import FPS, FRAMES, LETTERS, FrameRef, sample_prefix_frames
+from data.render.frame_cache import FrameReader
 from evaluation import retrieve, similarity
 from evaluation.embedders.base import released_encoder
 from evaluation.embedders.dual_encoder import unit_rows
@@ -67,8 +67,8 @@ def presets(tmp_path_factory) -> dict[str, RetrieverConfig]:
 
 
 @pytest.fixture(scope="module")
-def frames(micro_store) -> Frames:
-    return Frames(micro_store, released.SIZE)
+def frames(micro_store) -> FrameReader:
+    return FrameReader(micro_store, released.SIZE)
 
 
 def encoder(preset: RetrieverConfig):
@@ -99,7 +99,7 @@ def test_a_query_is_the_sum_of_its_prefix_and_its_question(
     preset, query = presets[kind], micro_store.standard_test()[0]
     model = AutoModel.from_pretrained(preset.model)
     processor = AutoProcessor.from_pretrained(preset.model)
-    shown = shown_frames(query.prefix_start, query.prefix_stop, preset.frames)
+    shown = sample_prefix_frames(query.prefix_start, query.prefix_stop, preset.frames)
     inputs = processor(
         text=[query.question.lower()], images=[frames.image(query.scene_id, f) for f in shown],
         padding="max_length", max_length=model.config.text_config.max_position_embeddings,
@@ -150,7 +150,7 @@ def test_vlm2vec_reads_bare_media_at_flat_positions(presets, frames, micro_store
     plain = Qwen2VLForConditionalGeneration.from_pretrained(base["base_model_name_or_path"])
     model = PeftModel.from_pretrained(plain, preset.model).merge_and_unload().eval()
     processor = AutoProcessor.from_pretrained(preset.model)
-    shown = shown_frames(query.prefix_start, query.prefix_stop, preset.frames)
+    shown = sample_prefix_frames(query.prefix_start, query.prefix_stop, preset.frames)
     clip = torch.from_numpy(frames.stack(query.scene_id, shown)).permute(0, 3, 1, 2)
     times = {"fps": float(FPS), "total_num_frames": FRAMES, "frames_indices": shown}
     inputs = processor(

@@ -26,7 +26,7 @@ from conf.schema import (
     RetrieveCommand,
     RetrieverConfig,
 )
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import open_store
 from evaluation import retrieve
 from evaluation.embedders import base
@@ -98,7 +98,7 @@ def edit_config(folder: Path, **changes: object) -> None:
 def test_it_is_measured_once_and_read_back(world, tmp_path, micro_store) -> None:
     first = world()
     queries, database = micro_store.standard_test(), micro_store.database()
-    frames, names = Frames(micro_store, 96), [f.name for f in database]
+    frames, names = FrameReader(micro_store, 96), [f.name for f in database]
     (trained, _) = embedders(tmp_path / "run", CFG, "bf16", micro_store, tmp_path)
     store = open_store(tmp_path / "store" / "micro")
     asked = embed_queries(trained, queries, store, frames, 16).rows([q.query_id for q in queries])
@@ -162,7 +162,7 @@ def test_one_of_many_vectors_is_measured_by_late_interaction(
     save_run(cfg, tmp_path / "run", micro, micro_store)
     first = world()
     queries, database = micro_store.standard_test(), micro_store.database()
-    frames = Frames(micro_store, 96)
+    frames = FrameReader(micro_store, 96)
     model = embedder.load_trained(cfg, "fp32", tmp_path / "run" / "retriever")
     asked = model.encode_query([embedder.query_input(q, frames, CFG) for q in queries])
     shown = model.encode_document([embedder.frame_input(f, frames) for f in database])
@@ -255,16 +255,16 @@ def test_a_kept_embedding_depends_on_what_is_shown(micro_store, saved, tmp_path)
     folders = set()
     for preset in [replace(CFG, **change) for change in changes]:
         again = replace(embedder, preset=preset)
-        kept = embed_frames(again, database, store, Frames(store, preset.image_size), 2)
+        kept = embed_frames(again, database, store, FrameReader(store, preset.image_size), 2)
         assert kept.rows([f.name for f in database]).shape == (2, 64)
         folders.add(kept.folder)
-    folders.add(embed_frames(untrained, database, store, Frames(store, 96), 2).folder)
+    folders.add(embed_frames(untrained, database, store, FrameReader(store, 96), 2).folder)
     bf16 = replace(embedder, precision="bf16")
-    folders.add(embed_frames(bf16, database, store, Frames(store, 96), 2).folder)
+    folders.add(embed_frames(bf16, database, store, FrameReader(store, 96), 2).folder)
     assert len(folders) == 5
     # Neither the number of a query's frames nor its instruction changes a frame's embedding.
     asked = replace(embedder, preset=replace(CFG, frames=6, query_instruction="Find."))
-    assert embed_frames(asked, database, store, Frames(store, 96), 2).folder in folders
+    assert embed_frames(asked, database, store, FrameReader(store, 96), 2).folder in folders
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from PIL import Image
 from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import SelectCommand, ServerConfig, StudentConfig
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from evaluation import select
 from evaluation.generators.model_source import model_served, response_settings, shown
 from evaluation.generators.openai_server import revision, say, written
@@ -36,7 +36,7 @@ def items(micro_store):
 
 @pytest.fixture
 def frames(micro_store):
-    return Frames(micro_store, STUDENT.image_size)
+    return FrameReader(micro_store, STUDENT.image_size)
 
 
 def at(*servers, **changes) -> ServerConfig:

@@ -30,7 +30,7 @@ from conf.schema import (
     TeacherConfig,
     TwoStageCommand,
 )
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import Store, open_store
 from evaluation import two_stage
 from evaluation.embedders.base import released_encoder
@@ -114,7 +114,7 @@ def test_texts_rank_by_their_scores_and_a_missing_one_is_a_miss(ranks, store, cl
     said = [f"The scene after {q.question} {k}" for k, q in enumerate(queries)]
     found = ranks("predict_image", said)
     encoder = released_encoder(clip, "fp32", Path("unused"))
-    scores = encoder.texts(said) @ encoder.frames(database, Frames(store, clip.image_size)).T
+    scores = encoder.texts(said) @ encoder.frames(database, FrameReader(store, clip.image_size)).T
     gold = np.array([database.index(q.target) for q in queries])
     plain = ranking_metrics_of_scores(scores, gold, [10])
     row = retrieval_rows("micro", "x", found, queries, 0)[0]
@@ -134,7 +134,7 @@ def test_texts_rank_by_their_scores_and_a_missing_one_is_a_miss(ranks, store, cl
 
 def test_repeating_the_question_ranks_as_seeing_no_prefix(ranks, store, clip, tmp_path) -> None:
     queries, database = load_standard_test(store)
-    frames, names = Frames(store, clip.image_size), [f.name for f in database]
+    frames, names = FrameReader(store, clip.image_size), [f.name for f in database]
     [embedder] = embedders(None, clip, "fp32", store, tmp_path)
     encoder = embedder.load()
     encoder.watch = lambda clips: np.zeros((len(clips), 24), np.float32)
@@ -172,7 +172,7 @@ def test_captions_match_by_their_words(ranks, store) -> None:
 
 def test_a_drawn_target_is_found_first_and_drawn_once(ranks, store, talking) -> None:
     queries, _ = load_standard_test(store)
-    pixels = Frames(store)
+    pixels = FrameReader(store)
 
     def paint(request) -> bytes:
         scene, frame = request["prompt"].split("/")

@@ -14,7 +14,7 @@ from transformers import AutoModelForImageTextToText, AutoProcessor
 
 from conf.entry import Run
 from conf.schema import ArchitectureConfig, LoraConfig, SelectCommand, ServerConfig, StudentConfig
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from evaluation import select
 from evaluation.generators.model_source import shown
 from evaluation.generators.openai_server import chat_of, request_of
@@ -98,7 +98,10 @@ def server_of_merged(merged, tmp_path):
 def test_the_server_is_asked_with_the_ids_that_a_model_here_reads(
     server, cfg, base, micro_store, control
 ) -> None:
-    frames, processor = Frames(micro_store, cfg.image_size), AutoProcessor.from_pretrained(base)
+    frames, processor = (
+        FrameReader(micro_store, cfg.image_size),
+        AutoProcessor.from_pretrained(base),
+    )
     loading.pin_sizes(processor, cfg.image_size, cfg.frames)
     client = openai.OpenAI(base_url=server.url, api_key="none")
     for mode, item in zip(("record", "answer"), micro_store.selection("test"), strict=False):
@@ -172,7 +175,7 @@ def test_a_server_answers_as_the_student_that_was_merged(
 
 def likeliest_served(server, model, cfg, store, item) -> tuple[list[int], list[float]]:
     """The likeliest first tokens of an answer, and their log-probabilities."""
-    sample = shown("cot", Frames(store, cfg.image_size), cfg, None, "answer", item)
+    sample = shown("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
     request = request_of(cfg, "answer", sample.clip)
     request |= {"max_tokens": 1, "logprobs": True, "top_logprobs": 10}
     request["extra_body"]["return_tokens_as_token_ids"] = True
@@ -185,7 +188,7 @@ def likeliest_served(server, model, cfg, store, item) -> tuple[list[int], list[f
 
 def scored_here(folder, cfg, store, item) -> np.ndarray:
     """The log-probability of every token there, by the standard classes."""
-    sample = shown("cot", Frames(store, cfg.image_size), cfg, None, "answer", item)
+    sample = shown("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
     processor = AutoProcessor.from_pretrained(folder)
     loading.pin_sizes(processor, cfg.image_size, cfg.frames)
     model = AutoModelForImageTextToText.from_pretrained(folder, dtype="auto").eval()

@@ -78,17 +78,17 @@ def test_a_frame_stands_in_the_page_once_and_small(micro_store, every):
 
 def test_frames_that_are_gone_are_told_and_the_others_stay(micro_store, every, monkeypatch):
     from conf.errors import UserError
-    from data.render.frame_cache import Frames
+    from data.render.frame_cache import FrameReader
 
     lost = every[0].scene_id
-    stack = Frames.stack
+    stack = FrameReader.stack
 
     def partly(self, scene_id, frames):
         if scene_id == lost:
             raise UserError(f"the video of {scene_id} is gone")
         return stack(self, scene_id, frames)
 
-    monkeypatch.setattr(Frames, "stack", partly)
+    monkeypatch.setattr(FrameReader, "stack", partly)
     few = [every[0], next(i for i in every if i.scene_id != lost and i.family == "time")]
     frames, gone = shown.pictures(few, micro_store)
     assert gone == [f"the video of {lost} is gone"]

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from conf.errors import UserError
 from conf.schema import ReportCommand
 from data.records import LETTERS
-from data.tracks.controls import MATCHED
+from data.tracks.controls import MATCHED_ANCHOR
 from evaluation.reporting.run_responses import Scored
 from tests.evaluation.reporting.measured import (
     reported,
@@ -162,7 +162,7 @@ def test_what_a_suite_is_answered_stands_beside_what_all_items_are(
     everything = {"runs": ["select/*"], "items": 500}
     before = page_data(reported(runs, micro_store.folder.parent, **everything))["items"]
     pairs = micro_store.selection("test")[:6]
-    suite = {"model": "cot", "mode": "reasoning", "suite": MATCHED}
+    suite = {"model": "cot", "mode": "reasoning", "suite": MATCHED_ANCHOR}
     select_run(runs, micro_store, micro, "pairs", right, pairs, **suite)
     after = page_data(reported(runs, micro_store.folder.parent, **everything))["items"]
     said = {item["id"]: {s["by"] for s in item["said"]} for item in after}

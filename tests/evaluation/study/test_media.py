@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from evaluation.study.media import IMAGE, PREFIX, VIDEO, encode_video, media_of
 
 END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
@@ -21,7 +21,7 @@ def item(micro_store):
 
 
 def test_candidates_are_their_pixels_in_files_of_one_size(micro_store, item) -> None:
-    frames = Frames(micro_store)
+    frames = FrameReader(micro_store)
     prefix, *candidates = media_of(item, frames)
     assert (prefix.slot, prefix.kind) == (PREFIX, VIDEO)
     assert [m.slot for m in candidates] == [0, 1, 2, 3]
@@ -40,7 +40,7 @@ def test_candidates_are_their_pixels_in_files_of_one_size(micro_store, item) -> 
 
 
 def test_a_prefix_is_every_frame_at_the_scenes_rate_and_nothing_else(micro_store, item) -> None:
-    frames = Frames(micro_store)
+    frames = FrameReader(micro_store)
     prefix = media_of(item, frames)[0]
     shown = list(range(item.prefix_start, item.prefix_stop + 1))
     with av.open(io.BytesIO(prefix.content)) as video:

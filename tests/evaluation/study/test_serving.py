@@ -22,7 +22,7 @@ from starlette.responses import PlainTextResponse
 from conf.entry import Run
 from conf.schema import ExportStudyCommand
 from data.records import LETTERS
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from evaluation.study import auth, export, storage
 from evaluation.study.guards import HEADERS, Guard
 from evaluation.study.routes import make_app
@@ -113,7 +113,7 @@ def test_a_letter_stands_for_the_candidate_that_was_shown_there(small, micro_sto
     [turn] = rows(small, "SELECT * FROM turn WHERE token = ?", page.hidden("key"))
     item = next(i for i in micro_store.selection("test") if i.item_id == turn["item_id"])
     chosen = item.candidates[turn["choice"]]
-    pixels = Frames(micro_store).array(chosen.scene_id, chosen.frame)
+    pixels = FrameReader(micro_store).array(chosen.scene_id, chosen.frame)
     assert np.array_equal(np.asarray(Image.open(io.BytesIO(shown[2]))), pixels)
     assert turn["client_seconds"] == 3.25
     assert turn["opened"] <= turn["loaded"] <= turn["answered"]

@@ -20,7 +20,7 @@ from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
 from data import store
-from data.store import load_rows, save_rows, sealed
+from data.store import add_checksum, load_rows, save_rows
 from models.checks import check_pooling
 from train import contrastive
 
@@ -34,8 +34,8 @@ def edited(folder: Path, root: Path, edit: Callable[[Rows], Rows]) -> str:
     path = copy / "retrieval.parquet"
     save_rows(edit(load_rows(path)), path)
     manifest = json.loads((copy / store.MANIFEST).read_text())
-    manifest["files"] = store.digests(copy)
-    (copy / store.MANIFEST).write_text(json.dumps(sealed(manifest)))
+    manifest["files"] = store.hash_files(copy)
+    (copy / store.MANIFEST).write_text(json.dumps(add_checksum(manifest)))
     return str(root)
 
 

@@ -17,7 +17,7 @@ from torch.nn.functional import cross_entropy, normalize
 from conf.errors import UserError
 from conf.schema import LoraConfig, RetrieverConfig
 from data.records import FrameRef
-from data.world.geometry import displacements
+from data.world.displacement import frame_displacements
 from models.lora_kernels import fuse, unfuse
 from models.retriever.embedder import frame_input, load_retriever, query_input, tokenizer_texts
 from train.retriever.batches import batch_of
@@ -210,7 +210,7 @@ def told(store, query, other, frame, place, changes) -> float:
     if changes.get("identical") and frame == query.target:
         return -math.inf
     if "near" in changes and frame.scene_id == query.target.scene_id:
-        apart = displacements(store.scene(frame.scene_id))[query.target.frame, frame.frame]
+        apart = frame_displacements(store.scene(frame.scene_id))[query.target.frame, frame.frame]
         if apart < changes["near"]:
             return -math.inf
     return math.log(changes.get("hard_weight", 1.0)) if own else 0.0

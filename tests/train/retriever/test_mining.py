@@ -12,7 +12,7 @@ import pytest
 from conf.entry import Run
 from conf.schema import LateConfig
 from data.records import FrameRef
-from data.world.geometry import displacements
+from data.world.displacement import frame_displacements
 from models.retriever.embedder import frame_input, load_trained, query_input
 from train import contrastive
 from train.common.journal import read_journal
@@ -25,7 +25,7 @@ MARGIN = 24.0
 def test_what_is_ranked_high_and_wrong_is_taken_in_order(micro_store) -> None:
     query = micro_store.retrieval("train")[0]
     scene, target = query.target.scene_id, query.target.frame
-    apart = displacements(micro_store.scene(scene))[target]
+    apart = frame_displacements(micro_store.scene(scene))[target]
     ranked = [FrameRef(scene, f) for f in np.argsort(apart, kind="stable").tolist()]
     elsewhere = [FrameRef("s0-000009", target), FrameRef("s0-000008", 0)]
     found = wrong(query, [*ranked, *elsewhere], micro_store, MARGIN, 5)
@@ -42,7 +42,7 @@ def test_the_benchmarks_own_fill_what_is_lacking(micro_store) -> None:
 def test_no_margin_takes_a_frame_that_shows_what_the_target_shows(micro_store) -> None:
     for query in micro_store.retrieval("train"):
         scene, target = query.target.scene_id, query.target.frame
-        apart = displacements(micro_store.scene(scene))[target]
+        apart = frame_displacements(micro_store.scene(scene))[target]
         ranked = [FrameRef(scene, f) for f in np.argsort(apart, kind="stable").tolist()]
         found = wrong(query, ranked, micro_store, 0, len(ranked))
         assert {f.frame for f in found} == set(np.flatnonzero(apart >= 1).tolist())

@@ -10,7 +10,7 @@ import torch
 from transformers import EvalPrediction
 
 from conf.errors import UserError
-from data.records import FPS, SelectionItem, shown_frames
+from data.records import FPS, SelectionItem, sample_prefix_frames
 from models.student.collator import IGNORED, Collator, encode, letter_ids, pad
 from models.student.prompts import Sample, selection_sample
 from train.student.lazy_samples import LazySample, LengthSampler, Samples
@@ -86,7 +86,7 @@ def test_the_prompt_holds_every_shown_frame_at_its_true_time(
     encoded = encode(selection_sample(item, "answer", "cot", frames, student_cfg), processor, 1500)
     assert encoded.media["video_grid_thw"].tolist() == [[6, 6, 6]]
     assert encoded.media["image_grid_thw"].tolist() == [[1, 6, 6]] * 4
-    shown = shown_frames(item.prefix_start, item.prefix_stop, 12)
+    shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, 12)
     times = [(a + b) / 2 / FPS for a, b in zip(shown[::2], shown[1::2], strict=True)]
     text = processor.tokenizer.decode(encoded.input_ids)
     at = 0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from data.records import LETTERS
-from data.render.frame_cache import Frames
+from data.render.frame_cache import FrameReader
 from data.store import Store
 from teacher.predicates import find_cut, object_region
 from train.student.lazy_samples import LazySample
@@ -31,7 +31,7 @@ def shown(store: Store, scene_id: str, frame: int) -> dict[str, str]:
     }
 
 
-def all_shown(store: Store, frames: Frames) -> dict[bytes, list[dict[str, str]]]:
+def all_shown(store: Store, frames: FrameReader) -> dict[bytes, list[dict[str, str]]]:
     """What frames show, by their pixels. A scene at rest is told alike, but where an object creeps
     over a region's border."""
     every: dict[bytes, list[dict[str, str]]] = {}
