@@ -1,8 +1,8 @@
-"""Every setting of every command: one dataclass a command and a group, with its unit and default.
+"""Settings of every command: one dataclass per command and per group of settings.
 
-Defaults here are the paper's values; a preset (`conf/<group>/<name>.yaml`) states what differs.
-`check()` returns one sentence for each combination of values that cannot work, naming the keys as
-a user types them.
+The docstring below a field is its description in `--help`. Defaults are the paper's values; a
+preset (`conf/<group>/<name>.yaml`) sets the values that differ. `check()` returns one sentence per
+invalid value or combination of values, with the keys as the user types them.
 """
 
 from conf.schema.benchmark import (
@@ -40,41 +40,3 @@ from conf.schema.study import ExportStudyCommand, StudyCommand
 from conf.schema.teacher import TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainConfig
 from conf.schema.two_stage import MatcherConfig, TwoStageCommand
-
-__all__ = [
-    "PARALLEL_BACKENDS",
-    "ArchitectureConfig",
-    "BenchmarkConfig",
-    "BuildCommand",
-    "CommandConfig",
-    "ContrastiveCommand",
-    "ContrastiveTrainConfig",
-    "ExportCommand",
-    "ExportModelCommand",
-    "ExportStudyCommand",
-    "GalleryCommand",
-    "ImageServerConfig",
-    "LateConfig",
-    "LoraConfig",
-    "MatcherConfig",
-    "NarrateCommand",
-    "Quota",
-    "ReportCommand",
-    "RetrievalTrackConfig",
-    "RetrieveCommand",
-    "RetrieverConfig",
-    "SelectCommand",
-    "SelectionConfig",
-    "ServeCommand",
-    "ServerConfig",
-    "ServersConfig",
-    "SftCommand",
-    "SftTrainConfig",
-    "SimilarityCommand",
-    "StatisticsCommand",
-    "StudentConfig",
-    "StudyCommand",
-    "TeacherConfig",
-    "TrainConfig",
-    "TwoStageCommand",
-]

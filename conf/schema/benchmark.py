@@ -1,4 +1,4 @@
-"""What a benchmark is made of: its scenes, cells, quotas and databases."""
+"""Settings of a benchmark: its scenes, its cells with their quotas, and its databases."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import product
 
 from omegaconf import MISSING
 
-from conf.schema.checks import too_small
+from conf.schema.checks import check_minimum, check_options, check_positive, check_share
 
 RENDERERS = ("bullet", "egl", "blender")
 SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
@@ -19,12 +19,12 @@ WINDOW_HORIZONS = (8, 16, 24)
 WINDOW_DIFFICULTIES = ("easy", "hard")
 STANDIN_OBJECTS = 6
 DISTINCT_APPEARANCES = 48
-"""Objects that can be told apart by their names: 3 shapes, 8 colours, 2 materials."""
+"""Number of distinct object names: 3 shapes x 8 colours x 2 materials."""
 
 
 @dataclass
 class Quota:
-    """How many items or queries a cell gets in each split."""
+    """Number of items or queries of a cell in each split."""
 
     train: int = 0
     test: int = 0
@@ -32,158 +32,162 @@ class Quota:
 
 @dataclass
 class SelectionConfig:
-    """Cells of the selection track and their quotas. A cell's name is its item's `subtype`."""
+    """Cells of the selection track and their quotas. The name of a cell is its items' `subtype`."""
 
     min_displacement: float = 12.0
-    """Least displacement (px at 336 x 336) between any two candidates, in some object."""
+    """Minimum displacement (px at 336 x 336) of at least one object between any two candidates."""
     event: dict[str, Quota] = field(default_factory=dict)
+    """Quota of each event cell."""
     time: dict[str, Quota] = field(default_factory=dict)
+    """Quota of each time cell."""
     window: dict[str, Quota] = field(default_factory=dict)
-    """Quotas of cells, such as G1_A_h8_easy, or of all six cells of a group and family, such as
-    G1_A, which are divided evenly among them."""
+    """Quota of each window cell, such as G1_A_h8_easy; a group and family, such as G1_A, divides its
+    quota evenly among its six cells."""
     matched: Quota = field(default_factory=Quota)
-    """Pairs of items that differ in their question's anchor alone, a suite of their own."""
+    """Pairs of matched-anchor items: the two questions differ only in the anchor (event or
+    time)."""
 
     def __post_init__(self) -> None:
         self.window = divide_window_quotas(self.window)
 
     def check(self) -> list[str]:
-        problems = too_small(self, "benchmark.selection.", {"min_displacement": 0})
+        problems = check_minimum(self, "benchmark.selection.", {"min_displacement": 0})
         for family in ("event", "time", "window"):
-            problems += quota_problems(f"benchmark.selection.{family}", getattr(self, family))
-        return problems + quota_problems("benchmark.selection", {"matched": self.matched})
+            problems += check_quotas(f"benchmark.selection.{family}", getattr(self, family))
+        return problems + check_quotas("benchmark.selection", {"matched": self.matched})
 
 
 @dataclass
 class RetrievalTrackConfig:
-    """Builders of the retrieval track (spec names 1 to 6) and the test database."""
+    """Builders 1 to 6 of the retrieval track, and its databases."""
 
     builders: dict[str, Quota] = field(default_factory=dict)
+    """Quota of each builder."""
     counterfactual: Quota = field(default_factory=Quota)
-    """Queries about scenes that are simulated again with an object absent."""
+    """Queries about scenes that are simulated again without one of their objects."""
     hard_negatives: int = 3
-    """Same-scene wrong-time frames a query."""
+    """Hard negatives per query: wrong-time frames of the query's own scene."""
     standard: int = 2_002
-    """Of the builders' test queries, those of the standard test; as many of each builder."""
+    """Test queries of the standard test, equally many from each builder."""
     database: int = 10_000
-    """Frames of the standard test's database; it holds every target of its queries."""
+    """Frames in the database of the standard test, including every target."""
     source: int = 30_000
-    """Frames that the builders' queries have for a source; it holds every target of theirs."""
+    """Source frames of the builders' queries, including every target."""
     counterfactual_source: int = 26_995
-    """Frames that the counterfactual queries have for a source."""
+    """Source frames of the counterfactual queries, including every target."""
 
     def check(self) -> list[str]:
-        sizes = ("standard", "database", "source", "counterfactual_source")
+        sizes = dict.fromkeys(("standard", "database", "source", "counterfactual_source"), 0)
         return [
-            *too_small(self, "benchmark.retrieval.", {"hard_negatives": 1}),
-            *too_small(self, "benchmark.retrieval.", dict.fromkeys(sizes, 0)),
-            *quota_problems("benchmark.retrieval.builders", self.builders),
-            *quota_problems("benchmark.retrieval", {"counterfactual": self.counterfactual}),
+            *check_minimum(self, "benchmark.retrieval.", {"hard_negatives": 1, **sizes}),
+            *check_quotas("benchmark.retrieval.builders", self.builders),
+            *check_quotas("benchmark.retrieval", {"counterfactual": self.counterfactual}),
         ]
 
 
 @dataclass
 class BenchmarkConfig:
     name: str = MISSING
-    """Name of the folder below `store`."""
+    """Folder of the benchmark below `store`."""
     simulator: str = "bullet"
-    """bullet simulates scenes; clevrer, movi_a and physion read a release of that simulator."""
+    """Source of the scenes: bullet simulates them; clevrer, movi_a and physion read a release."""
     standin: str | None = None
-    """The transfer suite, movi_a or physion, for which scenes of another look and physics stand in:
-    Bullet's own, by that suite's recipe. Null simulates standard scenes."""
+    """Transfer suite to imitate without its release: movi_a or physion. Bullet simulates scenes
+    with other shapes, colours and physics, and the items follow that suite's recipe. null simulates
+    standard scenes."""
     folder: str | None = None
-    """Folder of the release, where one is read."""
+    """Folder of the release, when `simulator` reads one."""
     fps: float = 30.0
-    """Frames a second of Physion's trials, which do not record it."""
+    """Frame rate (frames per second) of Physion's trials, whose files do not record it."""
     seed: int = 0
+    """Seed of the scenes, of the split and of the items."""
     scenes: int = 10_000
-    """Scenes, of a release at most."""
+    """Number of scenes; for a release, the maximum number."""
     test_share: float = 0.2
+    """Share of the scenes in the test split."""
     min_objects: int = 4
+    """Minimum number of objects in a scene."""
     max_objects: int = 6
+    """Maximum number of objects in a scene."""
     max_collisions: int = 3
+    """Maximum number of collisions in a scene."""
     renderer: str = "bullet"
-    """bullet draws everywhere, egl through a graphics driver, blender as CLEVRER looks (extra
-    blender)."""
+    """bullet (software, runs on every machine), egl (Bullet on a GPU driver) or blender (the look
+    of CLEVRER, needs the extra `blender`)."""
     width: int = 480
+    """Width of a frame (px)."""
     height: int = 320
+    """Height of a frame (px)."""
     prefix_frames: int = 12
-    """Frames of a prefix that are rendered ahead, evenly spread."""
+    """Evenly spaced frames of each prefix to render during the build."""
     selection: SelectionConfig = field(default_factory=SelectionConfig)
     retrieval: RetrievalTrackConfig = field(default_factory=RetrievalTrackConfig)
 
     def check(self) -> list[str]:
-        problems = too_small(
-            self, "benchmark.", {"seed": 0, "scenes": 4, "max_collisions": 1, "prefix_frames": 2}
+        least = {"seed": 0, "scenes": 4, "max_collisions": 1, "prefix_frames": 2}
+        problems = check_minimum(self, "benchmark.", least)
+        problems += check_share(self, "benchmark.", ["test_share"])
+        problems += check_positive(self, "benchmark.", ["fps"])
+        problems += check_options(
+            self,
+            "benchmark.",
+            {"renderer": RENDERERS, "simulator": SIMULATORS, "standin": (*STANDINS, None)},
         )
-        if not 0 < self.test_share <= 1:
-            problems.append(f"benchmark.test_share={self.test_share} must be above 0 and at most 1")
-        if self.fps <= 0:
-            problems.append(f"benchmark.fps={self.fps} must be above 0")
-        if self.renderer not in RENDERERS:
-            problems.append(
-                f"benchmark.renderer={self.renderer}: the options are {', '.join(RENDERERS)}"
-            )
-        absent = self.retrieval.counterfactual
-        if self.simulator not in SIMULATORS:
-            problems.append(
-                f"benchmark.simulator={self.simulator}: the options are {', '.join(SIMULATORS)}"
-            )
-        elif self.simulator != "bullet" and absent.train + absent.test > 0:
+        if self.simulator in SIMULATORS[1:] and self._has_counterfactuals():
             problems.append(
                 f"benchmark.retrieval.counterfactual with benchmark.simulator={self.simulator}: "
-                "scenes of a release cannot be simulated again, set both of its quotas to 0"
+                "scenes of a release cannot be simulated again; set both quotas to 0"
             )
-        problems += self._standin_problems()
+        if self.standin in STANDINS:
+            problems += self._standin_problems()
         if not 2 <= self.min_objects <= self.max_objects <= DISTINCT_APPEARANCES:
             problems.append(
                 f"benchmark.min_objects={self.min_objects} and "
                 f"benchmark.max_objects={self.max_objects}: need 2 <= min <= max <= "
-                f"{DISTINCT_APPEARANCES}, because no two objects of a scene look alike"
+                f"{DISTINCT_APPEARANCES}, because all objects of a scene look different"
             )
         if self.width < 48 or self.width * 2 != self.height * 3:
             problems.append(
-                f"benchmark.width={self.width} and benchmark.height={self.height}: frames are "
-                "3 wide to 2 high and 48 x 32 px at least, such as 480 x 320"
+                f"benchmark.width={self.width} and benchmark.height={self.height}: the aspect "
+                "ratio must be 3:2 and the size at least 48 x 32 px, such as 480 x 320"
             )
         return problems
 
+    def _has_counterfactuals(self) -> bool:
+        quota = self.retrieval.counterfactual
+        return quota.train + quota.test > 0
+
     def _standin_problems(self) -> list[str]:
-        if self.standin is None:
-            return []
-        named = f"benchmark.standin={self.standin}"
-        if self.standin not in STANDINS:
-            return [f"{named}: the options are {', '.join(STANDINS)} and null"]
-        problems = []
+        problems, typed = [], f"benchmark.standin={self.standin}"
         if self.simulator != "bullet":
             problems.append(
-                f"{named} with benchmark.simulator={self.simulator}: only scenes of "
-                "benchmark.simulator=bullet stand in for another suite's"
+                f"{typed} with benchmark.simulator={self.simulator}: a stand-in is simulated; set "
+                "benchmark.simulator=bullet"
             )
         if self.renderer == "blender":
             problems.append(
-                f"{named} with benchmark.renderer=blender, which has no look but its own: give "
-                "benchmark.renderer=bullet or egl"
+                f"{typed} with benchmark.renderer=blender: Blender only renders the standard look; "
+                "set benchmark.renderer=bullet or egl"
             )
         if self.max_objects > STANDIN_OBJECTS:
             problems.append(
-                f"{named} with benchmark.max_objects={self.max_objects}: {STANDIN_OBJECTS} at most "
-                "have room in its view"
+                f"{typed} with benchmark.max_objects={self.max_objects}: its view has room for at "
+                f"most {STANDIN_OBJECTS} objects"
             )
-        absent = self.retrieval.counterfactual
-        if absent.train + absent.test > 0:
+        if self._has_counterfactuals():
             problems.append(
-                f"{named} has no counterfactual scenes: set both quotas of "
+                f"{typed} has no counterfactual scenes: set both quotas of "
                 "benchmark.retrieval.counterfactual to 0"
             )
         return problems
 
 
-def quota_problems(above: str, quotas: dict[str, Quota]) -> list[str]:
+def check_quotas(group: str, quotas: dict[str, Quota]) -> list[str]:
+    """Quotas below 0."""
     return [
         problem
         for name, quota in quotas.items()
-        for problem in too_small(quota, f"{above}.{name}.", {"train": 0, "test": 0})
+        for problem in check_minimum(quota, f"{group}.{name}.", {"train": 0, "test": 0})
     ]
 
 

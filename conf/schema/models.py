@@ -1,4 +1,4 @@
-"""Students and retrievers: the base, its quantisation and adapters, and what it is shown."""
+"""Settings of students and retrievers: base, quantisation, adapters and inputs."""
 
 from __future__ import annotations
 
@@ -6,76 +6,92 @@ from dataclasses import dataclass, field
 
 from omegaconf import MISSING
 
-from conf.schema.checks import no_share, too_small
+from conf.schema.checks import check_fraction, check_minimum, check_options, check_share
 
 
 @dataclass
 class ArchitectureConfig:
-    """Sizes of a Qwen3-VL built offline from a seed, with its tokenizer and processor."""
+    """Sizes of a Qwen3-VL that is built offline with random weights, a tokenizer and a
+    processor."""
 
     seed: int = 0
+    """Seed of the weights."""
     vocabulary: int = 1024
+    """Number of tokens."""
     hidden: int = 192
+    """Hidden size of the language tower."""
     layers: int = 4
+    """Layers of the language tower."""
     heads: int = 6
+    """Attention heads per layer of the language tower."""
     kv_heads: int = 6
+    """Key and value heads per layer of the language tower."""
     head: int = 32
-    """Size of one attention head; half of it is split over time, height and width."""
+    """Size of one attention head; half of it encodes position in time, height and width."""
     feed_forward: int = 512
+    """Feed-forward size of the language tower."""
     vision_hidden: int = 128
+    """Hidden size of the vision tower."""
     vision_layers: int = 3
+    """Layers of the vision tower."""
     vision_heads: int = 4
+    """Attention heads per layer of the vision tower."""
     vision_feed_forward: int = 384
+    """Feed-forward size of the vision tower."""
 
 
 @dataclass
 class LoraConfig:
     rank: int = 16
-    """0 adds no adapters and trains the whole model."""
+    """Rank of the adapters; 0 adds none and trains the whole model."""
     alpha: int = 32
+    """Scale of the adapters: their output is multiplied by alpha / rank."""
     dropout: float = 0.0
+    """Dropout probability of the adapters' inputs."""
     targets: str = (
         r"(model\.)*language_model\.layers\.\d+\."
         r"(self_attn\.[qkvo]_proj|mlp\.(gate|up|down)_proj)"
     )
-    """Anchored pattern over module names: the language tower's projections only."""
+    """Regular expression for the full names of the adapted modules: the attention and feed-forward
+    projections of the language tower."""
 
 
 @dataclass
 class StudentConfig:
     name: str = MISSING
+    """Name of the student in reports."""
     model: str | None = None
-    """A folder, or a hub name that is in the local cache; null builds `architecture`."""
+    """Folder of the base, or its name on the Hugging Face hub if it is in the local cache; null
+    builds `architecture`."""
     revision: str | None = None
+    """Branch, tag or commit of the model on the hub."""
     trust_remote_code: bool = False
-    """Whether code that a model ships may run."""
+    """Allow the model's own Python code to run."""
     architecture: ArchitectureConfig | None = None
     quantization: str = "nf4"
-    """nf4 or none."""
+    """Quantisation of the base's weights: nf4 (4 bits) or none."""
     lora: LoraConfig = field(default_factory=LoraConfig)
     image_size: int = 336
-    """Frames reach the model at image_size x image_size px, before the processor's grid."""
+    """Width and height (px) to which frames are resized before the model's image processor."""
     frames: int = 12
-    """Frames a prefix, evenly spread."""
+    """Evenly spaced frames per prefix."""
     max_length: int = 3072
-    """Tokens a sample; a longer one is refused, never cut."""
+    """Maximum length of a sample (tokens); longer samples are refused, never truncated."""
     max_new_tokens: int = 512
-    """Tokens of an answer, those of a thought included."""
+    """Maximum length of a response (tokens), including its thinking."""
     thinking: bool = False
-    """Whether the model thinks before it answers. What it thinks is no answer."""
+    """Let the model think before its response; its thinking is not scored."""
     temperature: float = 0.0
-    """At which tokens of an answer are drawn; 0 takes the likeliest one each time."""
+    """Sampling temperature of responses; 0 decodes greedily."""
     top_p: float = 1.0
-    """Share of the likeliest tokens that are drawn from."""
+    """Sample from the most likely tokens whose probabilities sum to this share."""
     top_k: int = 0
-    """How many of the likeliest tokens are drawn from; 0 sets no bound."""
+    """Sample from this number of most likely tokens; 0 sets no limit."""
 
     def check(self) -> list[str]:
         least = {"max_new_tokens": 1, "temperature": 0, "top_k": 0}
-        problems = _backbone_problems("student", self) + too_small(self, "student.", least)
-        if not 0 < self.top_p <= 1:
-            problems.append(f"student.top_p={self.top_p} must be above 0 and at most 1")
-        return problems
+        problems = _check_model("student", self) + check_minimum(self, "student.", least)
+        return problems + check_share(self, "student.", ["top_p"])
 
 
 ENCODERS = ("qwen3_vl", "vlm2vec", "dual", "languagebind")
@@ -83,57 +99,70 @@ ENCODERS = ("qwen3_vl", "vlm2vec", "dual", "languagebind")
 
 @dataclass
 class LateConfig:
-    """A retriever of many vectors: one a token of the frame, or of the query's clip and question. A
-    frame scores, for each vector of the query, the most that one of its own gives. The sum of these
-    goes with a train.scale of about 1."""
+    """Late interaction: one vector per token of a frame, and of a query's clip and question. The
+    score sums, over the query's vectors, the highest similarity to any vector of the frame. Train
+    with train.scale near 1."""
 
     width: int = 128
-    """Entries of a vector."""
+    """Dimensions of a vector."""
     pool: int = 1
-    """A frame keeps one of so many vectors, means of those that are most alike; 1 keeps all."""
+    """Pooling factor: the number of similar vectors of a frame that are averaged into one; 1 keeps
+    every vector."""
 
 
 @dataclass
 class RetrieverConfig:
     name: str = MISSING
+    """Name of the retriever in reports."""
     encoder: str = "qwen3_vl"
-    """qwen3_vl and vlm2vec read a prefix and its question together; dual (CLIP, SigLIP 2) and
-    languagebind embed them apart and add them up. qwen3_vl alone is trained here, the others are
-    measured as they were released."""
+    """Kind of model. qwen3_vl and vlm2vec embed a prefix and its question jointly; dual (CLIP,
+    SigLIP 2) and languagebind embed them separately and add the embeddings. Only qwen3_vl can be
+    trained; the others are measured as released."""
     model: str | None = None
+    """Folder of the base, or its name on the Hugging Face hub if it is in the local cache; null
+    builds `architecture`."""
     image_model: str | None = None
-    """Of languagebind: what embeds frames, where `model` embeds prefixes and questions."""
+    """Model that embeds frames, for languagebind only; `model` embeds prefixes and questions."""
     revision: str | None = None
+    """Branch, tag or commit of `model` on the hub."""
     image_revision: str | None = None
+    """Branch, tag or commit of `image_model` on the hub."""
     trust_remote_code: bool = False
+    """Allow the model's own Python code to run."""
     architecture: ArchitectureConfig | None = None
     quantization: str = "nf4"
+    """Quantisation of the base's weights: nf4 (4 bits) or none."""
     lora: LoraConfig = field(default_factory=LoraConfig)
     image_size: int = 336
+    """Width and height (px) to which frames are resized before the model's image processor."""
     frames: int = 12
+    """Evenly spaced frames per prefix."""
     max_length: int = 3072
+    """Maximum length of an input (tokens); longer inputs are refused, never truncated."""
     widths: list[int] = field(default_factory=lambda: [4096, 2048, 1024, 512, 256, 128, 64])
-    """Matryoshka widths, widest first. Those of a retriever with one vector; `late` has its own."""
+    """Matryoshka widths in descending order; unused with `late`, which has its own width."""
     late: LateConfig | None = None
-    """null gives a query and a frame one vector each."""
+    """null embeds each query and each frame as a single vector."""
     query_instruction: str = "Retrieve images or text relevant to the user's query."
+    """System prompt of a query."""
     frame_instruction: str = "Represent the user's input."
+    """System prompt of a frame."""
 
     def check(self) -> list[str]:
-        problems = _backbone_problems("retriever", self)
-        falling = sorted(set(self.widths), reverse=True) == list(self.widths)
-        if not self.widths or not falling or self.widths[-1] < 1:
+        problems = _check_model("retriever", self)
+        descending = sorted(set(self.widths), reverse=True) == list(self.widths)
+        if not self.widths or not descending or self.widths[-1] < 1:
             problems.append(
-                f"retriever.widths={self.widths} must be one or more widths that fall strictly, "
-                "widest first"
+                f"retriever.widths={self.widths}: give one or more widths above 0 in strictly "
+                "descending order"
             )
         if self.late is not None:
-            problems += too_small(self.late, "retriever.late.", {"width": 1, "pool": 1})
+            problems += check_minimum(self.late, "retriever.late.", {"width": 1, "pool": 1})
         return problems + self._encoder_problems()
 
     def _encoder_problems(self) -> list[str]:
         if self.encoder not in ENCODERS:
-            return [f"retriever.encoder={self.encoder}: the options are {', '.join(ENCODERS)}"]
+            return check_options(self, "retriever.", {"encoder": ENCODERS})
         problems = []
         if self.encoder != "qwen3_vl" and (
             self.quantization != "none"
@@ -142,38 +171,37 @@ class RetrieverConfig:
             or self.architecture is not None
         ):
             problems.append(
-                f"retriever.encoder={self.encoder} is measured as it was released: give "
+                f"retriever.encoder={self.encoder} is measured as released: set "
                 "retriever.quantization=none and retriever.lora.rank=0, and leave retriever.late "
                 "and retriever.architecture null"
             )
         if (self.encoder == "languagebind") != (self.image_model is not None):
             problems.append(
                 f"retriever.image_model={self.image_model} with retriever.encoder={self.encoder}: "
-                "languagebind, and it alone, has a model of its own for frames"
+                "languagebind needs an image_model, and no other encoder takes one"
             )
         return problems
 
 
-def _backbone_problems(group: str, cfg: StudentConfig | RetrieverConfig) -> list[str]:
-    problems = too_small(cfg, f"{group}.", {"image_size": 32, "frames": 2, "max_length": 1})
-    problems += too_small(cfg.lora, f"{group}.lora.", {"rank": 0})
-    problems += no_share(cfg.lora, f"{group}.lora.", ["dropout"])
+def _check_model(group: str, cfg: StudentConfig | RetrieverConfig) -> list[str]:
+    problems = check_minimum(cfg, f"{group}.", {"image_size": 32, "frames": 2, "max_length": 1})
+    problems += check_options(cfg, f"{group}.", {"quantization": ("nf4", "none")})
+    problems += check_minimum(cfg.lora, f"{group}.lora.", {"rank": 0})
+    problems += check_fraction(cfg.lora, f"{group}.lora.", ["dropout"])
     if (cfg.model is None) == (cfg.architecture is None):
         problems.append(
-            f"{group}.model and {group}.architecture: give exactly one, a model to load or sizes "
-            "to build"
+            f"{group}.model and {group}.architecture: set exactly one, a model to load or sizes to "
+            "build"
         )
-    if cfg.quantization not in ("nf4", "none"):
-        problems.append(f"{group}.quantization={cfg.quantization}: the options are nf4 and none")
     if cfg.quantization == "nf4" and cfg.lora.rank == 0:
         problems.append(
             f"{group}.quantization=nf4 with {group}.lora.rank=0: 4-bit weights cannot be trained "
-            f"whole, set {group}.quantization=none or raise {group}.lora.rank"
+            f"directly; set {group}.quantization=none or raise {group}.lora.rank"
         )
     if cfg.architecture is not None and (cfg.quantization == "nf4" or cfg.lora.rank > 0):
         problems.append(
             f"{group}.quantization={cfg.quantization} and {group}.lora.rank={cfg.lora.rank} with "
-            f"{group}.architecture: a model built from a seed is trained whole, set "
+            f"{group}.architecture: a model with random weights is trained as a whole; set "
             f"{group}.quantization=none and {group}.lora.rank=0"
         )
     return problems

@@ -1,4 +1,4 @@
-"""OpenAI-compatible servers, and how they are asked."""
+"""Settings of OpenAI-compatible servers and of their clients."""
 
 from __future__ import annotations
 
@@ -6,85 +6,82 @@ import re
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from conf.schema.checks import is_url, too_small
+from conf.schema.checks import check_minimum, is_url
 
 
 @dataclass
 class ServersConfig:
-    """What every group of servers takes."""
+    """Settings that every group of servers has."""
 
     GROUP: ClassVar[str]
 
     url: Any = None
-    """An OpenAI-compatible server, such as http://127.0.0.1:8000/v1, or a list of several that
-    serve the same model; null for none."""
+    """Address of an OpenAI-compatible server, such as http://127.0.0.1:8000/v1, or a list of
+    servers of the same model; null uses no server."""
     model: str | None = None
-    """The model's name at the server."""
+    """Name of the model on the server."""
     concurrency: int = 128
-    """Requests in flight, over all servers; 128 keep one busy."""
+    """Concurrent requests over all servers; 128 saturate one vLLM server."""
     timeout: float = 120.0
-    """Seconds that one request may take."""
+    """Timeout of a request (s)."""
     patience: float = 600.0
-    """Seconds to wait while no server can be asked before giving up."""
+    """Time (s) without any reachable server after which the command gives up."""
 
     @property
     def urls(self) -> list[str]:
-        """The servers' addresses; none where there is no server."""
+        """Addresses of the servers; empty without a server."""
         if self.url is None:
             return []
         return list(self.url) if isinstance(self.url, list) else [self.url]
 
     def check(self) -> list[str]:
         group = self.GROUP
-        problems = too_small(self, f"{group}.", {"concurrency": 1, "timeout": 1, "patience": 0})
+        problems = check_minimum(self, f"{group}.", {"concurrency": 1, "timeout": 1, "patience": 0})
         if self.url == []:
-            problems.append(f"{group}.url=[] names no server: give one, or null for none")
+            problems.append(f"{group}.url=[] is empty: give an address, or null for no server")
         for url in self.urls:
             if not isinstance(url, str) or not is_url(url):
-                problems.append(
-                    f"{group}.url={url} is no address of a server, such as http://127.0.0.1:8000/v1"
-                )
+                problems.append(f"{group}.url={url} is not a URL, such as http://127.0.0.1:8000/v1")
         return problems
 
 
 @dataclass
 class ServerConfig(ServersConfig):
-    """Servers of a model that is measured."""
+    """Servers of the model to measure."""
 
     GROUP: ClassVar[str] = "server"
 
     model: str | None = None
-    """The model's name at the server, or that of an adapter that it has; null takes
-    student.model."""
+    """Name of the model or of an adapter on the server; null uses student.model."""
     concurrency: int = 32
-    """Requests in flight, over all servers; each holds an item's frames."""
+    """Concurrent requests over all servers; each contains the frames of an item."""
     timeout: float = 600.0
-    """Seconds that one request may take; thinking takes minutes."""
+    """Timeout of a request (s); a response with thinking takes minutes."""
 
     def check(self) -> list[str]:
         problems = super().check()
         if self.model is not None and self.url is None:
-            problems.append(f"server.model={self.model} needs server.url=...")
+            problems.append(f"server.model={self.model} without a server: give server.url=...")
         return problems
 
 
 @dataclass
 class ImageServerConfig(ServersConfig):
-    """Servers that draw images of texts (/v1/images/generations, as vLLM-Omni has it)."""
+    """Servers that generate images from text (/v1/images/generations, as in vLLM-Omni)."""
 
     GROUP: ClassVar[str] = "images"
 
     concurrency: int = 4
-    """Images in the making, over all servers."""
+    """Concurrent requests over all servers."""
     timeout: float = 600.0
-    """Seconds that one image may take."""
+    """Timeout of a request (s)."""
     size: str = "480x320"
-    """Width and height in px of an image; it is then shown to the matcher as frames are."""
+    """Width x height (px) of a generated image, before it is preprocessed like a frame."""
     seed: int = 0
-    """Of every image: the same text gives the same one."""
+    """Seed of every image, so that the same text gives the same image."""
 
     def check(self) -> list[str]:
-        problems = super().check() + too_small(self, "images.", {"seed": 0})
+        problems = super().check() + check_minimum(self, "images.", {"seed": 0})
         if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", self.size):
-            problems.append(f"images.size={self.size} is no size in px, such as 480x320")
+            problems.append(f"images.size={self.size} is not a size in px, such as 480x320")
         return problems

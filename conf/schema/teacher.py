@@ -1,4 +1,4 @@
-"""Who narrates, and how it is asked."""
+"""Settings of the teacher, which narrates rationales."""
 
 from __future__ import annotations
 
@@ -7,40 +7,47 @@ from typing import ClassVar
 
 from omegaconf import MISSING
 
-from conf.schema.checks import too_small
+from conf.schema.checks import check_minimum, check_share
 from conf.schema.servers import ServersConfig
 
 
 @dataclass
 class TeacherConfig(ServersConfig):
-    """Without a server it is the built-in narrator."""
+    """A model on a server, or the built-in narrator without one."""
 
     GROUP: ClassVar[str] = "teacher"
 
     name: str = MISSING
-    """Recorded with every rationale."""
+    """Name of the teacher, recorded with every rationale."""
     seed: int = 0
-    """Of the built-in narrator's phrasings; with a server, a label of one narration."""
+    """Seed of the built-in narrator's phrasing; with a server, a label that separates
+    narrations."""
     min_words: int = 80
+    """Minimum length of a rationale (words)."""
     max_words: int = 250
+    """Maximum length of a rationale (words)."""
     attempts: int = 4
-    """Answers asked for at most for an item before it is set aside."""
+    """Maximum number of responses requested for an item before it is set aside."""
     fallback: bool = False
-    """Whether the built-in narrator tells the items that are set aside, marked as its own."""
+    """Let the built-in narrator narrate the items that are set aside; its rationales are marked."""
     samples: int = 3
-    """Answers that one request asks for, for an item whose answer before was rejected."""
+    """Responses per request for an item whose previous response was rejected."""
     temperature: float = 0.7
+    """Sampling temperature of the server's responses."""
     top_p: float = 0.8
+    """Sample from the most likely tokens whose probabilities sum to this share."""
     top_k: int = 20
+    """Sample from this number of most likely tokens."""
     max_tokens: int = 640
+    """Maximum length of a response (tokens)."""
     grammar: bool = False
-    """Whether the server may write only what has a rationale's form."""
+    """Constrain the server's decoding to the form of a rationale."""
 
     def check(self) -> list[str]:
         least = {"seed": 0, "attempts": 1, "samples": 1, "temperature": 0, "max_tokens": 1}
-        problems = super().check() + too_small(self, "teacher.", least)
+        problems = super().check() + check_minimum(self, "teacher.", least)
         if (self.url is None) != (self.model is None):
-            problems.append("teacher.url and teacher.model go together: set both or neither")
+            problems.append("teacher.url and teacher.model: set both (a server) or neither")
         if not 0 < self.min_words <= self.max_words:
             problems.append(
                 f"teacher.min_words={self.min_words} and teacher.max_words={self.max_words}: "
@@ -49,7 +56,5 @@ class TeacherConfig(ServersConfig):
         if self.grammar and self.url is None:
             problems.append("teacher.grammar=true needs a server: give teacher.url=...")
         if self.fallback and self.url is None:
-            problems.append("teacher.fallback=true needs a server, for whose items it stands in")
-        if not 0 < self.top_p <= 1:
-            problems.append(f"teacher.top_p={self.top_p} must be above 0 and at most 1")
-        return problems
+            problems.append("teacher.fallback=true needs a server: give teacher.url=...")
+        return problems + check_share(self, "teacher.", ["top_p"])

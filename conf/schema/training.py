@@ -1,83 +1,73 @@
-"""How students and retrievers are trained."""
+"""Settings of training."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from conf.schema.checks import no_share, too_small
+from conf.schema.checks import check_fraction, check_minimum, check_options, check_positive
 
 REGIMES = ("cot", "cot_no_candidate_analysis", "cot_no_match_layout", "answer_only", "describe")
 
 
 @dataclass
 class TrainConfig:
-    """Settings that both trainers share."""
+    """Settings that students and retrievers share."""
 
     lr: float = 2e-5
+    """Peak learning rate."""
     schedule: str = "cosine"
-    """cosine, linear or constant, after the warm-up."""
+    """Learning rate schedule after the warm-up: cosine, linear or constant."""
     warmup: float = 0.03
-    """Share of the steps."""
+    """Warm-up, as a share of the steps."""
     weight_decay: float = 0.0
+    """Weight decay of AdamW."""
     adam_beta2: float = 0.999
-    """How much of the squared gradients' mean AdamW keeps from step to step."""
+    """Decay rate of AdamW's second moment."""
     max_grad_norm: float = 1.0
+    """Norm to which gradients are clipped."""
     epochs: float = 3.0
+    """Passes over the training set."""
     max_steps: int = -1
-    """Optimizer steps; -1 leaves it to `epochs`."""
+    """Number of optimizer steps; -1 uses `epochs`."""
     precision: str = "auto"
-    """bf16 or fp32: what the passes compute in; adapters and optimizer stay fp32. auto is bf16 on a
-    GPU or CPU that has instructions for it, and else fp32, which is then several times as fast."""
+    """Precision of the forward and backward pass, bf16 or fp32; adapters and optimizer state are
+    always fp32. auto uses bf16 if the GPU or CPU has bf16 instructions, otherwise fp32."""
     gradient_checkpointing: bool | str = "auto"
-    """Whether activations are computed again in the backward pass: less memory, more time. auto
-    does so only where they do not fit."""
+    """Recompute activations in the backward pass, which saves memory and costs time: true, false,
+    or auto (only if the activations do not fit into memory)."""
     evaluations: int = 10
-    """Evaluations, evenly spread over the run, each followed by a checkpoint."""
+    """Number of evaluations, evenly spaced over the run; each saves a checkpoint."""
     keep: int = 2
-    """Checkpoints kept, the best one among them."""
+    """Number of checkpoints to keep, including the best."""
     best: str | None = None
-    """The measure by which the best checkpoint is kept and becomes the student or retriever, by its
-    name in metrics.jsonl, such as eval_answer_letter_accuracy, eval_reasoning_loss or
-    eval_recall@10; a loss is best when least, all others when greatest. null takes the last
-    step."""
+    """Metric in metrics.jsonl that selects the checkpoint to export, such as
+    eval_answer_letter_accuracy, eval_reasoning_loss or eval_recall@10: a loss by its lowest value,
+    any other metric by its highest. null selects the last step."""
     workers: int = 0
-    """Processes that prepare batches while the model computes; for a retriever, mini-batches that a
-    thread prepares ahead. 0 leaves it to the trainer's own process."""
+    """Processes that prepare batches in the background; for a retriever, mini-batches that a thread
+    prepares in advance. 0 prepares each batch when it is needed."""
     report_to: list[str] = field(default_factory=list)
-    """Trackers of transformers' Trainer, such as tensorboard, wandb or trackio."""
+    """Experiment trackers of transformers' Trainer, such as tensorboard, wandb or trackio."""
 
     def check(self) -> list[str]:
-        problems = too_small(
-            self,
-            "train.",
-            {
-                "weight_decay": 0,
-                "max_grad_norm": 0,
-                "evaluations": 1,
-                "keep": 1,
-                "workers": 0,
-            },
-        )
-        problems += no_share(self, "train.", ["warmup", "adam_beta2"])
+        least = {"weight_decay": 0, "max_grad_norm": 0, "evaluations": 1, "keep": 1, "workers": 0}
+        options = {
+            "schedule": ("cosine", "linear", "constant"),
+            "precision": ("auto", "bf16", "fp32"),
+        }
+        problems = check_minimum(self, "train.", least)
+        problems += check_fraction(self, "train.", ["warmup", "adam_beta2"])
+        problems += check_positive(self, "train.", ["lr"])
+        problems += check_options(self, "train.", options)
         if self.gradient_checkpointing not in (True, False, "auto"):
             problems.append(
                 f"train.gradient_checkpointing={self.gradient_checkpointing}: the options are "
-                "auto, true and false"
-            )
-        if self.lr <= 0:
-            problems.append(f"train.lr={self.lr} must be above 0")
-        if self.schedule not in ("cosine", "linear", "constant"):
-            problems.append(
-                f"train.schedule={self.schedule}: the options are cosine, linear and constant"
-            )
-        if self.precision not in ("auto", "bf16", "fp32"):
-            problems.append(
-                f"train.precision={self.precision}: the options are auto, bf16 and fp32"
+                "auto, true, false"
             )
         if self.max_steps < 1 and (self.max_steps != -1 or self.epochs <= 0):
             problems.append(
-                f"train.max_steps={self.max_steps} and train.epochs={self.epochs}: give one or "
-                "more steps, or -1 and epochs above 0"
+                f"train.max_steps={self.max_steps} and train.epochs={self.epochs}: give 1 or more "
+                "steps, or train.max_steps=-1 and train.epochs above 0"
             )
         return problems
 
@@ -85,33 +75,33 @@ class TrainConfig:
 @dataclass
 class SftTrainConfig(TrainConfig):
     regime: str = "cot"
-    """What a student writes: cot (the rationale, whether each candidate matches it, the answer),
-    cot_no_candidate_analysis, cot_no_match_layout, answer_only, or describe (the recipe of the
-    tiny base)."""
+    """Content of the student's response: cot (rationale, match of each candidate, answer),
+    cot_no_candidate_analysis, cot_no_match_layout, answer_only, or describe (the recipe of the tiny
+    base)."""
     batch: int = 16
-    """Samples a step, over all its micro-batches and ranks."""
+    """Samples per optimizer step, over all micro-batches and ranks."""
     micro_batch: int | str = 1
-    """Samples that pass a rank's model at once; moves memory and time, not what is learnt. auto
-    takes the fastest number that fits, by trying the longest samples."""
+    """Samples per forward pass on each rank; changes memory and speed, not the result. auto uses
+    the fastest size at which the longest samples fit into memory."""
     reuse_features: bool = False
-    """Whether what the frozen vision tower makes of a frame is kept in memory and used wherever
-    the frame is shown again; about 3 MB a frame of an 8B model, in half of the free memory."""
+    """Cache the frozen vision tower's features of each frame in up to half of the free memory,
+    about 3 MB per frame with an 8B model."""
     packing: str = "auto"
-    """Whether a micro-batch's samples stand in one row without padding, kept from seeing each
-    other: true, false, or auto, where flash attention does so at no cost (never on a CPU, where it
-    is slower)."""
+    """Concatenate the samples of a micro-batch into one sequence without padding, with attention
+    limited to each sample: true, false, or auto (only with flash attention; never on a CPU, where
+    packing is slower)."""
     permute_candidates: bool = False
-    """Whether each epoch shows every item's candidates in an order of its own."""
+    """Shuffle the candidates of each item in every epoch."""
     validation_items: int = 64
-    """Training-split items of held-out training scenes that measure the run."""
+    """Number of validation items, from training scenes that are held out."""
     generated_items: int = 8
-    """How many of these the student answers in full at each evaluation, in each mode, all at once;
-    0 asks for no answers."""
+    """Number of validation items for which each evaluation generates a response in every mode; 0
+    generates none."""
 
     def check(self) -> list[str]:
-        problems = super().check() + too_small(
-            self, "train.", {"batch": 1, "validation_items": 1, "generated_items": 0}
-        )
+        least = {"batch": 1, "validation_items": 1, "generated_items": 0}
+        problems = super().check() + check_minimum(self, "train.", least)
+        problems += check_options(self, "train.", {"regime": REGIMES})
         if isinstance(self.micro_batch, str):
             if self.micro_batch != "auto":
                 problems.append(f"train.micro_batch={self.micro_batch}: give a number or auto")
@@ -122,18 +112,16 @@ class SftTrainConfig(TrainConfig):
                 f"train.micro_batch={self.micro_batch} must divide train.batch={self.batch}"
             )
         if self.packing.lower() not in ("auto", "true", "false"):
-            problems.append(f"train.packing={self.packing}: the options are auto, true and false")
-        if self.regime not in REGIMES:
-            problems.append(f"train.regime={self.regime}: the options are {', '.join(REGIMES)}")
+            problems.append(f"train.packing={self.packing}: the options are auto, true, false")
         if self.packing.lower() == "true" and self.regime == "describe":
             problems.append(
-                "train.packing=true with train.regime=describe: what each visual token shows is "
-                "learnt from padded samples, leave train.packing=auto"
+                "train.packing=true with train.regime=describe: this regime trains on padded "
+                "samples; set train.packing=auto"
             )
         if self.permute_candidates and self.regime == "describe":
             problems.append(
                 "train.permute_candidates=true with train.regime=describe: descriptions have no "
-                "candidates"
+                "candidates; set train.permute_candidates=false"
             )
         return problems
 
@@ -141,77 +129,70 @@ class SftTrainConfig(TrainConfig):
 @dataclass
 class ContrastiveTrainConfig(TrainConfig):
     batch: int = 512
-    """Queries a step, over all ranks; each is contrasted with every target and hard negative of
-    the batch."""
+    """Queries per optimizer step, over all ranks; each is contrasted with every target and hard
+    negative of the batch."""
     batches: str = "random"
-    """How a batch is composed: random; scenes, where some queries of a scene stand together, so
-    that it has many frames of one scene; or spread, with as few of a scene as can be."""
+    """Composition of a batch: random; scenes (groups of train.scene_queries queries of one scene);
+    or spread (as few queries of one scene as possible)."""
     scene_queries: int = 4
-    """Queries of a scene that stand together in train.batches=scenes."""
+    """Queries per scene in a batch of train.batches=scenes."""
     mini_batch: int | str = 8
-    """Prefixes or frames that pass the model at once; moves memory and time, not the gradient. auto
-    takes the fastest number that fits, by trying the longest prefixes."""
+    """Prefixes or frames per forward pass; changes memory and speed, not the gradient. auto uses
+    the fastest size at which the longest prefixes fit into memory."""
     mini_batch_tokens: int | None = None
-    """Tokens that pass the model at once, in place of train.mini_batch."""
+    """Tokens per forward pass, instead of train.mini_batch."""
     hard_negatives: int = 1
-    """Same-scene wrong-time frames a query."""
+    """Hard negatives per query: wrong-time frames of the query's own scene."""
     mine_every: int = 0
-    """Steps after which hard negatives are mined anew: the wrong frames that the retriever then
-    ranks highest. 0 keeps the benchmark's. What is mined for one query may be another's target, so
-    that this masks as train.mask_identical=true does."""
+    """Steps between two minings of hard negatives, which replace a query's hard negatives by the
+    wrong frames that the retriever ranks highest; 0 keeps those of the benchmark. Mining masks
+    identical frames, like train.mask_identical=true."""
     mine_margin: float = 24.0
-    """Mined frames of the target's scene are displaced by so many px (at 336 x 336) from it."""
+    """Minimum displacement (px at 336 x 336) of a mined frame from the target in the same scene."""
     scale: float = 50.0
-    """Inverse temperature of the scores: cosine similarities, which retriever.late sums up."""
+    """Inverse temperature: factor of the cosine similarities, or of their sum for
+    retriever.late."""
     distinct_frames: bool = True
-    """Whether a frame that several queries of a rank's share name is embedded once; moves no
+    """Embed a frame once when several queries on a rank refer to it; does not change the
     gradient."""
     shared_prefixes: bool = True
-    """Whether a prefix that several queries of a rank's share have in common passes once; moves no
+    """Encode a prefix once when several queries on a rank share it; does not change the
     gradient."""
     reuse_features: bool = False
-    """Whether the frozen tower's outputs are kept between the two passes of a step, in memory that
-    grows with the batch (about 30 MB a query of an 8B model); moves no gradient."""
+    """Keep the frozen vision tower's features between the two passes of a step, about 30 MB per
+    query with an 8B model; does not change the gradient."""
     mask_identical: bool = False
-    """Whether the frame of a query's target, where it is shown for another query too, is left out
-    of its negatives. This changes the objective."""
+    """Exclude the target's frame from a query's negatives where another query of the batch refers
+    to it; changes the objective."""
     mask_near: float = 0.0
-    """Frames of the target's scene that are displaced by less than so many px (at 336 x 336) from
-    it are left out of a query's negatives. Above 0 this changes the objective."""
+    """Exclude frames of the target's scene within this displacement (px at 336 x 336) of the target
+    from a query's negatives; above 0 this changes the objective."""
     hard_weight: float = 1.0
-    """How many other negatives a query's own hard negatives count for. Other than 1 this changes
+    """Weight of a query's own hard negatives relative to other negatives; other than 1 this changes
     the objective."""
     width_weights: list[float] | None = None
-    """Weight of the loss at each of retriever.widths; null weighs all alike."""
+    """Weight of the loss at each width of retriever.widths; null weights them equally."""
     validation_queries: int = 128
-    """Queries of held-out training scenes that measure the run."""
+    """Number of validation queries, from training scenes that are held out."""
 
     def check(self) -> list[str]:
-        problems = super().check() + too_small(
-            self,
-            "train.",
-            {
-                "batch": 1,
-                "hard_negatives": 0,
-                "validation_queries": 1,
-                "scene_queries": 1,
-                "mini_batch_tokens": 1,
-                "mask_near": 0,
-                "mine_every": 0,
-                "mine_margin": 0,
-            },
-        )
-        for name in ("scale", "hard_weight"):
-            if getattr(self, name) <= 0:
-                problems.append(f"train.{name}={getattr(self, name)} must be above 0")
-        if self.batches not in ("random", "scenes", "spread"):
-            problems.append(
-                f"train.batches={self.batches}: the options are random, scenes and spread"
-            )
+        least = {
+            "batch": 1,
+            "hard_negatives": 0,
+            "validation_queries": 1,
+            "scene_queries": 1,
+            "mini_batch_tokens": 1,
+            "mask_near": 0,
+            "mine_every": 0,
+            "mine_margin": 0,
+        }
+        problems = super().check() + check_minimum(self, "train.", least)
+        problems += check_positive(self, "train.", ["scale", "hard_weight"])
+        problems += check_options(self, "train.", {"batches": ("random", "scenes", "spread")})
         if self.batch < 2 and not self.hard_negatives:
             problems.append(
-                f"train.batch={self.batch} with train.hard_negatives=0 leaves no negatives: give a "
-                "batch of 2 or more, or hard negatives"
+                f"train.batch={self.batch} with train.hard_negatives=0 leaves no negatives: set "
+                "train.batch to 2 or more, or train.hard_negatives to 1 or more"
             )
         if self.batches == "scenes" and self.scene_queries > self.batch:
             problems.append(
@@ -220,19 +201,18 @@ class ContrastiveTrainConfig(TrainConfig):
         if self.mine_every and not self.hard_negatives:
             problems.append(
                 f"train.mine_every={self.mine_every} with train.hard_negatives=0 mines nothing: "
-                "give hard negatives, or leave train.mine_every=0"
+                "set train.hard_negatives to 1 or more, or train.mine_every=0"
             )
         if self.mini_batch == "auto":
             if self.mini_batch_tokens is not None:
                 problems.append(
                     f"train.mini_batch=auto with train.mini_batch_tokens={self.mini_batch_tokens}: "
-                    "give one of them"
+                    "set only one of them"
                 )
         elif isinstance(self.mini_batch, str):
             problems.append(f"train.mini_batch={self.mini_batch}: give a number or auto")
         elif not 1 <= self.mini_batch <= self.batch:
             problems.append(
-                f"train.mini_batch={self.mini_batch} must lie between 1 and "
-                f"train.batch={self.batch}"
+                f"train.mini_batch={self.mini_batch} must be from 1 to train.batch={self.batch}"
             )
         return problems

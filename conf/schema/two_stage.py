@@ -1,4 +1,4 @@
-"""What two-stage retrieval takes: who writes, who draws, and who matches."""
+"""Settings of two-stage retrieval: the writing model, the image server and the matcher."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from omegaconf import MISSING
 
 from conf.schema.benchmark import BenchmarkConfig
-from conf.schema.checks import too_small
+from conf.schema.checks import check_choices, check_minimum
 from conf.schema.commands import CommandConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import ImageServerConfig, ServerConfig
@@ -18,19 +18,19 @@ ROUTES = ("cot_text", "predict_caption", "predict_image", "predict_drawn")
 
 @dataclass
 class MatcherConfig:
-    """The frozen encoder that matches what was written to the database: any retriever's preset."""
+    """Frozen encoder that matches written texts to the database: the preset of any retriever."""
 
     retriever: RetrieverConfig = MISSING
     train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
-    """The preset's recipe; a measurement takes its precision alone."""
+    """The preset's training recipe, of which only the precision is used."""
     model: str | None = None
-    """A run folder of train.contrastive or what train.export wrote, with its own retriever and
-    recipe; null takes the preset's model as it was released."""
+    """Run folder of train.contrastive or folder that train.export wrote, with its own retriever and
+    recipe; null uses the preset's released model."""
     batch: int = 64
-    """Texts or frames that pass the model at once."""
+    """Texts or frames per forward pass."""
 
     def check(self) -> list[str]:
-        return too_small(self, "matcher.", {"batch": 1})
+        return check_minimum(self, "matcher.", {"batch": 1})
 
 
 @dataclass
@@ -39,33 +39,29 @@ class TwoStageCommand(CommandConfig):
     student: StudentConfig = MISSING
     server: ServerConfig = field(default_factory=ServerConfig)
     train: SftTrainConfig = field(default_factory=SftTrainConfig)
-    """The preset's recipe; a base that writes takes its precision."""
+    """The preset's training recipe, of which a base uses only the precision."""
     model: str | None = None
-    """Who writes: a run folder of train.sft or what train.export wrote, with its own student and
-    recipe; null takes the student's base."""
+    """Writing model: run folder of train.sft or folder that train.export wrote, with its own
+    student and recipe; null uses the student's base."""
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
     images: ImageServerConfig = field(default_factory=ImageServerConfig)
     routes: list[str] | None = None
-    """cot_text (the state that a rationale foresees, matched to frames), predict_caption (a
-    description of the future frame, matched to descriptions of the database's frames by the same
-    model), predict_image (that description, matched to frames) and predict_drawn (what the server
-    of images draws of it, matched to frames); null takes the first of a student, and the first
-    three of a base."""
+    """Routes to measure: cot_text (the future state in a rationale, matched to frames),
+    predict_caption (a description of the future frame, matched to the same model's descriptions of
+    the database's frames), predict_image (that description, matched to frames) and predict_drawn
+    (an image that the image server generates from it, matched to frames). null uses cot_text for a
+    student, and the first three for a base."""
     batch: int = 16
-    """Queries or frames that pass the writing model at once."""
+    """Queries or frames per forward pass of the writing model."""
     seed: int = 0
-    """Of texts that are drawn, and of the scenes that are drawn for the intervals."""
+    """Seed of sampled texts and of the bootstrap."""
 
     def check(self) -> list[str]:
-        problems = super().check() + too_small(self, "", {"batch": 1})
-        given = ["cot_text"] if self.routes is None else self.routes
-        if not given or len(set(given)) < len(given) or set(given) - set(ROUTES):
+        problems = super().check() + check_minimum(self, "", {"batch": 1})
+        problems += check_choices("routes", self.routes, ROUTES)
+        if "predict_drawn" in (self.routes or ()) and not (self.images.urls and self.images.model):
             problems.append(
-                f"routes={self.routes}: give one or more of {', '.join(ROUTES)}, each once"
-            )
-        if "predict_drawn" in given and not (self.images.urls and self.images.model):
-            problems.append(
-                "routes: predict_drawn needs a server of images, give "
+                "routes: predict_drawn needs an image server: give "
                 "images.url=http://HOST:PORT/v1 and images.model=NAME"
             )
         return problems
