@@ -41,7 +41,7 @@ def main_first() -> Iterator[None]:
 
     Work that is kept on disk is thus done once, and every rank reads the result from there.
     """
-    if ranks() == 1:
+    if world_size() == 1:
         yield
         return
     import torch

@@ -41,8 +41,8 @@ class SelectionConfig:
     time: dict[str, Quota] = field(default_factory=dict)
     """Quota of each time cell."""
     window: dict[str, Quota] = field(default_factory=dict)
-    """Quota of each window cell, such as G1_A_h8_easy; a group and family, such as G1_A, divides its
-    quota evenly among its six cells."""
+    """Quota of each window cell, such as G1_A_h8_easy; a group and family, such as G1_A, divides
+    its quota evenly among its six cells."""
     matched: Quota = field(default_factory=Quota)
     """Pairs of matched-anchor items: the two questions differ only in the anchor (event or
     time)."""
