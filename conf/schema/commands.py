@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from datetime import date
 
 from omegaconf import MISSING
 
@@ -16,7 +15,6 @@ from conf.schema.checks import (
     check_positive,
     check_run,
     check_share,
-    is_url,
 )
 from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import ServerConfig
@@ -85,25 +83,12 @@ class ExportCommand(CommandConfig):
     """Folder to write; it must not contain an earlier export."""
     images: bool = True
     """Include the frames; without them, a row only names its scenes and frames."""
-    url: str | None = None
-    """Address at which the dataset will be published, such as
-    https://huggingface.co/datasets/NAME/DATASET."""
-    published: str | None = None
-    """Date of publication (YYYY-MM-DD)."""
 
     def check(self) -> list[str]:
         problems = super().check()
         problems += check_options(self, "", {"format": ("huggingface", "clevrer")})
         if not self.folder:
             problems.append("folder= is empty: name a folder, such as folder=exports/tiny")
-        if self.url is not None and not is_url(self.url):
-            problems.append(
-                f"url={self.url} is not a URL, such as https://huggingface.co/datasets/NAME/DATASET"
-            )
-        try:
-            date.fromisoformat(self.published or "2026-01-31")
-        except ValueError:
-            problems.append(f"published={self.published} is not a date, such as 2026-01-31")
         return problems
 
 
