@@ -31,7 +31,7 @@ from data.store import (
     scene_path,
     write_atomically,
 )
-from data.tracks.build_items import family_quotas, item_builders, make_items_and_queries, suite_name
+from data.tracks.build_items import family_quotas, item_families, make_items_and_queries, suite_name
 from data.tracks.retrieval import future
 from data.tracks.retrieval.database import make_databases
 from data.tracks.shortfalls import count_records, find_shortfalls, summarize_store
@@ -115,9 +115,9 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
 def check_names(cfg: BenchmarkConfig) -> None:
     """Raises SettingsError where a quota names a family, cell or builder that does not exist."""
     named = [
-        (f"benchmark.selection.{family}", quotas, list(item_builders(cfg)[family].CELLS))
+        (f"benchmark.selection.{family}", quotas, list(item_families(cfg)[family].CELLS))
         for family, quotas in family_quotas(cfg).items()
-        if family in item_builders(cfg)
+        if family in item_families(cfg)
     ]
     builders = [str(b) for b in future.BUILDERS]
     named.append(("benchmark.retrieval.builders", cfg.retrieval.builders, builders))
@@ -132,7 +132,7 @@ def check_names(cfg: BenchmarkConfig) -> None:
         f"benchmark.selection.{family}: suite {suite_name(cfg)} has no items of it, "
         "leave the family out"
         for family, quotas in family_quotas(cfg).items()
-        if quotas and family not in item_builders(cfg)
+        if quotas and family not in item_families(cfg)
     ]
     if problems:
         raise SettingsError("\n".join(problems))

@@ -29,8 +29,8 @@ from data.records import (
 from data.render.frame_cache import FrameReader
 from data.store import Store, write_atomically
 from data.tracks.controls import MATCHED_ANCHOR
+from data.tracks.quota import named_rng
 from data.tracks.retrieval.counterfactual import removal_displacement
-from data.tracks.selection.distractors import cell_rng
 from data.world.displacement import cross_scene_displacement
 
 log = logging.getLogger(__name__)
@@ -113,7 +113,7 @@ def _grouped(every: Iterable[Any], key: str = "subtype") -> dict[Any, list[Any]]
 
 
 def _some(every: Sequence[Any], count: int, seed: int, name: str) -> list[Any]:
-    chosen = cell_rng(seed, "gallery", name).permutation(len(every))[:count]
+    chosen = named_rng(seed, "gallery", name).permutation(len(every))[:count]
     return [every[k] for k in sorted(chosen)]
 
 

@@ -123,6 +123,7 @@ def limit_items(items: list[SelectionItem], limit: int | None, seed: int) -> lis
     import numpy as np
 
     from data.tracks.controls import MATCHED_ANCHOR, pair_items
+    from data.tracks.quota import interleave
 
     if limit is None:
         return items
@@ -131,13 +132,7 @@ def limit_items(items: list[SelectionItem], limit: int | None, seed: int) -> lis
         order = np.random.default_rng(seed).permutation(len(matched))
         return [item for k in order[: limit // 2] for item in matched[k]]
     order = np.random.default_rng(seed).permutation(len(items))
-    turns: dict[str, int] = {}
-    ranked = []
-    for k in order:
-        family = items[k].family
-        turns[family] = turns.get(family, 0) + 1
-        ranked.append((turns[family], len(ranked), items[k]))
-    return [item for _, _, item in sorted(ranked, key=lambda r: r[:2])][:limit]
+    return interleave([items[k] for k in order], lambda item: item.family)[:limit]
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
 """How items of the transfer suites are made, for scenes of MoVi-A and Physion.
 
-`RECIPES[suite][family]` offers what a module of `data.tracks.selection` does: `CELLS`, and `draft`
-for an
-item of one of them. The questions are the same. An event item's prefix ends some frames before the
+`TRANSFER_SUITES[suite][family]` offers what a module of `data.tracks.selection` does: `CELLS` and
+`make_item`. The questions are the same. An event item's prefix ends some frames before the
 event, whose frame is the target; a time item's prefix is the scene's first second, and its target
 is so many seconds after the prefix's last frame. CLEVRER's scenes take the recipes of
 `data.tracks.selection` themselves.
@@ -16,9 +15,9 @@ from itertools import islice
 
 import numpy as np
 
-from data.records import Candidate, FrameRef, Scene
+from data.records import Candidate, FrameRef, Scene, SelectionItem
 from data.tracks.selection import event, time
-from data.tracks.selection.distractors import DistractorPicker, Draft, scene_candidates
+from data.tracks.selection.distractors import DistractorPicker, new_item, scene_candidates
 from data.tracks.selection.event import EventTiming
 from data.world.events import find_motion_onsets
 
@@ -55,9 +54,9 @@ class Recipe:
     later: bool
     CELLS: dict[str, Cell]
 
-    def draft(
+    def make_item(
         self, subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
-    ) -> Draft | None:
+    ) -> SelectionItem | None:
         """An item of the cell at one of the scene's moments, tried in a random order."""
         cell = self.CELLS[subtype]
         found = cell.moments(scene)
@@ -78,16 +77,17 @@ class Recipe:
                 if self.family == "event"
                 else {"horizon": gap}
             )
-            return Draft(
+            return new_item(
                 scene,
                 self.family,
                 subtype,
                 cell.question,
                 (moment.start, moment.stop),
                 moment.target,
-                *picked,
-                {"distractors": "mixed", **axes},
+                picked,
                 suite=self.suite,
+                distractors="mixed",
+                **axes,
             )
         return None
 

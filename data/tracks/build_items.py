@@ -1,9 +1,8 @@
-"""Every item and query of a benchmark, from the oracle alone.
+"""Makes all items and queries of a benchmark from the oracle alone.
 
-Each cell of the selection track and each builder of the retrieval track is a job of its own with a
-random generator of its own. What it gives is kept in a part that is named by everything it depends
-on, so that a killed build goes on with the parts it has, and one whose quotas were changed makes
-only the cells that changed.
+Each selection cell and each retrieval builder is a separate job with its own random generator. A
+job writes its result to a part file whose name is a hash of all its inputs. A killed build resumes
+with the parts that exist, and a build with changed quotas repeats only the jobs that changed.
 """
 
 from __future__ import annotations
@@ -21,19 +20,20 @@ from typing import Any
 from conf.schema import BenchmarkConfig, Quota
 from data.parallel import Workers
 from data.records import RetrievalQuery, Scene, SelectionItem
-from data.releases import transfer_suites as transfer
+from data.releases.transfer_suites import TRANSFER_SUITES
 from data.store import PARTS, load_scene, scene_path, write_atomically
 from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
+from data.tracks.quota import fill_quota
 from data.tracks.retrieval import counterfactual, future
-from data.tracks.selection import distractors, event, time, window
+from data.tracks.selection import event, time, window
+from data.tracks.selection.distractors import BUILDERS_VERSION
 from data.world.physics import GENERATOR_VERSION
 
-RECIPES = {"event": event, "time": time, "window": window}
-SCENES_KEPT = 20_000
+DYNAPIX_FAMILIES = {"event": event, "time": time, "window": window}
+CACHED_SCENES = 20_000
 """Scenes that a worker keeps in memory, at about 50 KB each."""
-RESERVE = 1.3
-"""Queries that are made for one that is wanted: some are dropped when databases are made, for their
-target looks like another's."""
+QUERY_RESERVE = 1.3
+"""Queries made per query of a quota: a query whose target has a twin is dropped later."""
 
 ScenesOfSplit = dict[str, list[str]]
 
@@ -41,24 +41,27 @@ ScenesOfSplit = dict[str, list[str]]
 def make_items_and_queries(
     cfg: BenchmarkConfig, folder: Path, scene_ids: ScenesOfSplit, workers: Workers
 ) -> tuple[list[SelectionItem], list[RetrievalQuery], dict[str, int]]:
-    """Items and queries of the scenes below `folder`, cell by cell in the config's order, and how
-    many were dropped for want of distractors that can be told apart. There are more queries than
-    the quotas ask for; see `RESERVE`."""
-    cells = _cells(cfg)
-    paths = {name: _part(folder, cfg, scene_ids, name, quota) for name, quota in cells.items()}
-    # The largest cells first, or the last of them would keep a single worker busy at the end.
+    """Make the items and queries of the scenes below `folder`, in the order of the config.
+
+    Returns:
+        Items; queries, more than the quotas by `QUERY_RESERVE`; and how many of each were dropped
+        because their candidates cannot be told apart.
+    """
+    quotas = _job_quotas(cfg)
+    paths = {name: _part_path(folder, cfg, scene_ids, name, quotas[name]) for name in quotas}
+    # Largest quotas first, so that no single worker is left with a large job at the end.
     jobs = {
-        name: partial(_make_cell, cfg, folder, scene_ids, name, quota, paths[name])
-        for name, quota in sorted(cells.items(), key=lambda cell: -cell[1].train)
+        name: partial(_run_job, cfg, folder, scene_ids, name, quota, paths[name])
+        for name, quota in sorted(quotas.items(), key=lambda job: -job[1].train)
         if not paths[name].exists()
     }
-    done = len(cells) - len(jobs)
+    done = len(quotas) - len(jobs)
     for _ in workers.run(jobs, "making items and queries", "cell", done):
         pass
     items: list[SelectionItem] = []
     queries: list[RetrievalQuery] = []
     dropped: Counter[str] = Counter()
-    for name in cells:
+    for name in quotas:
         part = json.loads(paths[name].read_bytes())
         track, group, _ = name.split("/")
         if track == "retrieval":
@@ -70,16 +73,16 @@ def make_items_and_queries(
     return items, queries, dict(dropped)
 
 
-def item_builders(cfg: BenchmarkConfig) -> Mapping[str, Any]:
-    """How the items of a benchmark's suite are made, by family: each has `CELLS` and `draft`."""
-    return transfer.TRANSFER_SUITES.get(suite_name(cfg), RECIPES)
+def item_families(cfg: BenchmarkConfig) -> Mapping[str, Any]:
+    """The families of a benchmark's suite; each has `CELLS` and `make_item`."""
+    return TRANSFER_SUITES.get(suite_name(cfg), DYNAPIX_FAMILIES)
 
 
 def suite_name(cfg: BenchmarkConfig) -> str:
-    """What the benchmark's items belong to."""
+    """The suite of the benchmark's items."""
     if cfg.standin is not None:
         return f"standin_{cfg.standin}"
-    return cfg.simulator if cfg.simulator in transfer.TRANSFER_SUITES else "dynapix"
+    return cfg.simulator if cfg.simulator in TRANSFER_SUITES else "dynapix"
 
 
 def family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:
@@ -88,8 +91,8 @@ def family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:
     return {"event": track.event, "time": track.time, "window": track.window}
 
 
-def _cells(cfg: BenchmarkConfig) -> dict[str, Quota]:
-    """Quotas by track/group/cell."""
+def _job_quotas(cfg: BenchmarkConfig) -> dict[str, Quota]:
+    """Quotas by track/group/cell, one a job."""
     return {
         **{
             f"selection/{family}/{subtype}": quota
@@ -97,20 +100,20 @@ def _cells(cfg: BenchmarkConfig) -> dict[str, Quota]:
             for subtype, quota in quotas.items()
         },
         f"controls/{MATCHED_ANCHOR}/pairs": cfg.selection.matched,
-        **{f"retrieval/future/{b}": _more(quota) for b, quota in cfg.retrieval.builders.items()},
-        "retrieval/counterfactual/all": _more(cfg.retrieval.counterfactual),
+        **{f"retrieval/future/{b}": _reserve(q) for b, q in cfg.retrieval.builders.items()},
+        "retrieval/counterfactual/all": _reserve(cfg.retrieval.counterfactual),
     }
 
 
-def _more(quota: Quota) -> Quota:
-    return Quota(math.ceil(RESERVE * quota.train), math.ceil(RESERVE * quota.test))
+def _reserve(quota: Quota) -> Quota:
+    return Quota(math.ceil(QUERY_RESERVE * quota.train), math.ceil(QUERY_RESERVE * quota.test))
 
 
-def _part(
+def _part_path(
     folder: Path, cfg: BenchmarkConfig, scene_ids: ScenesOfSplit, name: str, quota: Quota
 ) -> Path:
-    depends = {
-        "versions": [GENERATOR_VERSION, distractors.BUILDERS_VERSION],
+    inputs = {
+        "versions": [GENERATOR_VERSION, BUILDERS_VERSION],
         "seed": cfg.seed,
         "scenes": scene_ids,
         "cell": name,
@@ -118,14 +121,14 @@ def _part(
         "least": cfg.selection.min_displacement,
         "hard negatives": cfg.retrieval.hard_negatives,
     }
-    key = hashlib.sha256(json.dumps(depends).encode()).hexdigest()
+    key = hashlib.sha256(json.dumps(inputs).encode()).hexdigest()
     return folder / PARTS / f"{key[:32]}.json"
 
 
-_load = lru_cache(maxsize=SCENES_KEPT)(load_scene)
+_load = lru_cache(maxsize=CACHED_SCENES)(load_scene)
 
 
-def _make_cell(
+def _run_job(
     cfg: BenchmarkConfig,
     folder: Path,
     scene_ids: ScenesOfSplit,
@@ -137,16 +140,17 @@ def _make_cell(
         return _load(scene_path(folder, scene_id))
 
     track, group, cell = name.split("/")
-    least = cfg.selection.min_displacement
+    seed, least = cfg.seed, cfg.selection.min_displacement
+    negatives = cfg.retrieval.hard_negatives
     if track == "selection":
-        draw = partial(item_builders(cfg)[group].draft, cell)
-        found, dropped = distractors.fill(cell, draw, scene_ids, scene_of, quota, cfg.seed, least)
+        make_item = partial(item_families(cfg)[group].make_item, cell)
+        made, dropped = fill_quota(cell, make_item, scene_ids, scene_of, quota, seed, least)
     elif track == "controls":
-        found, dropped = fill_pairs(scene_ids, scene_of, quota, cfg.seed, least)
+        made, dropped = fill_pairs(scene_ids, scene_of, quota, seed, least)
     else:
-        shared = (scene_ids, scene_of, quota, cfg.retrieval.hard_negatives, least, cfg.seed)
-        found, dropped = (
-            future.fill(int(cell), *shared) if group == "future" else counterfactual.fill(*shared)
-        )
-    part: dict[str, Any] = {"rows": [made.to_row() for made in found], "dropped": dropped}
+        make = counterfactual.make_queries
+        if group == "future":
+            make = partial(future.make_queries, int(cell))
+        made, dropped = make(scene_ids, scene_of, quota, negatives, least, seed)
+    part: dict[str, Any] = {"rows": [row.to_row() for row in made], "dropped": dropped}
     write_atomically(path, json.dumps(part).encode())

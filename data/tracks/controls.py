@@ -1,23 +1,24 @@
-"""Controls that separate what a student is asked from how its items are built.
+"""Controls: matched-anchor pairs, candidate-only items and shuffled prefixes.
 
-Matched-anchor pairs are two items alike in prefix, target, horizon and candidates, of which one
-names the event that happens at the target and the other the time that passes until then. The other
-controls show an item of any suite otherwise than it is: without its prefix, or with the prefix's
-frames out of order.
+The two items of a matched-anchor pair share prefix, target, horizon and candidates. One question
+names the event at the target, the other the time until then. The other two controls change the
+prefix of an existing item: they remove it or shuffle its frames.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from conf.schema import Quota
-from data.records import SELECTION_SECOND, FrameRef, Scene, SelectionItem, sample_prefix_frames
-from data.tracks.selection import distractors, event, time
-from data.tracks.selection.distractors import DistractorPicker, Draft, scene_candidates
+from data.records import SELECTION_SECOND, Scene, SelectionItem, sample_prefix_frames
+from data.tracks.quota import fill_quota
+from data.tracks.selection import event, time
+from data.tracks.selection.distractors import DistractorPicker, new_item
+from data.tracks.selection.event import EventTiming
 from data.world.events import collisions_in
 
 MATCHED_ANCHOR = "matched_anchor"
@@ -29,54 +30,39 @@ EVENT_QUESTION = (
 SECONDS = (1, 2)
 
 
-@dataclass(frozen=True)
-class AnchorTiming:
-    """An observation's inclusive range and the collision that comes `seconds` after it."""
-
-    start: int
-    stop: int
-    target: int
-    seconds: int
-
-
-def anchor_timings(scene: Scene) -> Iterator[AnchorTiming]:
-    """The moments at which the next collision comes whole seconds after a second of observation."""
+def anchor_timings(scene: Scene) -> Iterator[EventTiming]:
+    """Timings where the next collision is whole seconds after a one-second observation."""
     for target in dict.fromkeys(c.frame for c in scene.collisions):
         for seconds in SECONDS:
             stop = target - seconds * SELECTION_SECOND
             start = stop - SELECTION_SECOND + 1
-            alone = not collisions_in(scene, stop + 1, target - 1)
-            if start >= 0 and alone and target <= scene.frames - 1 - event.TAIL:
-                yield AnchorTiming(start, stop, target, seconds)
+            is_next = not collisions_in(scene, stop + 1, target - 1)
+            if start >= 0 and is_next and target <= scene.frames - 1 - event.TAIL:
+                yield EventTiming(target, start, stop, target)
 
 
-def draft(scene: Scene, rng: np.random.Generator, picker: DistractorPicker) -> Draft | None:
-    """The item of a pair that names the time, at a random moment of the scene; its distractors are
-    other moments after the observation."""
-    found = list(anchor_timings(scene))
-    for k in rng.permutation(len(found)):
-        moment = found[k]
-        later = rng.permutation(np.arange(moment.stop + 1, scene.frames))
-        pool = scene_candidates(scene, later[later != moment.target], "same_time")
-        prefix = (moment.start, moment.stop)
-        target = FrameRef(scene.scene_id, moment.target)
-        picked = picker.pick(
-            target, pool, distractors.visible_objects(scene, prefix), int(rng.integers(4))
-        )
+def make_item(
+    scene: Scene, rng: np.random.Generator, picker: DistractorPicker
+) -> SelectionItem | None:
+    """Make the item of a pair that names the time; its distractors are other later frames."""
+    timings = list(anchor_timings(scene))
+    for k in rng.permutation(len(timings)):
+        timing = timings[k]
+        prefix = (timing.start, timing.stop)
+        horizon = timing.target - timing.stop
+        picked = time.pick_later_frames(scene, prefix, timing.target, rng, picker)
         if picked is not None:
-            return Draft(
+            return new_item(
                 scene,
                 "time",
-                f"in_{moment.seconds}s",
-                time.question(moment.seconds),
+                f"in_{horizon // SELECTION_SECOND}s",
+                time.question(horizon // SELECTION_SECOND),
                 prefix,
-                moment.target,
-                *picked,
-                {
-                    "event_frame": moment.target,
-                    "distractors": "same_time",
-                    "horizon": moment.target - moment.stop,
-                },
+                timing.target,
+                picked,
+                event_frame=timing.target,
+                distractors="same_time",
+                horizon=horizon,
             )
     return None
 
@@ -88,19 +74,17 @@ def fill_pairs(
     seed: int,
     least: float,
 ) -> tuple[list[SelectionItem], int]:
-    """Pairs up to the quota, each as two items one after the other; see `drafts.fill`."""
-    items, dropped = distractors.fill(
-        MATCHED_ANCHOR, draft, scene_ids, scene_of, quota, seed, least
-    )
+    """Make pairs up to the quota, as two items in a row; see `data.tracks.quota.fill_quota`."""
+    items, dropped = fill_quota(MATCHED_ANCHOR, make_item, scene_ids, scene_of, quota, seed, least)
     return [each for item in items for each in _pair(item)], dropped
 
 
 def _pair(item: SelectionItem) -> tuple[SelectionItem, SelectionItem]:
-    place = _place(item)
-    by_time = replace(item, suite=MATCHED_ANCHOR, item_id=f"{MATCHED_ANCHOR}-time-{place}")
+    key = _pair_key(item)
+    by_time = replace(item, suite=MATCHED_ANCHOR, item_id=f"{MATCHED_ANCHOR}-time-{key}")
     by_event = replace(
         by_time,
-        item_id=f"{MATCHED_ANCHOR}-event-{place}",
+        item_id=f"{MATCHED_ANCHOR}-event-{key}",
         family="event",
         subtype="next_collision",
         question=EVENT_QUESTION,
@@ -109,27 +93,30 @@ def _pair(item: SelectionItem) -> tuple[SelectionItem, SelectionItem]:
 
 
 def pair_items(items: Sequence[SelectionItem]) -> list[tuple[SelectionItem, SelectionItem]]:
-    """The matched-anchor pairs among items, in their order: that which names the event, and that
-    which names the time."""
-    by_time = {_place(item): item for item in items if item.family == "time"}
-    return [(item, by_time[_place(item)]) for item in items if item.family == "event"]
+    """The matched-anchor pairs among items, in their order, as (event item, time item)."""
+    by_time = {_pair_key(item): item for item in items if item.family == "time"}
+    return [(item, by_time[_pair_key(item)]) for item in items if item.family == "event"]
 
 
-def _place(item: SelectionItem) -> str:
+def _pair_key(item: SelectionItem) -> str:
     return f"{item.scene_id}-{item.prefix_stop}-{item.target_frame}"
 
 
 def prefix_under_control(item: SelectionItem, count: int, control: str | None) -> list[int]:
-    """The frames that are shown as an item's prefix, in the order in which they are shown: `count`
-    of them, in another order for `shuffled_prefix`, none for `candidate_only`."""
+    """Sample `count` frames of an item's prefix, in the order in which a model receives them.
+
+    Args:
+        control: `candidate_only` gives no frames, `shuffled_prefix` another order than in time,
+            None the frames in time.
+    """
     if control == "candidate_only":
         return []
-    shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, count)
+    frames = sample_prefix_frames(item.prefix_start, item.prefix_stop, count)
     if control == "shuffled_prefix":
         digest = hashlib.sha256(item.item_id.encode()).digest()
         rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-        order = np.arange(len(shown))
-        while (order == np.arange(len(shown))).all():
-            order = rng.permutation(len(shown))
-        return [shown[k] for k in order]
-    return shown
+        order = np.arange(len(frames))
+        while (order == np.arange(len(frames))).all():
+            order = rng.permutation(len(frames))
+        return [frames[k] for k in order]
+    return frames

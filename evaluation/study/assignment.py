@@ -11,7 +11,7 @@ from itertools import chain, permutations
 import numpy as np
 
 from data.records import LETTERS, SelectionItem
-from data.tracks.selection.distractors import cell_rng
+from data.tracks.quota import named_rng
 
 Column = tuple[int, ...]
 """The letters, by number, at which a candidate stands for four annotators."""
@@ -51,7 +51,7 @@ def plan(items: Sequence[SelectionItem], annotators: Sequence[str], seed: int) -
     """
     # Who lacks the items cannot work these orders out from the seed.
     digest = hashlib.sha256("\n".join(i.item_id for i in items).encode()).hexdigest()
-    shared = cell_rng(seed, "study", digest)
+    shared = named_rng(seed, "study", digest)
     shuffled = [items[k] for k in shared.permutation(len(items))]
     fours, left_over = [], []
     for family in sorted({item.family for item in items}):
@@ -67,7 +67,7 @@ def plan(items: Sequence[SelectionItem], annotators: Sequence[str], seed: int) -
                 orders[item.item_id] += _orders(item.answer, places, shared)
     planned = []
     for turn, annotator in enumerate(annotators):
-        ranks = cell_rng(seed, "study", digest, annotator).permutation(len(items))
+        ranks = named_rng(seed, "study", digest, annotator).permutation(len(items))
         for rank, item in zip(ranks, items, strict=True):
             planned.append(Planned(annotator, item.item_id, int(rank), orders[item.item_id][turn]))
     return planned

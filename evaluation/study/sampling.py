@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 from conf.errors import UserError
 from data.records import FAMILIES, SelectionItem
-from data.tracks.selection.distractors import cell_rng
+from data.tracks.quota import interleave, named_rng
 
 
 def named(text: str) -> list[str]:
@@ -77,10 +77,10 @@ def drawn(pool: Sequence[SelectionItem], count: int, seed: int) -> list[Selectio
     """
     if count > len(pool):
         raise ValueError(f"there are {len(pool)}")
-    rng = cell_rng(seed, "study", "items")
+    rng = named_rng(seed, "study", "items")
     shuffled = [pool[k] for k in rng.permutation(len(pool))]
     queues = {
-        family: _in_turn([i for i in shuffled if i.family == family], lambda i: i.subtype)
+        family: interleave([i for i in shuffled if i.family == family], lambda i: i.subtype)
         for family in FAMILIES
     }
     kept: list[SelectionItem] = []
@@ -103,15 +103,3 @@ def sharing(items: Sequence[SelectionItem]) -> int:
     """How many items show a scene that another one shows too."""
     shown = Counter(name for item in items for name in scenes(item))
     return sum(any(shown[name] > 1 for name in scenes(item)) for item in items)
-
-
-def _in_turn(
-    items: Sequence[SelectionItem], key: Callable[[SelectionItem], str]
-) -> list[SelectionItem]:
-    """The first item of each key, then the second of each, and so on."""
-    rounds: dict[str, int] = defaultdict(int)
-    ranked = []
-    for item in items:
-        rounds[key(item)] += 1
-        ranked.append((rounds[key(item)], item))
-    return [item for _, item in sorted(ranked, key=lambda r: r[0])]

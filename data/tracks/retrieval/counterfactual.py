@@ -1,8 +1,7 @@
-"""Counterfactual queries: what the scene would show had one object been absent.
+"""Counterfactual queries: the future of a scene had one object been absent.
 
-The scene is simulated again without the object, from the same start, so that the target is a frame
-of a scene of its own. The observation is the factual one, and ends before the object meets another
-for the first time.
+The scene is simulated again from the same start without the object, and the target is a frame of
+that scene. The prefix is the factual one and ends before the object's first contact.
 """
 
 from __future__ import annotations
@@ -14,20 +13,20 @@ import numpy as np
 
 from conf.schema import Quota
 from data.records import FPS, FrameRef, RetrievalQuery, Scene
+from data.tracks.quota import named_rng
 from data.tracks.retrieval import queries
 from data.tracks.retrieval.future import spell_seconds
-from data.tracks.selection.distractors import cell_rng
 from data.world.displacement import DIAGONAL, cross_scene_displacement, on_screen_positions
 
 LONGEST = 2 * FPS
-"""Frames after which an observation ends at the latest."""
+"""Latest frame at which a prefix ends."""
 HORIZONS = (1, 2, 3)
-"""Seconds after the observation that are asked for."""
+"""Seconds from the prefix's end to the target."""
 
 
 @dataclass(frozen=True)
 class CounterfactualTiming:
-    """A query's end of the observation and its target, both frames, and the seconds between."""
+    """The last frame of a query's prefix, its target frame, and the seconds between them."""
 
     stop: int
     target: int
@@ -35,16 +34,19 @@ class CounterfactualTiming:
 
 
 def removed_object(scene: Scene, seed: int) -> int | None:
-    """The object whose absence a scene is asked about: one that shows when the observation ends and
-    meets another only after it, at least a second into the clip. None where there is none."""
-    able = [
+    """Sample the object to remove, among those whose first contact follows the prefix.
+
+    The object must be on screen at the prefix's end, and the prefix at least a second long. None
+    where no object qualifies.
+    """
+    eligible = [
         k
         for k in range(len(scene.objects))
-        if (stop := _stop(scene, k)) is not None and on_screen_positions(scene)[1][stop, k]
+        if (stop := _prefix_stop(scene, k)) is not None and on_screen_positions(scene)[1][stop, k]
     ]
-    if not able:
+    if not eligible:
         return None
-    return int(cell_rng(seed, "removed", scene.scene_id).choice(able))
+    return int(named_rng(seed, "removed", scene.scene_id).choice(eligible))
 
 
 def absent_id(scene_id: str, removed: int) -> str:
@@ -52,36 +54,34 @@ def absent_id(scene_id: str, removed: int) -> str:
     return f"{scene_id}-without-{removed}"
 
 
-def _stop(scene: Scene, removed: int) -> int | None:
-    met = [c.frame for c in scene.collisions if removed in c.objects]
-    stop = min(LONGEST, met[0] - 1) if met else -1
+def _prefix_stop(scene: Scene, removed: int) -> int | None:
+    contacts = [c.frame for c in scene.collisions if removed in c.objects]
+    stop = min(LONGEST, contacts[0] - 1) if contacts else -1
     return stop if stop >= FPS else None
 
 
 def counterfactual_timings(
     scene: Scene, absent: Scene, removed: int, least: float
 ) -> list[CounterfactualTiming]:
-    """The moments at which the absence shows: some other object is at least `least` px (at 336)
-    from where it is in the scene as it was."""
-    stop = _stop(scene, removed)
-    apart = removal_displacement(scene, absent, removed)
-    asked = [CounterfactualTiming(stop, stop + seconds * FPS, seconds) for seconds in HORIZONS]
-    return [m for m in asked if m.target < scene.frames and apart[m.target] >= least]
+    """The timings at which the removal displaces another object by at least `least` px at 336."""
+    stop = _prefix_stop(scene, removed)
+    displacement = removal_displacement(scene, absent, removed)
+    timings = [CounterfactualTiming(stop, stop + s * FPS, s) for s in HORIZONS]
+    return [t for t in timings if t.target < scene.frames and displacement[t.target] >= least]
 
 
 def removal_displacement(scene: Scene, absent: Scene, removed: int) -> np.ndarray:
-    """(F,) the largest image displacement that the absence of `removed` makes to another object,
-    px at 336 x 336; an object counts where its centre is on screen in either scene."""
-    (places, shown), (other_places, other_shown) = (
-        on_screen_positions(scene),
-        on_screen_positions(absent),
-    )
-    places, shown = np.delete(places, removed, axis=1), np.delete(shown, removed, axis=1)
-    apart = np.linalg.norm(places - other_places, axis=-1)
-    return np.minimum(np.where(shown | other_shown, apart, 0.0).max(axis=-1), DIAGONAL)
+    """(F,) the largest displacement of another object by the removal, px at 336 x 336.
+
+    An object counts where its centre is on screen in either scene.
+    """
+    positions, on_screen = (np.delete(a, removed, axis=1) for a in on_screen_positions(scene))
+    other_positions, other_on_screen = on_screen_positions(absent)
+    distance = np.linalg.norm(positions - other_positions, axis=-1)
+    return np.minimum(np.where(on_screen | other_on_screen, distance, 0.0).max(axis=-1), DIAGONAL)
 
 
-def fill(
+def make_queries(
     scene_ids: dict[str, list[str]],
     scene_of: Callable[[str], Scene],
     quota: Quota,
@@ -89,50 +89,51 @@ def fill(
     least: float,
     seed: int,
 ) -> tuple[list[RetrievalQuery], int]:
-    """Queries up to the quota, and how many moments were dropped; see `queries.fill`.
+    """Make the counterfactual queries, and count the dropped ones; see `queries.fill_quota`.
 
-    The first hard negative is the scene as it was, at the target's own moment; the others are wrong
-    times of the scene without the object.
+    The first hard negative is the factual scene at the target's frame; the others are wrong-time
+    frames of the counterfactual scene.
     """
 
     def absent_of(scene: Scene) -> tuple[Scene, int] | None:
         removed = removed_object(scene, seed)
         return None if removed is None else (scene_of(absent_id(scene.scene_id, removed)), removed)
 
-    def moments_of(scene: Scene) -> list[CounterfactualTiming]:
+    def timings_of(scene: Scene) -> list[CounterfactualTiming]:
         absent = absent_of(scene)
         return [] if absent is None else counterfactual_timings(scene, *absent, least)
 
-    def ask(
-        scene: Scene, moment: CounterfactualTiming, rng: np.random.Generator
+    def make_query(
+        scene: Scene, timing: CounterfactualTiming, rng: np.random.Generator
     ) -> RetrievalQuery | None:
         absent, removed = absent_of(scene)
-        wrong = queries.wrong_times(absent, moment.target, hard_negatives - 1, least, rng)
-        factual = (scene, moment.target)
+        wrong = queries.pick_hard_negatives(absent, timing.target, hard_negatives - 1, least, rng)
         if wrong is None or any(
-            cross_scene_displacement(*factual, absent, frame) < least for frame in wrong
+            cross_scene_displacement(scene, timing.target, absent, frame) < least for frame in wrong
         ):
             return None
         phrase = scene.objects[removed].phrase
         return RetrievalQuery(
-            query_id=f"counterfactual-{absent.scene_id}-{moment.stop}-{moment.target}",
+            query_id=f"counterfactual-{absent.scene_id}-{timing.stop}-{timing.target}",
             split=scene.split,
             pool="counterfactual",
             builder=None,
             anchor="intervention",
             question=(
                 f"Had the {phrase} been absent, which frame would show the scene "
-                f"{spell_seconds(moment.seconds)} after the observation ends?"
+                f"{spell_seconds(timing.seconds)} after the observation ends?"
             ),
             scene_id=scene.scene_id,
             prefix_start=0,
-            prefix_stop=moment.stop,
-            target=FrameRef(absent.scene_id, moment.target),
+            prefix_stop=timing.stop,
+            target=FrameRef(absent.scene_id, timing.target),
             hard_negatives=(
-                FrameRef(scene.scene_id, moment.target),
+                FrameRef(scene.scene_id, timing.target),
                 *(FrameRef(absent.scene_id, frame) for frame in wrong),
             ),
             removed_object=phrase,
         )
 
-    return queries.fill("counterfactual", scene_ids, scene_of, quota, seed, moments_of, ask)
+    return queries.fill_quota(
+        "counterfactual", scene_ids, scene_of, quota, seed, timings_of, make_query
+    )

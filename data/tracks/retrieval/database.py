@@ -1,37 +1,36 @@
-"""The frames that retrieval ranks, no two of them alike.
+"""Databases of frames that retrieval ranks, without twins.
 
-Which frames look alike is told by the oracle: the same objects show, and none of them has moved by
-a pixel. So databases are chosen before a single frame is rendered.
+Twins are frames that look alike: the same objects are visible, and none of them has moved by a
+pixel. The oracle decides this, so databases are built before any frame is rendered.
 
-The future-state queries of all scenes have a source of frames, from which the standard test's
-database is drawn; the counterfactual queries have a source of their own (paper, Table 1 and
-"Query constructions").
+The future-state queries have one source of frames, of which the standard test's database is a part,
+and the counterfactual queries have another (paper, Table 1 and "Query constructions").
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import numpy as np
 
 from conf.schema import BenchmarkConfig
 from data.records import POOLS, FrameRef, RetrievalQuery, Scene
-from data.tracks.selection.distractors import cell_rng
+from data.tracks.quota import named_rng, round_robin
 from data.world.displacement import on_screen_positions
 
 TWIN_DISTANCE = 1.0
-"""Frames in which every object is within this of its place in the other, px at 336 x 336, are
-twins."""
-SHOWING = (0.02, 0.08)
-"""An object shows where at least such a share of it is visible. Two bounds, so that one that lies
-at either of them makes no twins differ."""
+"""Frames are twins where no object's position differs by this much, px at 336 x 336."""
+VISIBLE_FRACTIONS = (0.02, 0.08)
+"""An object counts as visible from this fraction on. Frames are twins under either bound, so that
+an object near one of them does not make twins differ."""
 
 
 @dataclass
 class UniqueFrames:
-    """Frames no two of which are twins, and how many were left out as twins of one in it."""
+    """Frames without twins, and the number of frames that were left out as twins."""
 
     scene_of: Callable[[str], Scene]
     frames: dict[FrameRef, None] = field(default_factory=dict)
@@ -39,7 +38,7 @@ class UniqueFrames:
     _seen: dict[tuple, list[np.ndarray]] = field(default_factory=lambda: defaultdict(list))
 
     def add(self, frame: FrameRef) -> bool:
-        """Take a frame in, unless it or a twin of it is there; whether it is new."""
+        """Add a frame unless it or a twin of it is present, and return whether it was added."""
         if frame in self.frames:
             return False
         looks = list(_appearances(self.scene_of(frame.scene_id), frame.frame))
@@ -55,37 +54,30 @@ class UniqueFrames:
         return True
 
     def fill(self, names: list[str], wanted: int, seed: int) -> list[FrameRef]:
-        """Take in `wanted` more frames of the scenes `names`, or as many as they have: a random one
-        of each scene in turn."""
-        taken: list[FrameRef] = []
-        waiting = {
-            name: cell_rng(seed, "database", name).permutation(self.scene_of(name).frames).tolist()
-            for name in names
-        }
-        while waiting and len(taken) < wanted:
-            for name in list(waiting):
-                if len(taken) == wanted:
-                    break
-                while waiting[name]:
-                    frame = FrameRef(name, waiting[name].pop())
-                    if self.add(frame):
-                        taken.append(frame)
-                        break
-                else:
-                    del waiting[name]
-        return taken
+        """Add `wanted` more frames of the scenes `names`, a random one of each scene in turn.
+
+        Returns:
+            The added frames; fewer where the scenes have no more.
+        """
+
+        def new_frames(name: str) -> Iterator[FrameRef]:
+            order = named_rng(seed, "database", name).permutation(self.scene_of(name).frames)
+            frames = (FrameRef(name, frame) for frame in reversed(order.tolist()))
+            return (frame for frame in frames if self.add(frame))
+
+        return list(islice(round_robin(map(new_frames, names)), max(wanted, 0)))
 
 
 def _appearances(scene: Scene, frame: int) -> Iterable[tuple[tuple, np.ndarray]]:
-    """Which objects show in a frame, by each bound of `SHOWING`, and where."""
+    """The visible objects of a frame and their positions, by each of `VISIBLE_FRACTIONS`."""
     visible = scene.visible_fraction[frame]
-    # Where a record does not tell how much of an object is visible, being in view has to do.
+    # NaN: the simulator's record has no visible fraction, only whether the object is in view.
     visible = np.where(np.isnan(visible), 1.0, visible) * scene.in_view[frame]
-    places = on_screen_positions(scene)[0][frame]
+    positions = on_screen_positions(scene)[0][frame]
     order = sorted(range(len(scene.objects)), key=lambda k: str(scene.objects[k]))
-    for bound in SHOWING:
-        shown = [k for k in order if visible[k] >= bound]
-        yield tuple(scene.objects[k] for k in shown), places[shown]
+    for bound in VISIBLE_FRACTIONS:
+        present = [k for k in order if visible[k] >= bound]
+        yield tuple(scene.objects[k] for k in present), positions[present]
 
 
 def make_databases(
@@ -94,24 +86,24 @@ def make_databases(
     scene_ids: dict[str, list[str]],
     scene_of: Callable[[str], Scene],
 ) -> tuple[list[RetrievalQuery], dict[str, list[FrameRef]], dict[str, int]]:
-    """The frames of every database, and counts of what was left out of them.
+    """Choose the frames of every database.
 
     Returns:
-        The queries whose target is in its database under its own name, those of the standard test
-        marked; frames by database; counts.
+        The queries whose target has no twin in its database, with the standard test marked; frames
+        by database; and counts of the queries and frames that were left out.
     """
-    albums = {pool: UniqueFrames(scene_of) for pool in POOLS}
+    unique = {pool: UniqueFrames(scene_of) for pool in POOLS}
     kept = {
-        pool: with_target(cfg, [q for q in queries if q.pool == pool], albums[pool])
+        pool: drop_twins(cfg, [q for q in queries if q.pool == pool], unique[pool])
         for pool in POOLS
     }
-    dropped = sum(album.left_out for album in albums.values())
+    dropped = sum(frames.left_out for frames in unique.values())
     kept["future"] = mark_standard(kept["future"], cfg.retrieval.standard)
-    test, source = future_databases(cfg, kept["future"], scene_ids, albums["future"])
-    absent = counterfactual_database(cfg, kept["counterfactual"], albums["counterfactual"])
+    test, source = future_databases(cfg, kept["future"], scene_ids, unique["future"])
+    absent = counterfactual_database(cfg, kept["counterfactual"], unique["counterfactual"])
     counts = {
         "queries dropped, target has a twin": dropped,
-        "frames left out, twins": sum(album.left_out for album in albums.values()) - dropped,
+        "frames left out, twins": sum(frames.left_out for frames in unique.values()) - dropped,
     }
     return (
         [*kept["future"], *kept["counterfactual"]],
@@ -124,42 +116,45 @@ def future_databases(
     cfg: BenchmarkConfig,
     queries: list[RetrievalQuery],
     scene_ids: dict[str, list[str]],
-    album: UniqueFrames,
+    unique: UniqueFrames,
 ) -> tuple[list[FrameRef], list[FrameRef]]:
-    """The standard test's database, of test scenes alone, and the source of all future-state
-    queries, of which it is a part."""
+    """The standard test's database, of test scenes only, and the future-state queries' source,
+    which contains it."""
     if not queries:
         return [], []
     track = cfg.retrieval
-    asked = dict.fromkeys(q.target for q in queries if q.standard)
-    test = [*asked, *album.fill(scene_ids["test"], track.database - len(asked), cfg.seed)]
-    source = [*test, *(f for f in dict.fromkeys(q.target for q in queries) if f not in asked)]
+    targets = dict.fromkeys(q.target for q in queries if q.standard)
+    test = [*targets, *unique.fill(scene_ids["test"], track.database - len(targets), cfg.seed)]
+    source = [*test, *(f for f in dict.fromkeys(q.target for q in queries) if f not in targets)]
     every = [*scene_ids["train"], *scene_ids["test"]]
-    return test, [*source, *album.fill(every, track.source - len(source), cfg.seed)]
+    return test, [*source, *unique.fill(every, track.source - len(source), cfg.seed)]
 
 
 def counterfactual_database(
-    cfg: BenchmarkConfig, queries: list[RetrievalQuery], album: UniqueFrames
+    cfg: BenchmarkConfig, queries: list[RetrievalQuery], unique: UniqueFrames
 ) -> list[FrameRef]:
-    """The source of the counterfactual queries: their targets, then their hard negatives, of each
-    query first what happened instead, then other frames of the scenes without the object. The test
-    queries' come before the training queries', for those alone are ranked among them."""
+    """The source of the counterfactual queries.
+
+    It holds their targets, then their hard negatives (the factual frame of each query first), then
+    other frames of the counterfactual scenes. Test queries come before training queries, because
+    only they are ranked against this source.
+    """
     wanted = cfg.retrieval.counterfactual_source
     ranked = sorted(queries, key=lambda q: q.split != "test")
     for of_rank in zip(*(q.hard_negatives for q in ranked), strict=True):
         for frame in of_rank:
-            if len(album.frames) < wanted:
-                album.add(frame)
+            if len(unique.frames) < wanted:
+                unique.add(frame)
     absent = sorted({q.target.scene_id for q in queries})
-    album.fill(absent, wanted - len(album.frames), cfg.seed)
-    return list(album.frames)
+    unique.fill(absent, wanted - len(unique.frames), cfg.seed)
+    return list(unique.frames)
 
 
-def with_target(
-    cfg: BenchmarkConfig, queries: list[RetrievalQuery], album: UniqueFrames
+def drop_twins(
+    cfg: BenchmarkConfig, queries: list[RetrievalQuery], unique: UniqueFrames
 ) -> list[RetrievalQuery]:
-    """Queries up to their quotas whose target is no twin of another's, of which those of the test
-    split come first: of two frames that look alike both would be right."""
+    """Queries up to their quotas whose target is not a twin of another target, because both frames
+    would be right answers. The test split has precedence."""
     kept: Counter[tuple[int | None, str]] = Counter()
     chosen = set()
     for query in sorted(queries, key=lambda q: q.split != "test"):
@@ -167,15 +162,15 @@ def with_target(
         if query.builder is not None:
             quota = cfg.retrieval.builders[str(query.builder)]
         full = kept[query.builder, query.split] >= getattr(quota, query.split)
-        if not full and (query.target in album.frames or album.add(query.target)):
+        if not full and (query.target in unique.frames or unique.add(query.target)):
             kept[query.builder, query.split] += 1
             chosen.add(query.query_id)
     return [q for q in queries if q.query_id in chosen]
 
 
 def mark_standard(queries: list[RetrievalQuery], total: int) -> list[RetrievalQuery]:
-    """The queries, `total` of the test split's marked as the standard test: as many of each builder
-    as of any other, the first ones."""
+    """Mark `total` test queries as the standard test: the first ones of each builder, with equal
+    counts."""
     builders = sorted({q.builder for q in queries if q.split == "test"})
     left = {
         builder: total * (k + 1) // len(builders) - total * k // len(builders)

@@ -1,7 +1,7 @@
 """The six future-state builders: a prefix, a question, the target frame, and hard negatives.
 
-Two are anchored in time and four in a collision (`anchor`). Times convert to frames at 25 a second
-and the clip's end is its last frame.
+Two builders are anchored in time and four in a collision. One second is 25 frames, and the clip
+ends at its last frame.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from conf.schema import Quota
 from data.records import FPS, FrameRef, RetrievalQuery, Scene
 from data.tracks.retrieval import queries
 
-EVENTS_A_SCENE = 3
-"""Events of a scene that builder 3 uses at most."""
-ONE_A_SCENE = (4, 5, 6)
-"""Builders that ask for one event of a scene (paper, retrieval construction)."""
+EVENTS_PER_SCENE = 3
+"""Largest number of events of a scene that builder 3 uses."""
+ONE_PER_SCENE = (4, 5, 6)
+"""Builders that use one event of a scene (paper, retrieval construction)."""
 
 
 @dataclass(frozen=True)
 class FutureQuestion:
-    """What a builder asks of a scene: an observation, a question, and the frame that answers."""
+    """A question that a builder can ask about a scene: its anchor, prefix and target frame."""
 
     anchor: str
     question: str
@@ -34,8 +34,8 @@ class FutureQuestion:
 def _clip_end(scene: Scene) -> Iterator[FutureQuestion]:
     for seconds in (2, 3, 4):
         text = "Which frame shows the scene at the end of the clip, {} after the observation ends?"
-        left = spell_seconds(5 - seconds)
-        yield FutureQuestion("time", text.format(left), (0, seconds * FPS), scene.frames - 1)
+        text = text.format(spell_seconds(5 - seconds))
+        yield FutureQuestion("time", text, (0, seconds * FPS), scene.frames - 1)
 
 
 def _clock(scene: Scene) -> Iterator[FutureQuestion]:
@@ -46,10 +46,10 @@ def _clock(scene: Scene) -> Iterator[FutureQuestion]:
 
 def _at_event(scene: Scene) -> Iterator[FutureQuestion]:
     text = "Which frame shows the scene at the moment of the next collision?"
-    for event in list(dict.fromkeys(c.frame for c in scene.collisions))[:EVENTS_A_SCENE]:
-        for early in range(6):
-            # So many frames lie between: the event's own would show the target.
-            stop = event - 1 - early
+    for event in _events(scene)[:EVENTS_PER_SCENE]:
+        for between in range(6):
+            # At least one frame before the event, which is the target.
+            stop = event - 1 - between
             if stop >= FPS and _is_next(scene, stop, event):
                 yield FutureQuestion("event", text, (stop - FPS, stop), event)
 
@@ -59,14 +59,14 @@ def _after_event(scene: Scene) -> Iterator[FutureQuestion]:
         "The observation ends at a collision. Which frame shows the scene 1 second after that "
         "collision?"
     )
-    for event in {c.frame: None for c in scene.collisions}:
+    for event in _events(scene):
         if event >= FPS and event + FPS < scene.frames:
             yield FutureQuestion("event", text, (event - FPS, event), event + FPS)
 
 
 def _before_event(scene: Scene) -> Iterator[FutureQuestion]:
     text = "Which frame shows the scene at the moment of the next collision?"
-    for event in {c.frame: None for c in scene.collisions}:
+    for event in _events(scene):
         stop = event - FPS
         if stop >= FPS and _is_next(scene, stop, event):
             yield FutureQuestion("event", text, (stop - FPS, stop), event)
@@ -74,10 +74,15 @@ def _before_event(scene: Scene) -> Iterator[FutureQuestion]:
 
 def _past_event(scene: Scene) -> Iterator[FutureQuestion]:
     text = "Which frame shows the scene half a second after the next collision?"
-    for event in {c.frame: None for c in scene.collisions}:
+    for event in _events(scene):
         stop = event - FPS // 2
         if stop >= FPS and stop + FPS < scene.frames and _is_next(scene, stop, event):
             yield FutureQuestion("event", text, (stop - FPS, stop), stop + FPS)
+
+
+def _events(scene: Scene) -> list[int]:
+    """The frames of the scene's collisions, each once, in order."""
+    return list(dict.fromkeys(c.frame for c in scene.collisions))
 
 
 def _is_next(scene: Scene, stop: int, event: int) -> bool:
@@ -96,10 +101,10 @@ BUILDERS: dict[int, Callable[[Scene], Iterator[FutureQuestion]]] = {
     5: _before_event,
     6: _past_event,
 }
-"""Each gives every moment of a scene that it can ask for."""
+"""Each builder yields all questions that it can ask about a scene."""
 
 
-def fill(
+def make_queries(
     builder: int,
     scene_ids: dict[str, list[str]],
     scene_of: Callable[[str], Scene],
@@ -108,32 +113,36 @@ def fill(
     least: float,
     seed: int,
 ) -> tuple[list[RetrievalQuery], int]:
-    """Queries of one builder up to its quota, and how many moments were dropped; see
-    `queries.fill`."""
+    """Make the queries of one builder, and count the dropped ones; see `queries.fill_quota`."""
 
-    def ask(
-        scene: Scene, moment: FutureQuestion, rng: np.random.Generator
+    def make_query(
+        scene: Scene, asked: FutureQuestion, rng: np.random.Generator
     ) -> RetrievalQuery | None:
-        negatives = queries.wrong_times(scene, moment.target, hard_negatives, least, rng)
+        negatives = queries.pick_hard_negatives(scene, asked.target, hard_negatives, least, rng)
         if negatives is None:
             return None
-        start, stop = moment.prefix
+        start, stop = asked.prefix
         return RetrievalQuery(
-            query_id=f"future-{builder}-{scene.scene_id}-{start}-{stop}-{moment.target}",
+            query_id=f"future-{builder}-{scene.scene_id}-{start}-{stop}-{asked.target}",
             split=scene.split,
             pool="future",
             builder=builder,
-            anchor=moment.anchor,
-            question=moment.question,
+            anchor=asked.anchor,
+            question=asked.question,
             scene_id=scene.scene_id,
             prefix_start=start,
             prefix_stop=stop,
-            target=FrameRef(scene.scene_id, moment.target),
+            target=FrameRef(scene.scene_id, asked.target),
             hard_negatives=tuple(FrameRef(scene.scene_id, frame) for frame in negatives),
         )
 
-    def moments(scene: Scene) -> list[FutureQuestion]:
-        return list(BUILDERS[builder](scene))
-
-    once = builder in ONE_A_SCENE
-    return queries.fill(str(builder), scene_ids, scene_of, quota, seed, moments, ask, once)
+    return queries.fill_quota(
+        str(builder),
+        scene_ids,
+        scene_of,
+        quota,
+        seed,
+        lambda scene: list(BUILDERS[builder](scene)),
+        make_query,
+        one_a_scene=builder in ONE_PER_SCENE,
+    )

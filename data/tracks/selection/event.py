@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data.records import Candidate, FrameRef, Scene
+from data.records import Candidate, FrameRef, Scene, SelectionItem
 from data.tracks.selection.distractors import (
     DistractorPicker,
-    Draft,
+    new_item,
     outside_prefix,
     scene_candidates,
     visible_objects,
@@ -27,9 +27,9 @@ PREFIX_STEP = 20
 TAIL = 10
 """Least number of frames between the target and the clip's end."""
 OFFSETS = (16, 32, 48)
-"""Frames on either side of the target at which same-scene distractors lie."""
-ELSEWHERE = 24
-"""Other scenes looked at for cross-scene distractors."""
+"""Offsets of same-scene distractors from the target, in frames on either side."""
+CROSS_SCENES = 24
+"""Other scenes sampled for cross-scene distractors."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ CELLS = {
 
 @dataclass(frozen=True)
 class EventTiming:
-    """Where a collision at frame `event` puts an item's prefix and target."""
+    """Frames of an item around an event: the event, the prefix's first and last, the target."""
 
     event: int
     start: int
@@ -62,72 +62,69 @@ class EventTiming:
 
 
 def event_timings(scene: Scene, cell: EventCell) -> Iterator[EventTiming]:
-    """The moments of a scene that the cell can ask about, in order of time."""
+    """The timings of a scene's collisions that leave room for prefix and target, in order."""
     for event in dict.fromkeys(c.frame for c in scene.collisions):
         stop = event - cell.gap if cell.framing == "future" else event
-        moment = EventTiming(event, stop - PREFIX_STEP, stop, stop + cell.gap)
-        if moment.start >= 0 and moment.target <= scene.frames - 1 - TAIL:
-            yield moment
+        timing = EventTiming(event, stop - PREFIX_STEP, stop, stop + cell.gap)
+        if timing.start >= 0 and timing.target <= scene.frames - 1 - TAIL:
+            yield timing
 
 
-def draft(
+def make_item(
     subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
-) -> Draft | None:
-    """An item of the cell around one of the scene's collisions, tried in a random order."""
+) -> SelectionItem | None:
+    """Make an item of a cell around one of the scene's collisions, tried in a random order."""
     cell = CELLS[subtype]
-    found = list(event_timings(scene, cell))
-    for k in rng.permutation(len(found)):
-        moment = found[k]
-        pool = wrong_frames(cell, scene, moment, rng, picker)
-        across = cell.distractors == "cross_scene"
+    timings = list(event_timings(scene, cell))
+    for k in rng.permutation(len(timings)):
+        timing = timings[k]
+        prefix = (timing.start, timing.stop)
         picked = picker.pick(
-            FrameRef(scene.scene_id, moment.target),
-            pool,
-            visible_objects(scene, (moment.start, moment.stop)),
-            None if across else int(rng.integers(4)),
+            FrameRef(scene.scene_id, timing.target),
+            wrong_frames(cell, scene, timing, rng, picker),
+            visible_objects(scene, prefix),
+            None if cell.distractors == "cross_scene" else int(rng.integers(4)),
         )
-        if picked is None:
-            continue
-        return Draft(
-            scene,
-            "event",
-            subtype,
-            QUESTION,
-            (moment.start, moment.stop),
-            moment.target,
-            *picked,
-            {
-                "event_frame": moment.event,
-                "framing": cell.framing,
-                "distractors": cell.distractors,
-                "gap": cell.gap,
-            },
-        )
+        if picked is not None:
+            return new_item(
+                scene,
+                "event",
+                subtype,
+                QUESTION,
+                prefix,
+                timing.target,
+                picked,
+                event_frame=timing.event,
+                framing=cell.framing,
+                distractors=cell.distractors,
+                gap=cell.gap,
+            )
     return None
 
 
 def wrong_frames(
     cell: EventCell,
     scene: Scene,
-    moment: EventTiming,
+    timing: EventTiming,
     rng: np.random.Generator,
     picker: DistractorPicker,
 ) -> Iterable[Candidate]:
-    """Distractors of the cell's source, in the order in which they are wanted: the scene at
-    offsets on either side, the scene's frames most alike to the target, or other scenes at such a
-    moment of their own."""
-    target, prefix = moment.target, (moment.start, moment.stop)
+    """Candidate distractors of the cell's source, best first.
+
+    Sources: frames at fixed offsets from the target, the scene's frames most similar to the
+    target, or the targets of other scenes.
+    """
+    target, prefix = timing.target, (timing.start, timing.stop)
     if cell.distractors == "same_offset":
         pool = [f for o in OFFSETS for f in (target - o, target + o) if 0 <= f < scene.frames]
-        return scene_candidates(
-            scene, rng.permutation(outside_prefix(pool, prefix)), cell.distractors
-        )
+        wrong = rng.permutation(outside_prefix(pool, prefix))
+        return scene_candidates(scene, wrong, cell.distractors)
     if cell.distractors == "same_obj_match":
-        alike = np.argsort(object_match_scores(scene, target), kind="stable")
-        wrong = outside_prefix(alike[alike != target], prefix)
+        similar = np.argsort(object_match_scores(scene, target), kind="stable")
+        wrong = outside_prefix(similar[similar != target], prefix)
         return scene_candidates(scene, wrong, cell.distractors)
     return (
-        Candidate(other.scene_id, there.target, cell.distractors)
-        for other in picker.others(scene, rng, ELSEWHERE)
-        for there in list(event_timings(other, cell))[:1]
+        Candidate(other.scene_id, first.target, cell.distractors)
+        for other in picker.sample_scenes(scene, rng, CROSS_SCENES)
+        for first in list(event_timings(other, cell))[:1]
     )

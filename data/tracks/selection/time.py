@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from data.records import SELECTION_SECOND, FrameRef, Scene
+from data.records import SELECTION_SECOND, FrameRef, Scene, SelectionItem
 from data.tracks.selection.distractors import (
     DistractorPicker,
-    Draft,
+    Picked,
+    new_item,
     scene_candidates,
     visible_objects,
 )
@@ -24,27 +25,38 @@ def question(seconds: int) -> str:
     )
 
 
-def draft(
+def make_item(
     subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
-) -> Draft | None:
-    """An item whose prefix is the scene's first second; distractors are later moments of the same
-    scene."""
+) -> SelectionItem | None:
+    """Make an item whose prefix is the scene's first second; distractors are later frames."""
     seconds = CELLS[subtype]
-    start, stop = 0, SELECTION_SECOND - 1
+    prefix = start, stop = 0, SELECTION_SECOND - 1
     target = start + SELECTION_SECOND + SELECTION_SECOND * seconds
-    later = rng.permutation(np.arange(stop + 1, scene.frames))
-    pool = scene_candidates(scene, later[later != target], "same_time")
-    about = visible_objects(scene, (start, stop))
-    picked = picker.pick(FrameRef(scene.scene_id, target), pool, about, int(rng.integers(4)))
+    picked = pick_later_frames(scene, prefix, target, rng, picker)
     if picked is None:
         return None
-    return Draft(
+    return new_item(
         scene,
         "time",
         subtype,
         question(seconds),
-        (start, stop),
+        prefix,
         target,
-        *picked,
-        {"distractors": "same_time", "horizon": target - stop},
+        picked,
+        distractors="same_time",
+        horizon=target - stop,
     )
+
+
+def pick_later_frames(
+    scene: Scene,
+    prefix: tuple[int, int],
+    target: int,
+    rng: np.random.Generator,
+    picker: DistractorPicker,
+) -> Picked | None:
+    """Pick distractors among the scene's frames after the prefix, in a random order."""
+    later = rng.permutation(np.arange(prefix[1] + 1, scene.frames))
+    pool = scene_candidates(scene, later[later != target], "same_time")
+    about = visible_objects(scene, prefix)
+    return picker.pick(FrameRef(scene.scene_id, target), pool, about, int(rng.integers(4)))

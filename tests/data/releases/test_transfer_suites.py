@@ -16,8 +16,8 @@ from data.records import Collision, Landing, Scene, SceneObject, SelectionItem
 from data.releases.readers import READERS
 from data.releases.transfer_suites import TRANSFER_SUITES
 from data.releases.validation import RecordError
+from data.tracks.quota import fill_quota
 from data.tracks.selection import event, time
-from data.tracks.selection.distractors import fill
 from data.world.displacement import cross_scene_displacement
 from data.world.events import find_motion_onsets
 
@@ -71,9 +71,9 @@ SCENES = {
 def items_of(
     suite: str, family: str, subtype: str, scenes: dict[str, Scene]
 ) -> list[SelectionItem]:
-    draw = partial(TRANSFER_SUITES[suite][family].draft, subtype)
+    make_item = partial(TRANSFER_SUITES[suite][family].make_item, subtype)
     names = {"train": [], "test": list(scenes)}
-    found, _ = fill(subtype, draw, names, scenes.__getitem__, Quota(0, 24), 0, LEAST)
+    found, _ = fill_quota(subtype, make_item, names, scenes.__getitem__, Quota(0, 24), 0, LEAST)
     return found
 
 

@@ -127,7 +127,7 @@ def test_families_b_and_c_are_told_apart_by_what_they_are_built_around(
     for item in (i for i in items if i.window_family in ("B", "C")):
         scene = benchmark_store.scene(item.scene_id)
         cell = window.CELLS[item.subtype]
-        about = window.built_around(cell, scene, item.prefix_stop, item.target_frame)
+        about = window.subject_objects(cell, scene, item.prefix_stop, item.target_frame)
         shown = visible_objects(scene, (item.prefix_start, item.prefix_stop))
         if item.window_family == "B":
             assert item.group in ("G2", "G4")
@@ -305,14 +305,14 @@ def test_the_standard_test_is_of_test_scenes_alone(benchmark_store) -> None:
 
 def test_the_counterfactual_database_shows_what_happened_instead(benchmark_store) -> None:
     database = benchmark_store.database("counterfactual")
-    album = UniqueFrames(benchmark_store.scene)
-    assert all(album.add(frame) for frame in database)
+    unique = UniqueFrames(benchmark_store.scene)
+    assert all(unique.add(frame) for frame in database)
     queries = benchmark_store.retrieval(pool="counterfactual")
     test = [q.hard_negatives[0] for q in queries if q.split == "test"]
     train = [q.hard_negatives[0] for q in queries if q.split == "train"]
     assert test
-    assert not any(album.add(frame) for frame in test)
-    if any(album.add(frame) for frame in train):
+    assert not any(unique.add(frame) for frame in test)
+    if any(unique.add(frame) for frame in train):
         others = set(database) - {q.target for q in queries}
         assert others <= {*test, *train}, "there was room for what happened instead"
 
@@ -325,14 +325,14 @@ def test_twins_are_those_that_do_not_move(benchmark_store) -> None:
             name: np.repeat(getattr(scene, name)[:1], scene.frames, axis=0) for name in scene.ARRAYS
         },
     )
-    album = UniqueFrames({"moving": scene, "still": still}.get)
+    unique = UniqueFrames({"moving": scene, "still": still}.get)
     for frame in range(scene.frames):
-        album.add(FrameRef("still", frame))
-    assert list(album.frames) == [FrameRef("still", 0)]
-    assert album.left_out == scene.frames - 1
+        unique.add(FrameRef("still", frame))
+    assert list(unique.frames) == [FrameRef("still", 0)]
+    assert unique.left_out == scene.frames - 1
     # The other scene begins as this one stands.
-    assert not album.add(FrameRef("moving", 0))
-    taken = [f.frame for f in album.fill(["moving"], 200, seed=0)]
+    assert not unique.add(FrameRef("moving", 0))
+    taken = [f.frame for f in unique.fill(["moving"], 200, seed=0)]
     apart = frame_displacements(scene)[np.ix_(taken, taken)]
     assert len(taken) > 20
     assert apart[~np.eye(len(taken), dtype=bool)].min() > 0.9

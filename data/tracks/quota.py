@@ -1,0 +1,91 @@
+"""Seeded sampling of scenes until each cell of a benchmark has the items of its quota."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from conf.schema import Quota
+from data.records import SPLITS, Scene, SelectionItem
+from data.tracks.selection.distractors import DistractorPicker
+
+Element = TypeVar("Element")
+ItemMaker = Callable[[Scene, np.random.Generator, DistractorPicker], SelectionItem | None]
+"""Makes at most one item of a cell from a scene, with the target as its first candidate."""
+
+
+def fill_quota(
+    subtype: str,
+    make_item: ItemMaker,
+    scene_ids: dict[str, list[str]],
+    scene_of: Callable[[str], Scene],
+    quota: Quota,
+    seed: int,
+    least: float,
+) -> tuple[list[SelectionItem], int]:
+    """Make the items of one cell, at most one a scene, from scenes in a seeded order.
+
+    Args:
+        least: Smallest displacement between two candidates, px at 336 x 336.
+
+    Returns:
+        Items of each split up to its quota, and the number of targets that were dropped because
+        no three distinguishable distractors exist.
+    """
+    items, dropped = [], 0
+    for split in SPLITS:
+        picker = DistractorPicker(least, scene_ids[split], scene_of)
+        rng = named_rng(seed, subtype, split)
+        made: list[SelectionItem] = []
+        for index in rng.permutation(len(scene_ids[split])):
+            if len(made) == getattr(quota, split):
+                break
+            item = make_item(scene_of(scene_ids[split][index]), rng, picker)
+            if item is not None:
+                made.append(item)
+        # Each letter is the answer equally often. The remainder starts at a random letter, because
+        # otherwise the last letter would be right in fewer cells than the first.
+        positions = rng.permutation((np.arange(len(made)) + rng.integers(4)) % 4)
+        items += [_shuffle(i, int(p), rng) for i, p in zip(made, positions, strict=True)]
+        dropped += picker.dropped
+    return items, dropped
+
+
+def _shuffle(item: SelectionItem, position: int, rng: np.random.Generator) -> SelectionItem:
+    """Shuffle an item's distractors and move the target to `position`."""
+    target, *distractors = item.candidates
+    candidates = [distractors[k] for k in rng.permutation(3)]
+    candidates.insert(position, target)
+    return replace(item, candidates=tuple(candidates), answer=position)
+
+
+def named_rng(seed: int, *names: str) -> np.random.Generator:
+    """A random generator for a seed and a name, so that one quota does not affect other cells."""
+    digest = hashlib.sha256("/".join(names).encode()).digest()
+    return np.random.default_rng([seed, int.from_bytes(digest[:8], "big")])
+
+
+def round_robin(queues: Iterable[Iterable[Element]]) -> Iterator[Element]:
+    """The next element of each queue in turn, read lazily, until all queues are exhausted."""
+    waiting = [iter(queue) for queue in queues]
+    while waiting:
+        for queue in list(waiting):
+            try:
+                yield next(queue)
+            except StopIteration:
+                waiting.remove(queue)
+
+
+def interleave(elements: Iterable[Element], key: Callable[[Element], Hashable]) -> list[Element]:
+    """The first element of each key, then the second of each, and so on; stable otherwise."""
+    turns: Counter[Hashable] = Counter()
+    ranked = []
+    for element in elements:
+        turns[key(element)] += 1
+        ranked.append((turns[key(element)], element))
+    return [element for _, element in sorted(ranked, key=lambda pair: pair[0])]
