@@ -1,5 +1,6 @@
 import json
 import random
+import time
 
 import pytest
 
@@ -131,7 +132,7 @@ CASES = [
     ("I cannot determine which image is right.", None, REF),
     ("I'm sorry, I can't help with that.", None, REF),
     ("Answer: none of the candidates", None, REF),
-    ("Answer: N/A", None, REF),
+    ("Answer: N/A", None, SEV),
     ('{"choice": "none"}', None, REF),
     ('{"choice": "unable to decide"}', None, REF),
     # other letters
@@ -156,18 +157,72 @@ CASES = [
     ('{"choice": ""}', None, NO),
     ('{"choice": "<letter>"}', None, NO),
     ('{"choice": "framed"}', None, NO),
-    ('{"choice": "B" or "C"}', None, NO),
+    ('{"choice": "B" or "C"}', None, SEV),
     ('{"choice": {"letter": "B"}}', None, NO),
     ('{"second_choice": "B"}', None, NO),
     ('{"rationales": {"choice": "C"}}', None, NO),
     ('{\n  "answer": "B"\n}', None, NO),
+    # a record one of whose keys looks like a choice, or that is broken around it
+    (f'<think>{{"forced_choice": "A"}}</think>{FULL}', "B", None),
+    ('{"reply": 1, "forced_choice": "d"}', "D", None),
+    ('{"forced_choice": " (a) "}', "A", None),
+    (FULL.replace('"B",', '"B"', 1), "B", MAL),
+    (FULL.replace("}", ",}", 1), "B", MAL),
+    ("{", None, NO),
+    ('{"', None, CUT),
+    ('{"forced_choice"', None, CUT),
+    (f"<think>{FULL}", None, CUT),
+    (f"<think>One.</think>{FULL}<think>Or else", None, CUT),
+    ('{"forced_choice": "A", "choice": "D"}', None, SEV),
+    ('{"forced_choice": "A/B"}', None, SEV),
+    ('{"forced_choice": "A"}{"forced_choice": null}', None, SEV),
+    ('{"forced_choice": "A"}{"forced_choice": "refuse"}', None, SEV),
+    ('{"forced_choice": "A: rejected"}', None, REF),
+    ('{"forced_choice": "B, but impossible to determine"}', None, REF),
+    ('{"forced_choice": "A, no other one fits"}', "A", None),
+    ('{"forced_choice": true}', None, NO),
+    ('{"forced_choice": "blue cube"}', None, NO),
+    # letters in passing, and inside words
+    ("ABCD", None, NO),
+    ("Bad", None, NO),
+    ("A red cube.", None, NO),
+    ("not C", None, NO),
+    ("Answer: Blue", None, NO),
+    ("The answer depends on A.", None, NO),
+    ("Candidate A:", None, NO),
+    # a letter that its own line withdraws, and one that is explained by what is absent
+    ("Answer: A? No.", None, REF),
+    ("Answer: A, no", None, REF),
+    ("Answer: A - wrong", None, REF),
+    ("Answer: A, which is wrong", None, REF),
+    ("Answer: B. I'm sorry, but I cannot determine it.", None, REF),
+    ("Answer: A. I refuse to answer.", None, REF),
+    ("Answer: B, but there is not enough information.", None, REF),
+    ("Answer: B. No cube has moved.", "B", None),
+    ("Answer: B, since the sphere cannot be seen any more.", "B", None),
+    ("Answer: B. There is not enough time to reach the corner.", "B", None),
+    ("Answer: B. It is not the first to collide.", "B", None),
+    # thoughts of other templates
+    ("<thinking>\nAnswer: B", None, CUT),
+    ("<THINK>\nAnswer: B", None, CUT),
+    ("◁think▷Answer: B◁/think▷Answer: C", "C", None),
+    # look-alikes of other scripts are other letters; forms of the same letter are not
+    ("Answer: В", None, BAD),
+    ("Answer: Α", None, BAD),
+    ('{"forced_choice": "С"}', None, BAD),
+    # other JSON
+    ("[]", None, NO),
+    ("null", None, REF),
+    ("\x00", None, NO),
+    ("</think>", None, NO),
 ]
 
 
 @pytest.mark.parametrize(("raw", "letter", "reason"), CASES)
-def test_outputs(raw, letter, reason):
+def test_parse_choice(raw, letter, reason):
     assert parse_choice(raw) == ParsedAnswer(letter, reason)
-    assert parse_choice(raw).letter == letter
+    for padded in (f"\n{raw}", f" \t{raw}  \n\n"):
+        assert parse_choice(padded).letter == letter
 
 
 def test_only_offered_letters_count():
@@ -207,7 +262,43 @@ def test_no_output_raises_or_leaves_the_letters():
 
 
 @pytest.mark.parametrize(
-    "unit", ["{", '{"a":', '{"choice":', "\n", "[", '"', "Answer:", "best ", "- "]
-)
-def test_long_output_is_read_in_linear_time(unit):
-    assert parse_choice(unit * 20_000).letter is None
+    ("raw", "letter"),
+    [("Answer: B", None), ("B", None), ("Option", None), ("Answer: B.", "B"),
+     ("Answer: B\nThe", "B"), (FULL, "B"), (FULL[:40], "B")],
+)  # fmt: skip
+def test_the_last_word_of_a_cut_response_is_no_choice(raw, letter):
+    answer = parse_choice(raw, cut=True)
+    assert answer.letter == letter
+    assert letter or answer.reason is CUT
+
+
+def test_texts_that_state_no_choice_have_no_letter():
+    """Prose and JSON of words that name letters, candidates and colours, but choose none."""
+    rng = random.Random(0)
+    words = ["A", "B", "Candidate C", "D", "cube", "a", "the", "best", "option", "choice", "late"]
+    keys = ["confidence", "second_choice", "distribution", "rationales", "answer", "my choices"]
+    for _ in range(1000):
+        prose = " ".join(rng.choices(words, k=rng.randint(6, 30)))
+        value = {k: rng.choice([prose, 0.5, "A", {"forced_choice": "B"}]) for k in keys}
+        raw = rng.choice(
+            [prose, json.dumps(value), f"{json.dumps(value)} {prose}", f"<think>{FULL}"]
+        )
+        assert parse_choice(raw).letter is None, raw
+
+
+UNITS = [
+    "final\n", "best\n", '"choice": x ', "'choice': x ", '{"choice":"B"} ', "{'a': ", "'", '"', "[[",
+    "Answer:\n", "the answer is ", "A, ", "I cannot ", " ", "\t", "<think>", "</think>", "\\", "A",
+    "\u200b", "{", '{"a":', '{"choice":', "\n", "Answer:", "- ",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("before", ["", "{", '{"choice": '])
+@pytest.mark.parametrize("after", ["", "}"])
+def test_long_output_is_read_in_linear_time(before, unit, after):
+    raw = f"{before}{unit * (50_000 // len(unit))}{after}"
+    began = time.perf_counter()
+    letter = parse_choice(raw).letter
+    assert time.perf_counter() - began < 2
+    assert letter is None or unit in ('{"choice":"B"} ', "A", "A, ")
