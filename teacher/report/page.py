@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from conf.runs import write_text
-from data.gallery import Looker
-from data.publish.contact_sheets import sheet
+from data.publish.contact_sheets import draw_sheet
+from data.publish.examples import ExampleRows
 from data.records import Rationale
 from data.store import Store, write_atomically
 from teacher.predicates import extract_predicates
@@ -46,12 +46,12 @@ def write_page(
     `seed` chooses them."""
     chosen = np.random.default_rng(seed).permutation(len(accepted))[:shown]
     items = {item.item_id: item for item in store.selection("train")}
-    look = Looker(store)
+    look = ExampleRows(store)
     body = []
     for k in sorted(chosen.tolist()):
         rationale = accepted[k]
         item = items[rationale.item_id]
-        write_atomically(folder / "shown" / f"{item.item_id}.png", sheet([look.item(item)]))
+        write_atomically(folder / "shown" / f"{item.item_id}.png", draw_sheet([look.item(item)]))
         predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
         facts = json.dumps(predicates.to_dict() if predicates else None, indent=1)
         body.append(_article(rationale, facts))

@@ -1,4 +1,4 @@
-"""What a gallery shows is what the benchmark asks."""
+"""A gallery shows the benchmark's items and queries as the store holds them."""
 
 from __future__ import annotations
 
@@ -10,102 +10,115 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data.gallery import Looker, page, sheets
-from data.publish.contact_sheets import BREAK, CELL, GAP, MARGIN, RADIUS, _seen_floor, paths, sheet
+from data.publish.contact_sheets import draw_sheet
+from data.publish.examples import ExampleRows
+from data.publish.gallery import draw_sheets, render_page
+from data.publish.trajectories import draw_trajectories, visible_floor
 from data.records import LETTERS
 from data.render.frame_cache import FrameReader
 from data.store import Store
 from data.world.camera import Camera
 from data.world.displacement import cross_scene_displacement
+from data.world.shapes import RADIUS
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def drawn(micro_store: Store) -> list:
-    return list(sheets(micro_store, examples=1, seed=0))
+def sheets(micro_store: Store) -> list:
+    return list(draw_sheets(micro_store, examples=1, seed=0))
 
 
-def test_every_cell_and_builder_has_a_sheet(micro_store, drawn) -> None:
-    files = [s.file for s in drawn]
+def test_every_cell_and_builder_has_a_sheet(micro_store, sheets) -> None:
+    files = [s.file for s in sheets]
     assert len(files) == len(set(files))
-    asked = {f"{i.family}-{i.subtype}.png" for i in micro_store.selection()}
-    asked |= {f"retrieval-builder-{q.builder}.png" for q in micro_store.retrieval()}
-    others = {"counterfactual.png", "paths.png", "controls-matched_anchor.png"}
-    assert set(files) == asked | others
+    expected = {f"{i.family}-{i.subtype}.png" for i in micro_store.selection()}
+    expected |= {f"retrieval-builder-{q.builder}.png" for q in micro_store.retrieval()}
+    expected |= {"counterfactual.png", "trajectories.png", "controls-matched_anchor.png"}
+    assert set(files) == expected
 
 
-def test_a_seed_gives_the_same_sheets_and_another_seed_others(micro_store, drawn) -> None:
-    again = list(islice(sheets(micro_store, examples=1, seed=0), 9))
-    other = list(islice(sheets(micro_store, examples=1, seed=1), 9))
-    assert again == drawn[:9]
-    assert [s.file for s in other] == [s.file for s in again]
-    assert other != again
+def test_the_seed_determines_the_sheets(micro_store, sheets) -> None:
+    same = list(islice(draw_sheets(micro_store, examples=1, seed=0), 9))
+    other = list(islice(draw_sheets(micro_store, examples=1, seed=1), 9))
+    assert same == sheets[:9]
+    assert [s.file for s in other] == [s.file for s in same]
+    assert other != same
 
 
-def test_an_item_is_shown_with_its_answer_and_its_displacements(micro_store) -> None:
-    look, frames = Looker(micro_store), FrameReader(micro_store)
+def test_an_item_row_has_its_candidates_answer_and_displacements(micro_store) -> None:
+    rows, frames = ExampleRows(micro_store), FrameReader(micro_store)
     for item in micro_store.selection("test")[::7]:
-        row = look.item(item)
-        assert "".join(c.letter for c in row.others) == LETTERS
-        assert [c.right for c in row.others].index(True) == item.answer
-        assert sum(c.right for c in row.others) == 1
-        for cell, candidate in zip(row.others, item.candidates, strict=True):
+        row = rows.item(item)
+        assert [c.is_answer for c in row.candidates] == [k == item.answer for k in range(4)]
+        for letter, cell, candidate in zip(LETTERS, row.candidates, item.candidates, strict=True):
             assert np.array_equal(cell.image, frames.array(candidate.scene_id, candidate.frame))
-            assert cell.caption[0] == candidate.source
-        least = min(float(c.caption[1].split(" px")[0].split()[-1]) for c in row.others)
+            assert cell.caption[0] == f"{letter}: {candidate.source}"
+        least = min(float(c.caption[1].split(" px")[0].split()[-1]) for c in row.candidates)
         assert least == round(item.min_displacement)
-        assert row.observed[0].caption == (f"frame {item.prefix_start}",)
-        assert row.observed[-1].caption == (f"frame {item.prefix_stop}",)
+        assert row.prefix[0].caption == (f"frame {item.prefix_start}",)
+        assert row.prefix[-1].caption == (f"frame {item.prefix_stop}",)
 
 
-def test_axes_that_do_not_apply_are_not_told(micro_store) -> None:
-    look = Looker(micro_store)
-    about = {i.family: look.item(i).about for i in micro_store.selection("test")}
-    assert "framing" in about["event"]
-    assert "group" in about["window"]
-    assert not any("None" in text for text in about.values())
-    assert "framing" not in about["window"]
+def test_a_heading_names_only_the_axes_that_apply(micro_store) -> None:
+    rows = ExampleRows(micro_store)
+    details = {i.family: rows.item(i).details for i in micro_store.selection("test")}
+    assert "framing" in details["event"]
+    assert "group" in details["window"]
+    assert not any("None" in text for text in details.values())
+    assert "framing" not in details["window"]
 
 
-def test_a_counterfactual_pair_shows_one_moment_with_and_without(micro_store) -> None:
-    look, frames = Looker(micro_store), FrameReader(micro_store)
+def test_a_counterfactual_row_shows_one_moment_with_and_without_the_object(micro_store) -> None:
+    rows, frames = ExampleRows(micro_store), FrameReader(micro_store)
     for query in micro_store.retrieval(pool="counterfactual"):
-        row = look.absence(query)
-        factual, target = row.others[:2]
+        row = rows.counterfactual(query)
+        factual, target = row.candidates[:2]
         frame = query.target.frame
         assert np.array_equal(factual.image, frames.array(query.scene_id, frame))
         assert np.array_equal(target.image, frames.array(query.target.scene_id, frame))
-        assert (factual.right, target.right) == (False, True)
-        assert query.removed_object in row.about
-        # The ring is where the object's own colour is missing from the other scene.
+        assert (factual.is_answer, target.is_answer) == (False, True)
+        assert query.removed_object in row.details
         scene = micro_store.scene(query.scene_id)
         removed = [o.phrase for o in scene.objects].index(query.removed_object)
-        x, y = scene.image_positions[frame, removed]
-        assert factual.ring == pytest.approx((x / 480, y / 320))
+        share = scene.image_positions[frame, removed] / scene.image_size
+        assert factual.ring == pytest.approx(share * factual.image.size)
         assert target.ring is None
 
 
-def test_an_answer_is_framed_in_green(micro_store) -> None:
+def test_the_answer_has_a_green_frame(micro_store) -> None:
     item = micro_store.selection("test")[0]
-    picture = np.asarray(Image.open(io.BytesIO(sheet([Looker(micro_store).item(item)]))))
-    green = (picture == (26, 127, 55)).all(-1)
-    across = np.flatnonzero(green.any(0))
-    left = MARGIN + (4 + item.answer) * (CELL + GAP) + BREAK
-    assert across.min() == left - 4
-    assert left + CELL <= across.max() <= left + CELL + 4
+    row = ExampleRows(micro_store).item(item)
+    sheet = np.asarray(Image.open(io.BytesIO(draw_sheet([row]))).convert("RGB"))
+    columns = np.flatnonzero((sheet == (26, 127, 55)).all(-1).any(0)) / sheet.shape[1]
+    # Eight frames, the last four after a gap: the answer's column is the only green one.
+    expected = (4 + item.answer + 0.5) / 8
+    assert columns.min() < expected < columns.max()
+    assert columns.max() - columns.min() < 1 / 7
 
 
-def test_the_floor_that_is_drawn_is_what_the_camera_sees() -> None:
-    corners = _seen_floor()
+def test_a_ring_outside_the_image_does_not_change_its_scale(micro_store) -> None:
+    """An object that leaves the image has its ring outside, where it is cut off."""
+    from matplotlib.figure import Figure
+
+    from data.publish.contact_sheets import Cell, draw_cell
+
+    axes = Figure().subplots()
+    draw_cell(axes, Cell(Image.new("RGB", (48, 32)), ("frame 0",), ring=(300.0, -90.0)))
+    assert axes.get_xlim() == (-0.5, 47.5)
+    assert axes.get_ylim() == (31.5, -0.5)
+
+
+def test_the_drawn_floor_is_what_the_camera_sees() -> None:
+    corners = visible_floor()
     points = np.column_stack([corners[:, 1], corners[:, 0], np.full(4, RADIUS)])
-    seen, _ = Camera().project(points)
-    assert seen == pytest.approx(np.array([[0, 0], [480, 0], [480, 320], [0, 320]]), abs=1e-6)
+    projected, _ = Camera().project(points)
+    assert projected == pytest.approx(np.array([[0, 0], [480, 0], [480, 320], [0, 320]]), abs=1e-6)
 
 
-def test_paths_of_any_number_of_scenes_are_drawn(micro_store) -> None:
+def test_trajectories_of_any_number_of_scenes_are_drawn(micro_store) -> None:
     scenes = [micro_store.scene(name) for name in micro_store.scene_ids("train")]
-    sizes = [Image.open(io.BytesIO(paths(scenes[:n]))).size for n in (1, 3, 4)]
+    sizes = [Image.open(io.BytesIO(draw_trajectories(scenes[:n]))).size for n in (1, 3, 4)]
     assert sizes[0] == sizes[1]
     assert sizes[2][1] == 2 * sizes[1][1]
 
@@ -121,19 +134,19 @@ class Links(HTMLParser):
                 self.found[name].append(value)
 
 
-def test_the_page_links_every_sheet_once_and_nothing_outside(micro_store, drawn) -> None:
+def test_the_page_links_every_sheet_once_and_nothing_else(micro_store, sheets) -> None:
     links = Links()
-    links.feed(page(micro_store, [(s.section, s.title, s.file) for s in drawn]))
-    assert links.found["src"] == [s.file for s in drawn]
+    links.feed(render_page(micro_store, [(s.section, s.title, s.file) for s in sheets]))
+    assert links.found["src"] == [s.file for s in sheets]
     inside = [f"#{name}" for name in links.found["id"]]
     assert sorted(links.found["href"]) == sorted(inside + links.found["src"])
-    assert len(set(links.found["id"])) == len(drawn)
+    assert len(set(links.found["id"])) == len(sheets)
 
 
-def test_displacements_on_a_sheet_are_the_geometrys(micro_store) -> None:
+def test_captions_give_displacements_from_the_target(micro_store) -> None:
     query = micro_store.retrieval("test")[0]
     scene = micro_store.scene(query.scene_id)
-    for cell, frame in zip(Looker(micro_store).query(query).others[1:], query.hard_negatives,
-                           strict=True):  # fmt: skip
+    cells = ExampleRows(micro_store).query(query).candidates[1:]
+    for cell, frame in zip(cells, query.hard_negatives, strict=True):
         away = cross_scene_displacement(scene, query.target.frame, scene, frame.frame)
-        assert f"{away:.0f} px off" in cell.caption[1]
+        assert f"{away:.0f} px away" in cell.caption[1]
