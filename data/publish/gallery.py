@@ -15,7 +15,7 @@ from data.publish.trajectories import draw_trajectories
 from data.records import FAMILIES, SPLITS
 from data.store import Store
 from data.tracks.controls import MATCHED_ANCHOR, pair_items
-from data.tracks.selection.distractors import cell_rng
+from data.tracks.quota import named_rng
 
 TEMPLATE = "templates/gallery.html"
 
@@ -71,7 +71,7 @@ def _group(records: Iterable[Any], field: str) -> dict[Any, list[Any]]:
 
 
 def _sample(population: Sequence[Any], count: int, seed: int, name: str) -> list[Any]:
-    sample = cell_rng(seed, "gallery", name).permutation(len(population))[:count]
+    sample = named_rng(seed, "gallery", name).permutation(len(population))[:count]
     return [population[k] for k in sorted(sample)]
 
 
