@@ -1,46 +1,68 @@
-"""What `--help` prints: the presets to choose from, and every key with its value and meaning."""
+"""The text of `--help`: the presets of a command, and every key with its value and description."""
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
+import shutil
 import sys
+import textwrap
+from collections.abc import Iterator
+from dataclasses import asdict, fields, is_dataclass
+from functools import cache
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from conf.compose import OVERLAYS, compose, options
-from conf.keys import description, keys
+
+COLUMN = 46
+"""Column at which descriptions begin."""
 
 
 def help_text(command: str, schema: type, overrides: list[str]) -> str:
-    """The help of a command, with the values that `overrides` lead to. Raises SettingsError."""
-    settings = OmegaConf.structured(compose(command, schema, overrides))
+    """Help of a command, with the values that `overrides` result in. Raises SettingsError."""
+    settings = compose(command, schema, overrides)
     purpose = (sys.modules["__main__"].__doc__ or "").strip()
-    lines = [f"python -m {command} [KEY=VALUE ...]", "", *([purpose, ""] if purpose else [])]
     groups = options(command, schema)
-    lines += ["Presets, chosen as GROUP=NAME:"]
-    lines += [f"  {g}: {', '.join(groups[g])}" for g in groups if g not in OVERLAYS]
+    presets = [f"  {g}: {', '.join(groups[g])}" for g in groups if g not in OVERLAYS]
     overlays = [f"  {g}: {', '.join(groups[g])}" for g in groups if g in OVERLAYS]
-    lines += ["Overlays, laid over as +GROUP=NAME:", *overlays] if overlays else []
-    lines += ["", "Settings, changed as KEY=VALUE, or as KEY=VALUE,VALUE with -m for a sweep:"]
-    lines += [_line(schema, settings, key) for key in keys(schema) if _is_leaf(settings, key)]
-    lines += ["", "-m runs a sweep, one process a job; --cfg job prints the settings and ends."]
+    lines = [f"python -m {command} [KEY=VALUE ...]", "", *([purpose, ""] if purpose else [])]
+    lines += ["Presets, chosen with GROUP=NAME:", *presets, ""] if presets else []
+    lines += ["Overlays, added with +GROUP=NAME:", *overlays, ""] if overlays else []
+    lines += ["Settings, set with KEY=VALUE; with -m, KEY=VALUE,VALUE sweeps over values:"]
+    lines += _setting_lines(settings)
+    lines += ["", "-m runs a sweep, one process per job; --cfg job prints the settings and exits."]
     return "\n".join(lines)
 
 
-def _is_leaf(settings: Any, key: str) -> bool:
-    parent = OmegaConf.select(settings, key.rpartition(".")[0]) if "." in key else settings
-    if parent is None:
-        return False
-    value = OmegaConf.select(settings, key)
-    return not OmegaConf.is_dict(value) or OmegaConf.get_type(value) is dict
+def _setting_lines(settings: Any, group: str = "") -> Iterator[str]:
+    width = max(100, shutil.get_terminal_size().columns) - COLUMN
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if is_dataclass(value):
+            yield from _setting_lines(value, f"{group}{field.name}.")
+            continue
+        shown = textwrap.shorten(json.dumps(value, default=asdict), 60, placeholder=" ...")
+        first, *rest = textwrap.wrap(_description(type(settings), field.name), width) or [""]
+        yield f"{f'  {group}{field.name} = {shown}':<{COLUMN - 2}}  {first}".rstrip()
+        yield from (f"{'':<{COLUMN}}{line}" for line in rest)
 
 
-def _line(schema: type, settings: Any, key: str) -> str:
-    value = OmegaConf.select(settings, key)
-    shown = json.dumps(OmegaConf.to_container(value) if OmegaConf.is_config(value) else value)
-    if len(shown) > 60:
-        shown = shown[:57] + "..."
-    text = f"  {key} = {shown}"
-    said = description(schema, key)
-    return f"{text:<44}  {said}".rstrip()
+def _description(schema: type, name: str) -> str:
+    """The docstring below a field, from the class or the base class that has one."""
+    schemas = [kind for kind in schema.__mro__ if is_dataclass(kind)]
+    return next((text for kind in schemas if (text := _docstrings(kind).get(name))), "")
+
+
+@cache
+def _docstrings(schema: type) -> dict[str, str]:
+    """The docstrings of a dataclass's own fields, each on one line."""
+    [node] = ast.parse(textwrap.dedent(inspect.getsource(schema))).body
+    assert isinstance(node, ast.ClassDef)
+    return {
+        line.target.id: " ".join(text.split())
+        for line, below in zip(node.body, node.body[1:], strict=False)
+        if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)
+        if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+        if isinstance(text := below.value.value, str)
+    }

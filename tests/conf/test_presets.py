@@ -1,4 +1,4 @@
-"""Every yaml file composes, by the command that its first comment names."""
+"""Every yaml file composes with the command in its first comment."""
 
 import shlex
 from importlib.resources import files
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from conf import schema
-from conf.compose import compose, options, short
+from conf.compose import compose, config_name, options
 from conf.errors import SettingsError
 from data.tracks.selection.window import CELLS
 
@@ -43,7 +43,7 @@ def settings(line: str):
 @pytest.mark.parametrize(
     "path", sorted(CONF.rglob("*.yaml")), ids=lambda p: str(p.relative_to(CONF))
 )
-def test_a_file_names_a_command_that_composes_it(path):
+def test_first_comment_is_a_command_that_composes_the_file(path):
     lines = path.read_text().splitlines()
     line = lines[1] if lines[0].startswith("# @package") else lines[0]
     assert line.startswith("# python -m ")
@@ -53,11 +53,11 @@ def test_a_file_names_a_command_that_composes_it(path):
         assert f"+{group}={path.stem}" in line
         assert ("--multirun" in line) == (group == "sweep")
     elif path.parent == CONF and path.stem != "run_folder":
-        assert line == f"# python -m {next(c for c in SCHEMAS if short(c) == path.stem)}"
+        assert line == f"# python -m {next(c for c in SCHEMAS if config_name(c) == path.stem)}"
 
 
 @pytest.mark.parametrize("command", ["train.sft", "train.contrastive"])
-def test_a_command_offers_the_overlays_that_compose_there(command):
+def test_help_lists_the_overlays_that_compose(command):
     def composes(overlay: str) -> bool:
         try:
             compose(command, SCHEMAS[command], [f"+exp={overlay}"])
@@ -65,13 +65,11 @@ def test_a_command_offers_the_overlays_that_compose_there(command):
             return False
         return True
 
-    offered = options(command, SCHEMAS[command])["exp"]
-    assert offered == [
-        path.stem for path in sorted((CONF / "exp").iterdir()) if composes(path.stem)
-    ]
+    overlays = [path.stem for path in sorted((CONF / "exp").iterdir())]
+    assert options(command, SCHEMAS[command])["exp"] == list(filter(composes, overlays))
 
 
-def test_a_student_brings_its_recipe():
+def test_student_preset_sets_its_training_recipe():
     tiny = settings("python -m train.sft")
     paper = settings("python -m train.sft student=qwen3_vl_8b")
     assert (tiny.train.lr, tiny.train.batch, tiny.train.micro_batch) == (2e-3, 16, 4)
@@ -86,7 +84,7 @@ def test_a_student_brings_its_recipe():
     )
 
 
-def test_a_teacher_may_be_on_several_servers():
+def test_teacher_takes_one_server_or_several():
     command = "python -m teacher.narrate teacher=qwen3_32b"
     one = settings(command).teacher
     several = settings(f"{command} teacher.url=[http://a:8000/v1,https://b/v1]").teacher
@@ -95,7 +93,7 @@ def test_a_teacher_may_be_on_several_servers():
     assert settings("python -m teacher.narrate").teacher.urls == []
 
 
-def test_a_typed_value_and_an_overlay_win_over_a_recipe():
+def test_overrides_and_overlays_replace_the_recipe():
     assert settings("python -m train.sft student=qwen3_vl_8b train.lr=3e-4").train.lr == 3e-4
     base = settings("python -m train.sft +exp=base")
     assert base.student.name == "tiny_scratch"
@@ -104,7 +102,7 @@ def test_a_typed_value_and_an_overlay_win_over_a_recipe():
     assert base.train.regime == "describe"
 
 
-def test_a_retriever_brings_its_recipe():
+def test_retriever_preset_sets_its_training_recipe():
     tiny = settings("python -m train.contrastive")
     paper = settings("python -m train.contrastive retriever=qwen3_vl_emb_8b")
     assert (tiny.train.batch, tiny.train.lr, tiny.retriever.widths[0]) == (64, 1.5e-3, 128)
@@ -123,7 +121,7 @@ def test_a_window_group_quota_is_divided_among_its_cells():
     assert list(window) == list(CELLS)
 
 
-def test_the_paper_quotas_add_up():
+def test_quotas_add_up_to_the_papers_totals():
     benchmark = settings("python -m data.build benchmark=dynapix").benchmark
     track = benchmark.selection
     # (train, test) of the paper's tables; by group and family it gives the test items alone.

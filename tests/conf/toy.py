@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 @dataclass
 class ToyCommand(CommandConfig):
     x: float = 1.0
-    """How much."""
+    """Number to square."""
     end: str = "well"
     teacher: TeacherConfig = field(default_factory=TeacherConfig)
 
@@ -34,7 +34,7 @@ def main(cfg: ToyCommand, run: Run) -> dict[str, float]:
         log.info("sees GPU %s", gpu)
     match cfg.end:
         case "mistake":
-            raise UserError("this end is a mistake: set end=well")
+            raise UserError("this end is a mistake: set end=well", code="toy-mistake")
         case "bug":
             raise ValueError("a bug")
         case "disk":

@@ -22,7 +22,7 @@ from transformers import (
 )
 
 from conf.entry import Run
-from conf.errors import SettingsError, UserError
+from conf.errors import UserError
 from conf.runs import lock_folder, open_run
 from conf.schema import (
     LoraConfig,
@@ -64,7 +64,7 @@ def of_rank(settings: SftCommand, rank: int) -> SftCommand:
 @pytest.mark.slow
 def test_adapters_of_another_rank_are_told(settings, trained, tmp_path) -> None:
     other = of_rank(settings, 8)
-    with pytest.raises(SettingsError, match=r"student\.lora\.rank is 4 there and 8 now"):
+    with raises_user_error("other-settings", contains="student.lora.rank was 4 and is now 8"):
         open_run(Run("trained", trained), asdict(other), "train.sft", [])
     with pytest.raises(UserError, match=r"student holds adapters of rank 4, and student\.lora"):
         loading.load_trained(other.student, "fp32", trained / "student")

@@ -1,0 +1,97 @@
+"""End a command after an error: one sentence for a mistake, a traceback for a bug."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import re
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NoReturn
+
+from conf.errors import SettingsError, UserError
+from conf.runs import rank, world_size
+
+MAIN_RANK_GRACE = 3.0
+"""Time (s) for the main rank to print an error before another rank does."""
+PEER_ENDED = r"gloo.*(by peer|[Bb]roken pipe)"
+"""Error of a rank that waits for the others after one of them has ended."""
+FULL_DISK_BYTES = 1 << 20
+"""Free space below which a disk counts as full."""
+WRITE_ERRORS = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EEXIST,
+    errno.ENAMETOOLONG,
+)
+
+
+@contextmanager
+def report_failures(folder: str = ".") -> Iterator[None]:
+    """Print a UserError, an interruption or a failed write as one sentence and exit.
+
+    Any other exception is a bug and keeps its traceback. With several ranks, one rank prints.
+
+    Args:
+        folder: The folder that the block writes to. Some libraries raise their own errors when its
+            disk is full.
+    """
+    try:
+        yield
+    except UserError as error:
+        lines = [f"error: {line}  [{error.code}]" for line in str(error).splitlines()]
+        _exit(2 if isinstance(error, SettingsError) else 1, "\n".join(lines))
+    except KeyboardInterrupt:
+        _exit(130, "interrupted; run the same command again to resume")
+    except OSError as error:
+        if error.errno not in WRITE_ERRORS:
+            raise
+        _exit_after_failed_write(str(error.filename or folder), str(error.strerror))
+    except Exception as error:
+        if world_size() > 1 and re.search(PEER_ENDED, str(error)):
+            _end_process(1)
+        if not _is_disk_full(folder):
+            raise
+        _exit_after_failed_write(folder, os.strerror(errno.ENOSPC))
+
+
+def _exit_after_failed_write(path: str, reason: str) -> NoReturn:
+    hint = "fix this and run the same command again to resume"
+    _exit(1, f"error: {path}: {reason}; {hint}  [write-failed]")
+
+
+def _exit(status: int, message: str) -> NoReturn:
+    """Print a message and exit, on the main rank first.
+
+    An error that all ranks share is printed by the main rank, whose exit makes the launcher end the
+    others; an error of a single other rank is printed after a delay.
+    """
+    if rank() != 0:
+        time.sleep(MAIN_RANK_GRACE)
+        # The progress bar of the main rank has not ended its line.
+        print(file=sys.stderr)
+    print(message, file=sys.stderr)
+    _end_process(status)
+
+
+def _end_process(status: int) -> NoReturn:
+    if world_size() > 1:
+        # A normal exit waits for messages of other ranks, which wait for this one.
+        logging.shutdown()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
+
+
+def _is_disk_full(folder: str) -> bool:
+    return os.path.exists(folder) and shutil.disk_usage(folder).free < FULL_DISK_BYTES
