@@ -13,45 +13,43 @@ from evaluation.metrics.intervals import Interval, wilson_interval
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy by family, in the order event, time, window; a family without items is left out."""
+    """Accuracy of each family that has items, in the order event, time, window."""
 
     families: dict[str, Interval]
     macro: float
     micro: Interval
 
 
-def accuracy_by_group(groups: Sequence[str], correct: Sequence[float]) -> dict[str, Interval]:
-    """Accuracy of each group of items, in order of name.
+def accuracy_by_group(groups: Sequence[str], credits: Sequence[float]) -> dict[str, Interval]:
+    """Return the accuracy of each group of items, in order of name, with Wilson intervals.
 
     Args:
-        groups: a name an item: its family, subtype or horizon.
-        correct: its credit, a bool or the 1/m of a tie among m.
+        groups: One name per item, such as its family, subtype or horizon.
+        credits: One credit per item: a bool, or the 1/m of a tie among m candidates.
 
     Raises:
-        ValueError: not one credit an item.
+        ValueError: The arguments differ in length.
     """
-    groups, correct = np.asarray(groups, str), np.asarray(correct, float)
-    if groups.shape != correct.shape:
-        raise ValueError(f"{len(groups)} groups for {len(correct)} items")
-    return {str(g): _interval(correct[groups == g]) for g in np.unique(groups)}
+    groups, credits = np.asarray(groups, str), np.asarray(credits, float)
+    if groups.shape != credits.shape:
+        raise ValueError(f"{len(groups)} groups for {len(credits)} items")
+    return {str(g): _accuracy(credits[groups == g]) for g in np.unique(groups)}
 
 
-def accuracy_by_family(families: Sequence[str], correct: Sequence[float]) -> Accuracy:
-    """Accuracy by family, their plain mean (macro) over the families present, and over all items
-    (micro).
+def accuracy_by_family(families: Sequence[str], credits: Sequence[float]) -> Accuracy:
+    """Return the accuracy by family, their plain mean (macro) and that of all items (micro).
 
     Raises:
-        ValueError: no items, not one credit an item, or a family that does not exist.
+        ValueError: There are no items, the arguments differ in length, or a family is unknown.
     """
-    found = accuracy_by_group(families, correct)
-    if not found or set(found) - set(FAMILIES):
-        raise ValueError(f"families {sorted(found)}: expected some of {', '.join(FAMILIES)}")
-    ordered = {f: found[f] for f in FAMILIES if f in found}
+    by_family = accuracy_by_group(families, credits)
+    if not by_family or set(by_family) - set(FAMILIES):
+        raise ValueError(f"families {sorted(by_family)}: expected some of {', '.join(FAMILIES)}")
+    ordered = {f: by_family[f] for f in FAMILIES if f in by_family}
     macro = float(np.mean([i.value for i in ordered.values()]))
-    return Accuracy(ordered, macro, _interval(np.asarray(correct, float)))
+    return Accuracy(ordered, macro, _accuracy(np.asarray(credits, float)))
 
 
-def _interval(correct: np.ndarray) -> Interval:
-    return Interval(
-        float(correct.mean()), *wilson_interval(float(correct.sum()), len(correct)), len(correct)
-    )
+def _accuracy(credits: np.ndarray) -> Interval:
+    low, high = wilson_interval(float(credits.sum()), len(credits))
+    return Interval(float(credits.mean()), low, high, len(credits))

@@ -1,4 +1,4 @@
-"""Whether a model is as often right as it says, and whether it favours a position."""
+"""Calibration of reported confidences, and preference for a candidate's position."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from data.records import LETTERS
 from evaluation.metrics.intervals import Interval, wilson_interval
 
 BINS = 10
-"""Bins of equal width that confidences are sorted into."""
+"""Confidence bins of equal width."""
 
 
 @dataclass(frozen=True)
 class Bin:
-    """Answers whose confidence lies from `low` up to `high` (the last bin holds 1): their mean
-    confidence, and how many are right."""
+    """Mean confidence and accuracy of the answers with a confidence in [low, high).
+
+    The last bin includes 1.
+    """
 
     low: float
     high: float
@@ -28,9 +30,14 @@ class Bin:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Of `n` answers: the expected calibration error, the bins' gaps between confidence and
-    accuracy weighed by their answers; the Brier score, the mean squared gap of each; and the bins
-    that hold any."""
+    """Calibration of `n` answers.
+
+    Attributes:
+        ece: Expected calibration error, the mean gap between confidence and accuracy of the bins,
+            weighted by their answers.
+        brier: Brier score, the mean squared gap of the answers.
+        bins: The bins with answers.
+    """
 
     ece: float
     brier: float
@@ -38,45 +45,50 @@ class Calibration:
     bins: list[Bin]
 
     @classmethod
-    def from_dict(cls, told: dict[str, Any]) -> Calibration:
-        bins = [Bin(**{**b, "accuracy": Interval(**b["accuracy"])}) for b in told["bins"]]
-        return cls(**{**told, "bins": bins})
+    def from_dict(cls, values: dict[str, Any]) -> Calibration:
+        bins = [Bin(**{**b, "accuracy": Interval(**b["accuracy"])}) for b in values["bins"]]
+        return cls(**{**values, "bins": bins})
 
 
 def measure_calibration(
     confidence: Sequence[float], correct: Sequence[float]
 ) -> Calibration | None:
-    """How reported confidences go with what is right; None of no answers.
+    """Compare reported confidences with correctness; None without answers.
 
     Args:
-        confidence: of each answer, from 0 to 1.
-        correct: whether it is right.
+        confidence: Each answer's confidence, from 0 to 1.
+        correct: Whether each answer is right.
 
     Raises:
-        ValueError: not one confidence an answer, or one that is no share.
+        ValueError: The arguments differ in length, or a confidence is not from 0 to 1.
     """
-    told, right = np.asarray(confidence, float), np.asarray(correct, float)
-    if told.shape != right.shape or not ((told >= 0) & (told <= 1)).all():
-        raise ValueError(f"{len(told)} confidences from 0 to 1 for {len(right)} answers")
-    if not len(told):
+    confidence, correct = np.asarray(confidence, float), np.asarray(correct, float)
+    if confidence.shape != correct.shape or not ((confidence >= 0) & (confidence <= 1)).all():
+        raise ValueError(f"{len(confidence)} confidences from 0 to 1 for {len(correct)} answers")
+    if not len(confidence):
         return None
-    of = np.minimum((told * BINS).astype(int), BINS - 1)
+    bin_of = np.minimum((confidence * BINS).astype(int), BINS - 1)
     bins = []
-    for k in np.unique(of):
-        mean, hits = told[of == k].mean(), right[of == k]
+    for k in np.unique(bin_of):
+        mean, hits = confidence[bin_of == k].mean(), correct[bin_of == k]
         accuracy = Interval(hits.mean(), *wilson_interval(hits.sum(), len(hits)), len(hits))
         bins.append(Bin(float(k / BINS), float((k + 1) / BINS), float(mean), accuracy))
     gaps = [b.accuracy.n * abs(b.confidence - b.accuracy.value) for b in bins]
-    brier = float(((told - right) ** 2).mean())
-    return Calibration(float(sum(gaps) / len(told)), brier, len(told), bins)
+    brier = float(((confidence - correct) ** 2).mean())
+    return Calibration(float(sum(gaps) / len(confidence)), brier, len(confidence), bins)
 
 
 @dataclass(frozen=True)
 class PositionBias:
-    """Which letters a model chose and which were right, as counts in their order, and how often it
-    was right where each was; of all items, those without a choice among them. `chi_square` and `p`
-    hold what it chose against how often each was right: a small p says that it favours a position.
-    Both are None without a choice, or where a letter is never right."""
+    """Chosen letters against correct ones.
+
+    Attributes:
+        chosen, right: How often each letter was chosen, and was correct.
+        hits: How often the model was right where each letter was correct.
+        chi_square, p: Test of the chosen letters against the frequencies of the correct ones; a
+            small p means that the model prefers a position. None without a choice, or if a letter
+            is never correct.
+    """
 
     chosen: dict[str, int]
     right: dict[str, int]
@@ -86,19 +98,19 @@ class PositionBias:
 
 
 def measure_position_bias(chosen: Sequence[str | None], right: Sequence[str]) -> PositionBias:
-    """How a model's letters go with the right ones, an item each.
+    """Compare a model's letters, None for items without one, with the correct letters.
 
     Raises:
-        ValueError: not one choice an item.
+        ValueError: The arguments differ in length.
     """
     from scipy.stats import chisquare
 
     pairs = list(zip(chosen, right, strict=True))
-    own = [c for c, _ in pairs if c is not None]
-    mine, theirs = ({x: letters.count(x) for x in LETTERS} for letters in (own, list(right)))
+    made = [letter for letter, _ in pairs if letter is not None]
+    observed, truth = ({x: letters.count(x) for x in LETTERS} for letters in (made, list(right)))
     hits = {x: sum(c == r == x for c, r in pairs) for x in LETTERS}
-    if not own or not all(theirs.values()):
-        return PositionBias(mine, theirs, hits, None, None)
-    expected = np.array([theirs[x] for x in LETTERS]) * len(own) / len(pairs)
-    test = chisquare([mine[x] for x in LETTERS], expected)
-    return PositionBias(mine, theirs, hits, float(test.statistic), float(test.pvalue))
+    if not made or not all(truth.values()):
+        return PositionBias(observed, truth, hits, None, None)
+    expected = np.array([truth[x] for x in LETTERS]) * len(made) / len(pairs)
+    test = chisquare([observed[x] for x in LETTERS], expected)
+    return PositionBias(observed, truth, hits, float(test.statistic), float(test.pvalue))

@@ -1,4 +1,4 @@
-"""How far two ways of answering the same items are apart, item by item."""
+"""Paired comparison of two runs over the same items."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ from data.tracks.controls import pair_items
 from evaluation.metrics.intervals import macro_by_scene
 
 NAMED = 3
-"""Items that are named of those that one side alone answered."""
+"""Items of a difference that an error lists."""
 
 
 @dataclass(frozen=True)
 class PairedComparison:
-    """Two ways of answering the same `n` items, called `left` and `right`; in shares.
+    """Two runs over the same `n` items, called `left` and `right`; all numbers are shares.
 
-    `of` says which items: those of a family, or all. `difference` is the left accuracy less the
-    right one, with its 95% interval from `low` to `high` when whole scenes are drawn again.
-    `only_left` items are right the left way alone and `only_right` the right way alone (of ties,
-    those with more credit that way); `p` is McNemar's exact test of these two counts. Of "macro",
-    the plain mean of the families, nothing is counted and these three are None.
+    Attributes:
+        of: The items: a family's, "macro" for the plain mean of the families, or "all".
+        difference: Left accuracy less right accuracy, with its 95% interval from `low` to `high`
+            by resampling scenes.
+        only_left, only_right: Items that are right on one side only (of ties, those with more
+            credit on that side). None for "macro".
+        p: McNemar's exact test of these two counts. None for "macro".
     """
 
     left: str
@@ -48,17 +50,16 @@ def compare_runs(
     names: tuple[str, str],
     seed: int,
 ) -> list[PairedComparison]:
-    """Hold two runs against each other on items that both answered: by family and their macro,
-    where there are several, and over all.
+    """Compare two runs by family and macro, if there are several families, and over all items.
 
     Args:
-        left, right: the credit of each item by its id, such as whether it was answered right.
-        names: what the runs are called.
-        seed: of the scenes that are drawn for the intervals.
+        left, right: The credit of each item by its id, such as whether it was answered right.
+        names: What the runs are called.
+        seed: Seed of the scene resampling for the intervals.
 
     Raises:
-        UserError: one answered items that the other did not.
-        KeyError: neither answered one of `items`.
+        UserError: The runs answered different items.
+        KeyError: Neither answered one of `items`.
     """
     check_same_items(left, right, names)
     credits = np.array([(left[i.item_id], right[i.item_id]) for i in items], float)
@@ -66,19 +67,21 @@ def compare_runs(
     scenes = np.array([i.scene_id for i in items])
     groups = {f: families == f for f in FAMILIES if f in families}
     groups = {**groups, "macro": slice(None)} if len(groups) > 1 else {}
-    found = [
-        _paired(names, of, credits[kept], families[kept], scenes[kept], seed)
+    compared = [
+        _compare(names, of, credits[kept], families[kept], scenes[kept], seed)
         for of, kept in groups.items()
     ]
     together = np.full(len(items), "all")
-    return [*found, _paired(names, "all", credits, together, scenes, seed)]
+    return [*compared, _compare(names, "all", credits, together, scenes, seed)]
 
 
 def compare_anchors(
     items: Sequence[SelectionItem], credits: Mapping[str, float], seed: int
 ) -> list[PairedComparison]:
-    """Hold the two questions of matched-anchor pairs against each other, that which names the event
-    (left) and that which names the time (right); `credits` is each item's by its id."""
+    """Compare the two questions of matched-anchor pairs: event (left) against time (right).
+
+    `credits` has each item's credit by its id.
+    """
     matched = pair_items(items)
     left = {by_event.item_id: credits[by_event.item_id] for by_event, _ in matched}
     right = {by_event.item_id: credits[by_time.item_id] for by_event, by_time in matched}
@@ -90,22 +93,23 @@ def check_same_items(
 ) -> None:
     """
     Raises:
-        UserError: two runs did not answer the same items.
+        UserError: Two runs answered different items.
     """
-    apart = (left.keys() - right.keys(), right.keys() - left.keys())
-    told = [
+    extra = (left.keys() - right.keys(), right.keys() - left.keys())
+    differences = [
         f"{len(ids)} only in {name} (such as {', '.join(sorted(ids)[:NAMED])})"
-        for name, ids in zip(names, apart, strict=True)
+        for name, ids in zip(names, extra, strict=True)
         if ids
     ]
-    if told:
+    if differences:
         raise UserError(
-            f"{names[0]} and {names[1]} answered different items, {' and '.join(told)}: compare "
-            "runs of the same benchmark, suite, limit and seed"
+            f"{names[0]} and {names[1]} answered different items, {' and '.join(differences)}: "
+            "compare runs of the same benchmark, suite, limit and seed",
+            code="different-items",
         )
 
 
-def _paired(
+def _compare(
     names: tuple[str, str],
     of: str,
     credits: np.ndarray,
@@ -113,17 +117,19 @@ def _paired(
     scenes: np.ndarray,
     seed: int,
 ) -> PairedComparison:
-    apart = credits[:, 0] - credits[:, 1]
+    differences = credits[:, 0] - credits[:, 1]
     means = np.mean([credits[families == f].mean(axis=0) for f in np.unique(families)], axis=0)
-    found = macro_by_scene(apart, families, scenes, seed)
-    told = (*map(float, means), found.value, found.low, found.high, len(credits))
-    return PairedComparison(*names, of, *told, *(() if of == "macro" else _mcnemar(apart)))
+    mean = macro_by_scene(differences, families, scenes, seed)
+    counts = () if of == "macro" else _mcnemar(differences)
+    return PairedComparison(
+        *names, of, *map(float, means), mean.value, mean.low, mean.high, len(credits), *counts
+    )
 
 
-def _mcnemar(apart: np.ndarray) -> tuple[int, int, float]:
-    """How many differences are above 0 and how many below, and the test of these counts."""
-    # Imported here: it takes longer to load than all else that a command needs for its --help.
+def _mcnemar(differences: np.ndarray) -> tuple[int, int, float]:
+    """Return the numbers of positive and negative differences, and the test of these counts."""
+    # statsmodels takes longer to import than everything else that --help needs.
     from statsmodels.stats.contingency_tables import mcnemar
 
-    above, below = int((apart > 0).sum()), int((apart < 0).sum())
+    above, below = int((differences > 0).sum()), int((differences < 0).sum())
     return above, below, float(mcnemar([[0, above], [below, 0]], exact=True).pvalue)

@@ -31,8 +31,9 @@ from data.store import open_store
 from evaluation import retrieve
 from evaluation.embedders import base
 from evaluation.embedders.embed import EMBEDDINGS, embed_frames, embed_queries, embedders
-from evaluation.metrics.ranking import ranking_metrics, ranking_metrics_of_scores
+from evaluation.metrics.ranking import ranking_metrics
 from models.retriever import embedder
+from tests.evaluation.metrics.reference import matrix_metrics
 
 CFG = RetrieverConfig(
     name="small", widths=[64, 32], quantization="none", lora=LoraConfig(rank=0), image_size=96,
@@ -168,7 +169,7 @@ def test_one_of_many_vectors_is_measured_by_late_interaction(
     shown = model.encode_document([embedder.frame_input(f, frames) for f in database])
     gold = np.array([database.index(q.target) for q in queries])
     row = first["rows"][0]
-    plain = ranking_metrics_of_scores(model.similarity(asked, shown).numpy(), gold, [1])
+    plain = matrix_metrics(model.similarity(asked, shown).numpy(), gold, [1])
     assert row["mrr"]["value"] == pytest.approx(plain["mrr"], rel=0.01)
     assert row["bytes"] == sum(v.numel() for v in shown) * 4
     names = dict.fromkeys((row["name"], row["width"]) for row in first["rows"])

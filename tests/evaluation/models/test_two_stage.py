@@ -36,11 +36,12 @@ from evaluation import two_stage
 from evaluation.embedders.base import released_encoder
 from evaluation.embedders.embed import embed_queries, embedders, untrained_embedder
 from evaluation.metrics.breakdown import retrieval_rows
-from evaluation.metrics.ranking import query_metrics, ranking_metrics_of_scores
+from evaluation.metrics.ranking import query_metrics
 from evaluation.retrieval import text_matching
 from evaluation.retrieval.predicted_texts import ROUTES, foreseen
 from evaluation.retrieval.standard_test import load_standard_test, rank_targets
 from models import loading
+from tests.evaluation.metrics.reference import matrix_metrics
 from tests.evaluation.models import released
 from train.student import dataset
 
@@ -116,7 +117,7 @@ def test_texts_rank_by_their_scores_and_a_missing_one_is_a_miss(ranks, store, cl
     encoder = released_encoder(clip, "fp32", Path("unused"))
     scores = encoder.texts(said) @ encoder.frames(database, FrameReader(store, clip.image_size)).T
     gold = np.array([database.index(q.target) for q in queries])
-    plain = ranking_metrics_of_scores(scores, gold, [10])
+    plain = matrix_metrics(scores, gold, [10])
     row = retrieval_rows("micro", "x", found, queries, 0)[0]
     assert row.mrr.value == pytest.approx(plain["mrr"], rel=0.01)
     assert row.median_rank.value == pytest.approx(plain["median_rank"], abs=1)

@@ -31,7 +31,7 @@ from evaluation.reporting.tables import (
     selection_table,
 )
 from evaluation.retrieval.exact_search import Ranks
-from tests.evaluation.metrics.resampled import interval
+from tests.evaluation.metrics.reference import scene_interval
 from train.common.curves import curves_figure
 
 
@@ -99,7 +99,7 @@ def test_rows_are_the_metrics_of_their_queries_with_an_interval_around(ranks, qu
     scenes = [q.scene_id for q in queries]
     for name, statistic in (("mrr", np.mean), ("median_rank", np.median), ("recall@10", np.mean)):
         found = rows[1].measures[name]
-        drawn = interval(each[name], scenes, statistic, seed=3)
+        drawn = scene_interval(each[name], scenes, statistic, seed=3)
         assert (found.low, found.high) == pytest.approx(drawn)
     assert rows == retrieval_rows_of("tiny", "one", ranks, queries, seed=3)
     assert rows != retrieval_rows_of("tiny", "one", ranks, queries, seed=4)

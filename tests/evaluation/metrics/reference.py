@@ -1,4 +1,4 @@
-"""The bootstrap over scenes as it is written in books."""
+"""Reference implementations that the metrics are compared with."""
 
 from __future__ import annotations
 
@@ -6,17 +6,25 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from evaluation.metrics.ranking import count_ranks, ranking_metrics, target_scores
 
-def interval(
+
+def scene_interval(
     values: np.ndarray,
     scenes: Sequence[str],
     statistic: Callable[[np.ndarray], float],
     seed: int,
     resamples: int = 2000,
 ) -> tuple[float, float]:
-    """The 95% percentile interval of a statistic of the rows of scenes that are drawn again."""
+    """The 95% percentile interval of a statistic of the rows of resampled scenes."""
     rows = [np.flatnonzero(np.asarray(scenes) == scene) for scene in np.unique(scenes)]
     drawn = np.random.default_rng(seed).integers(len(rows), size=(resamples, len(rows)))
     results = [statistic(values[np.concatenate([rows[i] for i in picks])]) for picks in drawn]
     low, high = np.percentile(results, [2.5, 97.5])
     return float(low), float(high)
+
+
+def matrix_metrics(scores: np.ndarray, targets: np.ndarray, ks: Sequence[int]) -> dict[str, float]:
+    """Ranking metrics of a score matrix (queries, frames) and its target columns (queries,)."""
+    valid = ~np.isnan(target_scores(scores, targets))
+    return ranking_metrics(*count_ranks(scores, targets), valid, np.shape(scores)[1], ks)

@@ -1,0 +1,79 @@
+import math
+
+import numpy as np
+import pytest
+
+from evaluation.metrics.accuracy import accuracy_by_family
+from evaluation.metrics.intervals import SceneBootstrap, macro_by_scene, wilson_interval
+from tests.evaluation.metrics.reference import scene_interval
+
+
+@pytest.mark.parametrize(("successes", "n"), [(0, 5), (5, 5), (7, 20), (92, 249), (2.5, 10)])
+def test_wilson_is_its_formula(successes, n):
+    z, p = 1.959963984540054, successes / n
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
+    assert wilson_interval(successes, n) == pytest.approx((centre - half, centre + half), abs=1e-12)
+
+
+def test_wilson_of_nothing_is_everything():
+    assert wilson_interval(0, 0) == (0, 1)
+
+
+def test_bootstrap_draws_whole_scenes():
+    rng = np.random.default_rng(0)
+    alone = rng.random(400)
+    spread = SceneBootstrap(np.arange(400), seed=1).mean(alone)
+    half = 1.96 * alone.std() / 20
+    assert spread == pytest.approx((alone.mean() - half, alone.mean() + half), abs=0.01)
+    # Twenty-five copies of 16 values say no more than the 16: a scene is drawn or it is not.
+    few, scenes = np.repeat(rng.random(16), 25), np.repeat(np.arange(16), 25)
+    low, high = SceneBootstrap(scenes, seed=1).mean(few)
+    assert high - low > 4 * (spread[1] - spread[0]) * 0.7
+
+
+def test_bootstrap_of_nothing_is_refused():
+    with pytest.raises(ValueError, match="no items"):
+        SceneBootstrap([], seed=0)
+
+
+@pytest.mark.parametrize("items", [1, 2, 40, 401])
+def test_many_measures_at_once_draw_what_one_does(items):
+    rng = np.random.default_rng(items)
+    scenes = [f"scene {k}" for k in rng.integers(max(1, items // 5), size=items)]
+    values = np.round(rng.random(items), 2)
+    once = SceneBootstrap(scenes, seed=7, resamples=300)
+    for found, statistic in ((once.mean(values), np.mean), (once.median(values), np.median)):
+        drawn = scene_interval(values, scenes, statistic, seed=7, resamples=300)
+        assert found == pytest.approx(drawn, abs=1e-12)
+        assert found[0] <= statistic(values) <= found[1]
+
+
+@pytest.mark.parametrize("items", [1, 3, 40, 401])
+def test_a_macro_is_the_mean_of_its_families_means(items):
+    rng = np.random.default_rng(items)
+    scenes = [f"scene {k}" for k in rng.integers(max(1, items // 5), size=items)]
+    families = rng.choice(["event", "time", "window"], size=items, p=[0.1, 0.2, 0.7])
+    credits = rng.integers(2, size=items)
+
+    def macro(rows):
+        return np.mean([rows[rows[:, 0] == f, 1].astype(float).mean() for f in set(rows[:, 0])])
+
+    found = macro_by_scene(credits, families, scenes, seed=7)
+    assert found.value == pytest.approx(accuracy_by_family(families, credits).macro)
+    assert found.n == items
+    table = np.stack([families, credits.astype(str)], axis=1)
+    drawn = scene_interval(table, scenes, macro, seed=7)
+    assert (found.low, found.high) == pytest.approx(drawn, abs=1e-12)
+    # Of one family it is the mean.
+    alone = macro_by_scene(credits, ["time"] * items, scenes, seed=7)
+    assert (alone.low, alone.high) == pytest.approx(
+        scene_interval(credits, scenes, np.mean, seed=7)
+    )
+
+
+def test_a_macro_of_parts_that_do_not_fit_is_refused():
+    with pytest.raises(ValueError, match="values for"):
+        macro_by_scene([1, 0], ["event"], ["a", "b"], seed=0)
+    with pytest.raises(ValueError, match="no items"):
+        macro_by_scene([], [], [], seed=0)

@@ -1,0 +1,147 @@
+from itertools import permutations
+
+import numpy as np
+import pytest
+import pytrec_eval
+
+from evaluation.metrics.ranking import (
+    count_above_and_equal,
+    count_ranks,
+    expected_hits,
+    ranking_metrics,
+    target_scores,
+)
+from tests.evaluation.metrics.reference import matrix_metrics
+
+KS = (1, 2, 3, 10)
+
+
+def tied_scores(queries=40, frames=30, levels=6, seed=0):
+    rng = np.random.default_rng(seed)
+    scores = rng.integers(levels, size=(queries, frames)).astype(np.float32)
+    return scores, rng.integers(frames, size=queries)
+
+
+def enumerated(row, target, ks):
+    """Means of one query's metrics over every order that ties can fall in."""
+    orders = [
+        sorted(range(len(row)), key=lambda i, order=order: (-row[i], order[i]))
+        for order in permutations(range(len(row)))
+    ]
+    ranks = np.array([order.index(target) + 1 for order in orders])
+    recalls = {f"recall@{k}": (ranks <= k).mean() for k in ks}
+    return {**recalls, "mrr": (1 / ranks).mean(), "median_rank": ranks.mean()}
+
+
+def test_ties_are_the_mean_over_every_order():
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        row, target = rng.integers(3, size=6), int(rng.integers(6))
+        metrics = matrix_metrics(row[None], np.array([target]), KS)
+        for key, value in enumerated(row, target, KS).items():
+            assert metrics[key] == pytest.approx(value)
+
+
+def test_without_ties_it_is_sorting():
+    rng = np.random.default_rng(1)
+    scores = rng.permuted(np.tile(np.arange(50.0), (30, 1)), axis=1)
+    target = rng.integers(50, size=30)
+    ranks = np.array(
+        [list(np.argsort(-s)).index(g) + 1 for s, g in zip(scores, target, strict=True)]
+    )
+    metrics = matrix_metrics(scores, target, KS)
+    assert metrics["mrr"] == pytest.approx((1 / ranks).mean())
+    assert metrics["median_rank"] == np.median(ranks)
+    assert metrics["tie_rate"] == 0
+    for k in KS:
+        assert metrics[f"recall@{k}"] == pytest.approx((ranks <= k).mean())
+
+
+def test_a_constant_scorer_gets_chance():
+    metrics = matrix_metrics(np.zeros((5, 200)), np.arange(5), KS)
+    for k in KS:
+        assert metrics[f"recall@{k}"] == pytest.approx(k / 200)
+    assert metrics["mrr"] == pytest.approx(sum(1 / i for i in range(1, 201)) / 200)
+    assert metrics["median_rank"] == 100.5
+    assert metrics["tie_rate"] == 1
+
+
+def test_order_of_frames_and_queries_does_not_matter():
+    scores, target = tied_scores()
+    columns = np.random.default_rng(2).permutation(scores.shape[1])
+    rows = np.random.default_rng(3).permutation(len(target))
+    shuffled = scores[rows][:, columns]
+    moved = np.argsort(columns)[target[rows]]
+    assert matrix_metrics(shuffled, moved, KS) == pytest.approx(matrix_metrics(scores, target, KS))
+
+
+@pytest.mark.parametrize("block", [1, 7, 30])
+def test_blocks_of_frames_and_queries_equal_the_whole(block):
+    scores, target = tied_scores()
+    scores[3, 4] = np.nan
+    target[5] = -1
+    own = target_scores(scores, target)
+    counts = [count_above_and_equal(scores[:, i : i + block], own) for i in range(0, 30, block)]
+    greater = sum(g for g, _ in counts)
+    tied = np.maximum(sum(e for _, e in counts) - 1, 0)
+    by_frame = ranking_metrics(greater, tied, ~np.isnan(own), 30, KS)
+    parts = [count_ranks(scores[i : i + block], target[i : i + block]) for i in range(0, 40, block)]
+    by_query = ranking_metrics(*map(np.concatenate, zip(*parts, strict=True)), target >= 0, 30, KS)
+    assert by_frame == by_query == matrix_metrics(scores, target, KS)
+
+
+def test_nan_and_missing_queries_are_misses_that_count():
+    scores = np.array([[3.0, 2, 1], [np.nan, 2, 1], [3, 2, 1], [np.nan, 2, np.nan]])
+    metrics = matrix_metrics(scores, np.array([0, 0, -1, 1]), [1, 3])
+    assert metrics == {
+        "recall@1": 0.5,
+        "recall@3": 0.5,
+        "mrr": 0.5,
+        "median_rank": 2.0,
+        "tie_rate": 0.0,
+    }
+
+
+def test_all_nan_scores_tie_with_nothing():
+    metrics = matrix_metrics(np.full((2, 4), np.nan), np.array([0, 1]), [1])
+    assert metrics == {"recall@1": 0.0, "mrr": 0.0, "median_rank": 4.0, "tie_rate": 0.0}
+
+
+def test_scores_are_compared_in_fp32():
+    scores = np.array([[0.5, 0.5 + 1e-12, 0.1]])
+    assert matrix_metrics(scores, np.array([0]), [1])["tie_rate"] == 1
+
+
+@pytest.mark.parametrize(
+    ("shape", "target"),
+    [((2, 3), [0]), ((2, 3), [0, 3]), ((3,), [0, 1, 2]), ((0, 3), []), ((0,), [])],
+)
+def test_wrong_shapes_are_refused(shape, target):
+    with pytest.raises(ValueError, match=r"expected|out of range|no queries"):
+        matrix_metrics(np.zeros(shape), target, KS)
+
+
+def test_credit_of_four_candidates():
+    scores = np.array([[1, 0, 0, 0], [1, 1, 0, 0], [1, 1, 1, 1], [0, 1, 1, 0], [np.nan, 0, 0, 0]])
+    answer = np.zeros(5, int)
+    valid = ~np.isnan(target_scores(scores, answer))
+    credit = expected_hits(*count_ranks(scores, answer), valid, 1)
+    assert credit.tolist() == [1, 0.5, 0.25, 0, 0]
+
+
+def test_ranks_without_ties_are_those_of_an_independent_library():
+    rng = np.random.default_rng(5)
+    scores = rng.permuted(np.tile(np.arange(120.0), (40, 1)), axis=1)
+    target = rng.integers(120, size=40)
+    run = {f"q{i}": {f"f{j}": s for j, s in enumerate(row)} for i, row in enumerate(scores)}
+    relevant = {f"q{i}": {f"f{g}": 1} for i, g in enumerate(target)}
+    judge = pytrec_eval.RelevanceEvaluator(relevant, {"recall.1,10,50", "recip_rank"})
+    expected = judge.evaluate(run).values()
+    metrics = matrix_metrics(scores, target, (1, 10, 50))
+    for k in (1, 10, 50):
+        assert metrics[f"recall@{k}"] == pytest.approx(
+            np.mean([q[f"recall_{k}"] for q in expected])
+        )
+    ranks = np.array([1 / q["recip_rank"] for q in expected])
+    assert metrics["mrr"] == pytest.approx((1 / ranks).mean())
+    assert metrics["median_rank"] == pytest.approx(np.median(ranks))
