@@ -37,6 +37,7 @@ from models.retriever import embedder
 from models.tiny_qwen3_vl import build_model
 from teacher.narrate import JOURNAL_FILE, ensure_rationales
 from teacher.rationale_log import Journal
+from tests.user_errors import raises_user_error
 from train import sft
 from train.common.checkpoints import newest_checkpoint
 from train.common.training_loop import is_unwritten
