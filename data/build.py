@@ -14,10 +14,10 @@ from conf.errors import SettingsError, UserError
 from conf.keys import nearest
 from conf.schema import BenchmarkConfig, BuildCommand
 from data.parallel import Workers
-from data.partial_build import flatten, lock_partial_build
+from data.partial_build import find_change, lock_partial_build
 from data.render.prerender import RECORD, prerender_frames
 from data.store import (
-    FRAMES,
+    FRAMES_FOLDER,
     MANIFEST,
     PARTS,
     PLAN,
@@ -50,21 +50,19 @@ def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
 
 
 def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
-    """The benchmark that `cfg` describes below `root`, built where it is missing, with the frames
-    that it names; see `ensure_items`."""
+    """Open a benchmark as `ensure_items` does, and render the frames that its records refer to."""
     store = ensure_items(cfg, root, Workers(workers))
-    if not (store.folder / FRAMES / RECORD).exists():
+    if not (store.folder / FRAMES_FOLDER / RECORD).exists():
         prerender_frames(store, "named", None, Workers(workers))
     return store
 
 
 def ensure_items(cfg: BenchmarkConfig, root: Path, workers: Workers, strict: bool = False) -> Store:
-    """The benchmark that `cfg` describes below `root`, built where it is missing, whatever frames
-    of it are rendered.
+    """Open the benchmark that `cfg` describes below `root`; build it first where it is missing.
 
     Raises:
-        UserError: a store of that name is there but was built from other settings, by another
-            generator, or is damaged.
+        UserError: the existing store is damaged, or was built by another version or from other
+            settings.
     """
     check_names(cfg)
     folder = root / cfg.name
@@ -76,22 +74,31 @@ def ensure_items(cfg: BenchmarkConfig, root: Path, workers: Workers, strict: boo
 
 
 def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = False) -> None:
-    """Build a benchmark without its frames at `folder`, going on with what a killed build left. A
-    bad record of a release stops it where `strict`."""
+    """Build a benchmark without its frames at `folder`, and resume a killed build of it.
+
+    Args:
+        strict: Fail at the first invalid record of a release instead of leaving it out.
+    """
     check_names(cfg)
     log.info("building benchmark %s in %s", cfg.name, folder)
-    with lock_partial_build(cfg, folder) as growing:
-        if growing is None:
+    with lock_partial_build(cfg, folder) as partial:
+        if partial is None:
             return
-        scene_ids, unread = make_scenes(cfg, growing, workers, strict)
-        items, queries, dropped = make_items_and_queries(cfg, growing, scene_ids, workers)
-        scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(growing, name)))
+        scene_ids, unread = make_scenes(cfg, partial, workers, strict)
+        items, queries, dropped = make_items_and_queries(cfg, partial, scene_ids, workers)
+        scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(partial, name)))
         queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
-        _check_not_empty(cfg, items, queries)
-        save_rows([i.to_row() for i in items], growing / "selection.parquet")
-        save_rows([q.to_row() for q in queries], growing / "retrieval.parquet")
+        if not items and not queries:
+            raise UserError(
+                f"benchmark {cfg.name} would be empty: its scenes give no item with "
+                f"benchmark.selection.min_displacement={cfg.selection.min_displacement}; lower "
+                "it, or raise benchmark.scenes or the quotas",
+                code="empty-benchmark",
+            )
+        save_rows([i.to_row() for i in items], partial / "selection.parquet")
+        save_rows([q.to_row() for q in queries], partial / "retrieval.parquet")
         rows = [{**vars(f), "database": name} for name in databases for f in databases[name]]
-        save_rows(rows, growing / "database.parquet")
+        save_rows(rows, partial / "database.parquet")
         manifest = {
             "name": cfg.name,
             "suite": suite_name(cfg),
@@ -104,58 +111,46 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
             | left_out,
             "shortfalls": find_shortfalls(cfg, items, queries, databases),
             "scenes": scene_ids,
-            "files": hash_files(growing),
+            "files": hash_files(partial),
         }
-        write_atomically(growing / MANIFEST, json.dumps(add_checksum(manifest), indent=1).encode())
-        growing.rename(folder)
+        write_atomically(partial / MANIFEST, json.dumps(add_checksum(manifest), indent=1).encode())
+        partial.rename(folder)
         shutil.rmtree(folder / PARTS)
         (folder / PLAN).unlink()
 
 
 def check_names(cfg: BenchmarkConfig) -> None:
-    """Raises SettingsError where a quota names a family, cell or builder that does not exist."""
-    named = [
-        (f"benchmark.selection.{family}", quotas, list(item_families(cfg)[family].CELLS))
-        for family, quotas in family_quotas(cfg).items()
-        if family in item_families(cfg)
-    ]
-    builders = [str(b) for b in future.BUILDERS]
-    named.append(("benchmark.retrieval.builders", cfg.retrieval.builders, builders))
+    """Raises SettingsError where a quota names an unknown family, subtype or builder."""
+    families = item_families(cfg)
+    quotas = {f"selection.{family}": named for family, named in family_quotas(cfg).items()}
+    known = {f"selection.{family}": list(module.CELLS) for family, module in families.items()}
+    quotas["retrieval.builders"] = cfg.retrieval.builders
+    known["retrieval.builders"] = [str(b) for b in future.BUILDERS]
     problems = [
-        f"{key}.{name}: there is no such builder, did you mean {nearest(name, known) or known[0]}? "
-        f"There are {', '.join(known)}"
-        for key, quotas, known in named
-        for name in quotas
-        if name not in known
+        f"benchmark.{key}.{name}: unknown name, did you mean "
+        f"{nearest(name, known[key]) or known[key][0]}? The options are {', '.join(known[key])}"
+        for key, named in quotas.items()
+        for name in named
+        if key in known and name not in known[key]
     ]
     problems += [
-        f"benchmark.selection.{family}: suite {suite_name(cfg)} has no items of it, "
-        "leave the family out"
-        for family, quotas in family_quotas(cfg).items()
-        if quotas and family not in item_families(cfg)
+        f"benchmark.{key}: suite {suite_name(cfg)} has no items of this family; remove it"
+        for key, named in quotas.items()
+        if named and key not in known
     ]
     if problems:
-        raise SettingsError("\n".join(problems))
-
-
-def _check_not_empty(cfg: BenchmarkConfig, items: list, queries: list) -> None:
-    if not items and not queries:
-        raise UserError(
-            f"benchmark {cfg.name} would be empty: none of its scenes gave an item with "
-            f"benchmark.selection.min_displacement={cfg.selection.min_displacement}; lower it, "
-            "or raise benchmark.scenes or the quotas"
-        )
+        raise SettingsError("\n".join(problems), code="unknown-option")
 
 
 def _check_same_settings(store: Store, cfg: BenchmarkConfig) -> None:
-    built, asked = flatten(store.manifest["config"]), flatten(asdict(cfg))
-    for key in (built | asked).keys() - {"folder"}:
-        old, new = built.get(key), asked.get(key)
-        if old != new:
-            raise UserError(
-                f"{store.folder} was built with benchmark.{key}={old}, you ask for {new}: "
-                f"choose another name with benchmark.name=NAME, or delete {store.folder}"
-            )
+    # The folder of a release may move.
+    if change := find_change(store.manifest["config"], asdict(cfg), ignored={"folder"}):
+        key, built, requested = change
+        raise UserError(
+            f"{store.folder} was built with benchmark.{key}={built}, but the command has "
+            f"{requested}: choose another name with benchmark.name=NAME, or delete {store.folder}",
+            code="different-settings",
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Spreads jobs over this machine's cores, or over a Ray cluster, by joblib.
+"""Runs jobs in worker processes of this machine or of a Ray cluster, with joblib.
 
-A job leaves its work in files that are written whole or not at all, so that one whose worker died
-is done again by another.
+A job writes its result atomically to files, so that another worker can repeat the job of a worker
+that died.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
@@ -22,17 +22,23 @@ from conf.errors import UserError
 
 log = logging.getLogger(__name__)
 
+Element = TypeVar("Element")
 Job = Callable[[], Any]
 CHUNK = 32
-"""Jobs for each worker that are handed out together; between two such rounds workers wait."""
-DEATHS = 3
-"""Workers that may die in a row before a job is finished."""
+"""Jobs per worker in one batch; workers wait for each other between batches."""
+MAX_DEATHS = 3
+"""Number of workers that may die in a row before a job finishes."""
 
 
 @dataclass(frozen=True)
 class Workers:
-    """How many processes work, and where: `loky` for this machine, `ray` for a cluster (the one at
-    RAY_ADDRESS, or else one that is started here)."""
+    """A pool of worker processes.
+
+    Attributes:
+        count: Number of processes.
+        engine: `loky` for this machine, `ray` for the cluster at RAY_ADDRESS, or for a new local
+            one without that variable.
+    """
 
     count: int
     engine: str = "loky"
@@ -40,57 +46,63 @@ class Workers:
     def run(
         self, jobs: Mapping[str, Job], title: str, unit: str, done: int = 0
     ) -> Iterator[tuple[str, Any]]:
-        """Run jobs and give their results by name, as they come, under a progress bar on which
-        `done` others count as done before.
+        """Run jobs and yield their names and results in order of completion.
+
+        Args:
+            title: Title of the progress bar.
+            unit: What a job processes, in the singular.
+            done: Number of earlier jobs that the progress bar counts as done.
 
         Raises:
-            UserError: workers die again and again without finishing a job.
+            UserError: workers die repeatedly without finishing a job.
         """
-        left = dict(jobs)
-        bar = tqdm(total=done + len(left), initial=done, desc=title, unit=unit, mininterval=1.0)
-        with bar:
+        remaining = dict(jobs)
+        total = done + len(remaining)
+        with tqdm(total=total, initial=done, desc=title, unit=unit, mininterval=1.0) as bar:
             deaths = 0
-            while left:
+            while remaining:
                 try:
-                    for name, result in self._results(left):
-                        del left[name]
+                    for name, result in self._results(remaining):
+                        del remaining[name]
                         bar.update()
                         deaths = 0
                         yield name, result
                 except _worker_died(self.engine) as error:
                     deaths += 1
-                    if deaths > DEATHS:
+                    if deaths > MAX_DEATHS:
                         raise UserError(
-                            f"{title}: workers die before they finish a {unit}, probably for want "
-                            f"of memory; try workers={max(self.count // 2, 1)}"
+                            f"{title}: workers die before they finish a {unit}, probably because "
+                            f"memory is short; try workers={max(self.count // 2, 1)}",
+                            code="dying-workers",
                         ) from error
-                    log.warning("a worker died; its jobs are done again")
+                    log.warning("a worker died; retrying its jobs")
 
     def _results(self, jobs: Mapping[str, Job]) -> Iterator[tuple[str, Any]]:
         from joblib import Parallel, delayed
 
         if self.engine == "ray":
             _join_cluster(self.count)
-            # Ray's backend gives results only once all of them are there.
+            # Ray's backend cannot return results one by one.
             parallel = Parallel(self.count, backend="ray")
         else:
             parallel = Parallel(
                 self.count,
                 backend="loky",
                 return_as="generator_unordered",
-                initializer=_end_with_parent,
+                initializer=_exit_with_parent,
             )
-        # Loky renews a worker whose memory grows, as that of one does which keeps scenes.
+        # Loky restarts a worker whose memory grows, which caching scenes causes.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs")
-        for some in batched(list(jobs.items()), CHUNK * self.count):
-            yield from parallel(delayed(_named)(name, job) for name, job in some)
+        for batch in batched(list(jobs.items()), CHUNK * self.count):
+            yield from parallel(delayed(_run_job)(name, job) for name, job in batch)
 
 
-def batched(jobs: list[tuple[str, Job]], size: int) -> Iterator[list[tuple[str, Job]]]:
-    return (jobs[k : k + size] for k in range(0, len(jobs), size))
+def batched(elements: list[Element], size: int) -> Iterator[list[Element]]:
+    """Lists of at most `size` consecutive elements."""
+    return (elements[k : k + size] for k in range(0, len(elements), size))
 
 
-def _named(name: str, job: Job) -> tuple[str, Any]:
+def _run_job(name: str, job: Job) -> tuple[str, Any]:
     return name, job()
 
 
@@ -110,15 +122,17 @@ def _join_cluster(count: int) -> None:
         import ray
         from ray.util.joblib import register_ray
     except ImportError as error:
-        raise UserError("parallel=ray needs Ray: pip install -e '.[ray]'") from error
+        raise UserError(
+            "parallel=ray needs Ray: pip install -e '.[ray]'", code="missing-package"
+        ) from error
     if not ray.is_initialized():
-        here = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": count}
-        ray.init(log_to_driver=False, include_dashboard=False, **here)
+        local = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": count}
+        ray.init(log_to_driver=False, include_dashboard=False, **local)
     register_ray()
 
 
-def _end_with_parent() -> None:
-    """A worker would wait for work for minutes after its parent was killed."""
+def _exit_with_parent() -> None:
+    """End this worker when its parent is killed; it would otherwise wait for jobs for minutes."""
     parent = os.getppid()
 
     def watch() -> None:

@@ -1,11 +1,11 @@
-"""The folder that a build fills beside a store, so that a killed one goes on with what it has."""
+"""The folder beside a store that a build writes to, so that a killed build can resume."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,72 +17,85 @@ from data.records import SPLITS
 from data.store import PLAN, write_atomically
 from data.world.standins import generator_version
 
+SCENE_SETTINGS = (
+    "simulator",
+    "standin",
+    "seed",
+    "test_share",
+    "min_objects",
+    "max_objects",
+    "max_collisions",
+    "fps",
+)
+"""Settings that scenes depend on. Other parts have a name that depends on their settings."""
+
 
 @contextmanager
 def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | None]:
-    """The folder beside `folder` that a build fills, held by this process alone; while another
-    process holds it, this one waits. None where that one has built `folder` meanwhile.
+    """Lock the folder beside `folder` that a build writes to; wait while another process has it.
+
+    Yields:
+        The folder, or None if the other process has completed `folder` meanwhile.
 
     Raises:
-        UserError: a build of other settings was left there.
+        UserError: the folder holds an unfinished build with other settings.
     """
-    growing = folder.with_name(f".{folder.name}.partial")
-    growing.mkdir(parents=True, exist_ok=True)
+    partial = folder.with_name(f".{folder.name}.partial")
+    partial.mkdir(parents=True, exist_ok=True)
     plan = _plan(cfg)
-    handle = os.open(growing, os.O_RDONLY)
+    handle = os.open(partial, os.O_RDONLY)
     try:
         wait_for_lock(handle, f"{folder} is being built by another process")
         if folder.exists():
-            shutil.rmtree(growing, ignore_errors=True)
+            shutil.rmtree(partial, ignore_errors=True)
             yield None
             return
-        if (growing / PLAN).exists():
-            _check_same_plan(json.loads((growing / PLAN).read_text()), plan, growing)
-        for leftover in growing.rglob(".*.partial"):
+        if (partial / PLAN).exists():
+            _check_same_plan(json.loads((partial / PLAN).read_text()), plan, partial)
+        for leftover in partial.rglob(".*.partial"):
             leftover.unlink()
-        write_atomically(growing / PLAN, json.dumps(plan).encode())
-        yield growing
+        write_atomically(partial / PLAN, json.dumps(plan).encode())
+        yield partial
     finally:
         os.close(handle)
 
 
 def _plan(cfg: BenchmarkConfig) -> dict[str, Any]:
-    """What the scenes of a build depend on; its other parts are named by what they depend on."""
-    keys = (
-        "simulator",
-        "standin",
-        "seed",
-        "test_share",
-        "min_objects",
-        "max_objects",
-        "max_collisions",
-        "fps",
-    )
     absent = {split: getattr(cfg.retrieval.counterfactual, split) > 0 for split in SPLITS}
     return {
         "generator": generator_version(cfg.standin),
-        "config": {key: getattr(cfg, key) for key in keys},
+        "benchmark": {key: getattr(cfg, key) for key in SCENE_SETTINGS},
         "counterfactual scenes": absent,
     }
 
 
-def _check_same_plan(there: dict[str, Any], plan: dict[str, Any], growing: Path) -> None:
-    """Scenes that took hours are not thrown away for a changed setting."""
-    was, now = flatten(there), flatten(plan)
-    for key in was | now:
-        if was.get(key) != now.get(key):
-            name = key.replace("config.", "benchmark.", 1)
-            raise UserError(
-                f"{growing} holds an unfinished build with {name}={was.get(key)}, you ask for "
-                f"{now.get(key)}: go on with that one, choose another name with "
-                f"benchmark.name=NAME, or delete {growing}"
-            )
+def _check_same_plan(old: dict[str, Any], new: dict[str, Any], partial: Path) -> None:
+    """Scenes take hours to simulate, so a changed setting does not discard them silently."""
+    if change := find_change(old, new):
+        key, started, requested = change
+        raise UserError(
+            f"{partial} holds an unfinished build with {key}={started}, but the command has "
+            f"{requested}: resume that build with its setting, choose another name with "
+            f"benchmark.name=NAME, or delete {partial}",
+            code="different-settings",
+        )
 
 
-def flatten(config: dict[str, Any], above: str = "") -> dict[str, Any]:
+def find_change(
+    old: dict[str, Any], new: dict[str, Any], ignored: Collection[str] = ()
+) -> tuple[str, Any, Any] | None:
+    """The first dotted key whose value differs between nested settings, with both values."""
+    before, after = _flatten(old), _flatten(new)
+    for key in before | after:
+        if key not in ignored and before.get(key) != after.get(key):
+            return key, before.get(key), after.get(key)
+    return None
+
+
+def _flatten(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested settings by dotted key."""
-    found: dict[str, Any] = {}
-    for key, value in config.items():
-        name = f"{above}{key}"
-        found |= flatten(value, f"{name}.") if isinstance(value, dict) else {name: value}
-    return found
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        name = f"{prefix}{key}"
+        flat |= _flatten(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return flat

@@ -1,7 +1,7 @@
-"""The records that travel between packages: scenes, items, queries and rationales.
+"""The records that packages exchange: scenes, items, queries and rationales.
 
-Everything here is plain data with checks: no rendering, no simulation, no models. Field names are
-those of the released files, so a reader of `selection.parquet` finds the same words in the code.
+They are plain data with checks, without rendering, simulation or models. Field names equal the
+column names of the released files, such as `selection.parquet`.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 FRAMES = 128
-"""Frames a scene (CLEVRER's clip length)."""
+"""Frames per scene (CLEVRER's clip length)."""
 FPS = 25
-"""Frames a second of a scene; also the clock of the retrieval builders."""
+"""Frames per second of a scene, and of the retrieval builders."""
 SELECTION_SECOND = 26
 """Frames that the selection track's time builder counts as one second (128 frames in about 5 s)."""
 LETTERS = "ABCD"
@@ -29,18 +29,21 @@ FAMILIES = ("event", "time", "window")
 
 @dataclass(frozen=True)
 class SceneObject:
-    """What an object looks like. No two objects of a simulated scene are equal; a transfer suite's
-    may be. An attribute that a simulator's record does not give is empty."""
+    """The appearance of an object.
+
+    No two objects of a simulated scene are equal; those of a transfer suite may be. An attribute
+    that a simulator's record lacks is empty.
+    """
 
     shape: str
     material: str = ""
     color: str = ""
     size: str = ""
-    """small or large where a simulator has objects of several sizes."""
+    """small or large for a simulator with several object sizes."""
 
     @property
     def phrase(self) -> str:
-        """The noun phrase that names it, such as "blue metal cube"."""
+        """The noun phrase that names the object, such as "blue metal cube"."""
         return " ".join(filter(None, (self.size, self.color, self.material, self.shape)))
 
 
@@ -54,8 +57,8 @@ class Collision:
 
 @dataclass(frozen=True)
 class Landing:
-    """The first contact with the ground of an object that was in the air: the first frame at or
-    after it, and the object's index."""
+    """An object's first contact with the ground after a fall: the first frame at or after it, and
+    the object's index."""
 
     frame: int
     object: int
@@ -68,20 +71,20 @@ class Scene:
     Attributes:
         positions: (F, N, 3) centres, simulator units, z up.
         quaternions: (F, N, 4) orientations in x y z w order.
-        velocities: (F, N, 3) linear velocities, simulator units a second.
-        angular_velocities: (F, N, 3) radians a second.
+        velocities: (F, N, 3) linear velocities, simulator units per second.
+        angular_velocities: (F, N, 3) radians per second.
         image_positions: (F, N, 2) projected centres in px of an image of `image_size`, x right
             and y down; defined for every object in front of the camera, on screen or not.
         in_view: (F, N) whether any part of the object falls inside the image.
         visible_fraction: (F, N) visible pixels over the pixels the object would cover alone, 0
-            where it covers none; NaN where a simulator's record does not tell.
+            where it covers none; NaN where a simulator's record lacks it.
         collisions: first contacts in order of frame.
         image_size: (width, height) of the image plane that `image_positions` refers to.
-        fps: frames a second.
-        landings: in order of frame, where a simulator's record tells of the ground.
-        scenario: the kind of scene, where a simulator has several.
-        footage: where the recorded frames of another simulator's scene are, relative to the
-            folder of its release; None for a scene that is rendered from its oracle.
+        fps: frames per second.
+        landings: in order of frame, where a simulator's record contains the ground.
+        scenario: the kind of scene, for a simulator with several.
+        footage: path of the recorded frames of another simulator's scene, relative to the folder
+            of its release; None for a scene that is rendered from its oracle.
     """
 
     scene_id: str
@@ -122,7 +125,7 @@ class Scene:
                 )
         if len(self.objects) != count:
             raise ValueError(
-                f"scene {self.scene_id}: {len(self.objects)} objects named, {count} recorded"
+                f"scene {self.scene_id}: {len(self.objects)} objects, but states of {count}"
             )
         if self.footage is None and len(set(self.objects)) != count:
             raise ValueError(f"scene {self.scene_id}: two objects share shape, material and color")
@@ -132,27 +135,27 @@ class Scene:
         return self.positions.shape[0]
 
     def speeds(self) -> np.ndarray:
-        """(F, N) lengths of the linear velocities, simulator units a second."""
+        """(F, N) lengths of the linear velocities, simulator units per second."""
         return np.linalg.norm(self.velocities, axis=-1)
 
 
 @dataclass(frozen=True)
 class FrameRef:
-    """A frame, named by its scene and index. An image file is only a cache of it."""
+    """A frame, identified by its scene and index."""
 
     scene_id: str
     frame: int
 
     @property
     def name(self) -> str:
-        """What logs and caches know it by."""
+        """The key in logs and caches."""
         return f"{self.scene_id}/{self.frame}"
 
 
 @dataclass(frozen=True)
 class Candidate(FrameRef):
-    """One of an item's four frames. `source` says where it came from: target, same_offset,
-    same_obj_match, same_time, same_near, same_far or cross_scene."""
+    """One of an item's four frames. Its source is target, same_offset, same_obj_match, same_time,
+    same_near, same_far or cross_scene."""
 
     source: str = "target"
 
@@ -161,8 +164,8 @@ class Candidate(FrameRef):
 class SelectionItem:
     """A question with four candidate frames, one of which is the target.
 
-    `prefix_start` and `prefix_stop` are inclusive. An axis that does not apply is None.
-    `min_displacement` is the least displacement between two candidates in px at 336 x 336.
+    `prefix_start` and `prefix_stop` are inclusive. A construction axis that does not apply is None.
+    `min_displacement` is the smallest displacement between two candidates, px at 336 x 336.
     """
 
     item_id: str
@@ -200,8 +203,8 @@ class SelectionItem:
         ]
         if len(self.candidates) != 4 or target != [self.answer]:
             raise ValueError(
-                f"item {self.item_id}: expected four candidates with the target at "
-                f"{self.answer}, found it at {target} of {len(self.candidates)}"
+                f"item {self.item_id}: expected four candidates with the target at index "
+                f"{self.answer}, but the target is at {target} of {len(self.candidates)}"
             )
 
     @property
@@ -210,7 +213,7 @@ class SelectionItem:
 
     @property
     def name(self) -> str:
-        """What logs and caches know it by."""
+        """The key in logs and caches."""
         return self.item_id
 
     def to_row(self) -> dict[str, Any]:
@@ -239,11 +242,11 @@ class RetrievalQuery:
     hard_negatives: tuple[FrameRef, ...]
     removed_object: str | None = None
     standard: bool = False
-    """Whether it belongs to the standard test."""
+    """Whether the query belongs to the standard test."""
 
     @property
     def name(self) -> str:
-        """What logs and caches know it by."""
+        """The key in logs and caches."""
         return self.query_id
 
     def to_row(self) -> dict[str, Any]:
@@ -257,7 +260,7 @@ class RetrievalQuery:
 
 @dataclass(frozen=True)
 class Rationale:
-    """One answer of a teacher for one item, accepted or not, with the reasons for a rejection."""
+    """One response of a teacher for one item, accepted or rejected with reasons."""
 
     item_id: str
     attempt: int
@@ -268,24 +271,23 @@ class Rationale:
     prompt_version: str
     validator_version: str
     settings: str
-    """A short hash of the teacher's settings that shape an answer or its verdict."""
+    """A short hash of the settings that affect a response or its validation."""
     seed: int
     reasons: tuple[str, ...] = ()
     sections: dict[str, str] = field(default_factory=dict)
     prompt_tokens: int | None = None
-    """What a server read for this answer; null without a server. Of several answers to one
-    request the first has the whole prompt and the others have none."""
+    """Tokens of the prompt; None without a server. Of several responses to one request, only the
+    first has the prompt's tokens."""
     completion_tokens: int | None = None
-    """What a server wrote; the answers to one request share its sum evenly."""
+    """Generated tokens; the responses to one request share their sum evenly."""
     grammar: str | None = None
-    """Version of the grammar that the server was held to; null where it was free."""
+    """Version of the grammar that constrained the server; None without a grammar."""
     finished: float | None = None
-    """When a server gave it, seconds since 1970; null without a server."""
+    """Time of the server's response, seconds since 1970; None without a server."""
     fallback: bool = False
-    """Whether the built-in narrator told it in place of a teacher, for an item that was set
-    aside."""
+    """Whether the built-in narrator replaced the teacher, for an item that was set aside."""
     claims: dict[str, list[int]] = field(default_factory=dict)
-    """How many of its claims the predicates support, contradict and leave unknown, by kind."""
+    """Counts of supported, contradicted and undecided claims, by kind of claim."""
 
     def to_row(self) -> dict[str, Any]:
         return {**asdict(self), "reasons": list(self.reasons)}
@@ -296,8 +298,8 @@ class Rationale:
 
 
 def sample_prefix_frames(start: int, stop: int, count: int) -> list[int]:
-    """The frames of the inclusive range [start, stop] that a model is shown: `count` of them,
-    evenly spread with both ends in; every frame where there are no more than `count`."""
+    """Sample `count` frames of the inclusive range [start, stop], evenly and with both ends; all
+    frames where the range has no more."""
     available = stop - start + 1
     if available <= count:
         return list(range(start, stop + 1))

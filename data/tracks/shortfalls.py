@@ -1,4 +1,4 @@
-"""What a built benchmark holds, cell by cell, and where it fell short of its quotas."""
+"""Counts of a benchmark's records, and the cells that fall short of their quotas."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from conf.schema import BenchmarkConfig
 from data.records import SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from data.store import Store
 from data.tracks.build_items import family_quotas
-from data.tracks.controls import MATCHED_ANCHOR
+from data.tracks.controls import MATCHED_ANCHOR, pair_items
 
 
 def count_records(
@@ -17,7 +17,7 @@ def count_records(
     queries: list[RetrievalQuery],
     databases: dict[str, list[FrameRef]],
 ) -> dict[str, int]:
-    """Scenes, items by family, queries by builder and frames by database."""
+    """Count scenes, items by family, queries by builder and frames by database."""
     tally = Counter({f"scenes/{split}": len(names) for split, names in scene_ids.items()})
     tally.update(f"{_track(i)}/{i.family}/{i.split}" for i in items)
     tally.update(f"retrieval/{_builder(q)}/{q.split}" for q in queries)
@@ -32,15 +32,12 @@ def find_shortfalls(
     queries: list[RetrievalQuery],
     databases: dict[str, list[FrameRef]],
 ) -> dict[str, str]:
-    """What every cell, builder and database has, where that is less than its quota."""
-    found = Counter(
-        (f"{i.family}/{i.subtype}", i.split) for i in items if i.suite != MATCHED_ANCHOR
-    )
-    # A pair is two items.
-    found.update(
-        (MATCHED_ANCHOR, i.split) for i in items if i.suite == MATCHED_ANCHOR and i.family == "time"
-    )
-    found.update((_builder(q), q.split) for q in queries)
+    """Cells, builders and databases with fewer records than their quotas, as "n of quota"."""
+    own = [item for item in items if item.suite != MATCHED_ANCHOR]
+    pairs = pair_items([item for item in items if item.suite == MATCHED_ANCHOR])
+    counts = Counter((f"{item.family}/{item.subtype}", item.split) for item in own)
+    counts.update((MATCHED_ANCHOR, item.split) for item, _ in pairs)
+    counts.update((_builder(query), query.split) for query in queries)
     wanted = {
         **{
             f"{family}/{cell}": quota
@@ -52,10 +49,10 @@ def find_shortfalls(
         "counterfactual": cfg.retrieval.counterfactual,
     }
     short = {
-        f"{cell}/{split}": f"{found[cell, split]} of {getattr(quota, split)}"
+        f"{cell}/{split}": f"{counts[cell, split]} of {getattr(quota, split)}"
         for cell, quota in wanted.items()
         for split in SPLITS
-        if found[cell, split] < getattr(quota, split)
+        if counts[cell, split] < getattr(quota, split)
     }
     track = cfg.retrieval
     sizes = {
@@ -78,9 +75,8 @@ def _builder(query: RetrievalQuery) -> str:
 
 
 def summarize_store(store: Store) -> str:
-    """What a store holds and where it fell short, as a small table."""
+    """A table of a store's counts and shortfalls."""
     lines = [f"{store.folder} ({len(store.manifest['files'])} files, {store.identity})"]
-    lines += [f"  {name:<36}{many:>8,}" for name, many in store.manifest["counts"].items()]
-    for cell, found in store.manifest["shortfalls"].items():
-        lines.append(f"  short: {cell} has {found}")
+    lines += [f"  {name:<36}{n:>8,}" for name, n in store.manifest["counts"].items()]
+    lines += [f"  short: {cell} has {n}" for cell, n in store.manifest["shortfalls"].items()]
     return "\n".join(lines)

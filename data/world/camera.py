@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole looking at the origin with z up. The defaults fit CLEVRER's release."""
+    """A pinhole camera that looks at the origin, with z up; the defaults fit CLEVRER's release."""
 
     width: int = 480
     height: int = 320
@@ -30,10 +30,10 @@ class Camera:
         return replace(self, width=width, height=height, focal=self.focal * width / self.width)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World points (..., 3) -> px (..., 2) and depth (...) along the optical axis."""
+        """Project world points (..., 3) to px (..., 2) and depths (...) along the optical axis."""
         local = (points - np.asarray(self.eye)) @ self.axes.T
         depth = local[..., 2]
-        # A point beside or behind the camera has no image; keep it finite and far outside.
+        # A point behind the camera has no image; its projection stays finite and far outside.
         safe = np.maximum(depth, 1e-3)
         centre = np.array([self.width / 2, self.height / 2])
         return centre + self.focal * local[..., :2] / safe[..., None], depth

@@ -9,53 +9,61 @@ import numpy as np
 from data.records import Scene, SceneObject
 
 MODEL_SIZE = 336
-"""Side in px of the square image that displacements are measured in."""
+"""Side in px of the square image in which displacements are measured."""
 DIAGONAL = MODEL_SIZE * 2**0.5
 
 
 def on_screen_positions(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """(F, N, 2) where objects stand in px at 336 x 336, and (F, N) whether their centre shows."""
-    places = scene.image_positions * (MODEL_SIZE / np.array(scene.image_size))
-    inside = (places >= 0).all(-1) & (places <= MODEL_SIZE).all(-1)
-    return places, scene.in_view & inside
+    """(F, N, 2) positions in px at 336 x 336, and (F, N) whether an object's centre is on screen."""
+    positions = scene.image_positions * (MODEL_SIZE / np.array(scene.image_size))
+    inside = (positions >= 0).all(-1) & (positions <= MODEL_SIZE).all(-1)
+    return positions, scene.in_view & inside
 
 
 @lru_cache(maxsize=64)
 def frame_displacements(scene: Scene, about: tuple[int, ...] | None = None) -> np.ndarray:
-    """(F, F) how far two frames of a scene are apart: the largest image displacement between them
-    of an object (of one in `about`, where that is given), px at 336 x 336, the image's diagonal at
-    most.
+    """(F, F) largest image displacement of an object between two frames, px at 336 x 336.
 
-    An object counts where its centre is on screen in at least one of the two frames, so that a
-    sliver at the edge tells no frames apart.
+    An object counts where its centre is on screen in at least one of the two frames, so that the
+    visible edge of an object outside does not distinguish frames. The image's diagonal is the
+    maximum.
+
+    Args:
+        about: Indices of the objects that count; all by default.
     """
-    places, shown = on_screen_positions(scene)
+    positions, on_screen = on_screen_positions(scene)
     if about is not None:
-        places, shown = places[:, about], shown[:, about]
-    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
-    counts = shown[:, None] | shown[None]
-    return np.minimum(np.where(counts, apart, 0.0).max(axis=-1, initial=0.0), DIAGONAL)
+        positions, on_screen = positions[:, about], on_screen[:, about]
+    distance = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+    counts = on_screen[:, None] | on_screen[None]
+    return np.minimum(np.where(counts, distance, 0.0).max(axis=-1, initial=0.0), DIAGONAL)
 
 
 def cross_scene_displacement(scene: Scene, frame: int, other: Scene, other_frame: int) -> float:
-    """How far frames of two scenes are apart: as `displacements` over objects that look alike. One
-    that shows and is in only one of the scenes makes them as far apart as can be."""
-    here, there = _shown_at(scene, frame), _shown_at(other, other_frame)
-    apart = 0.0
-    for look in here.keys() | there.keys():
-        (place, shown), (other_place, other_shown) = (
-            side.get(look, (np.full(2, np.inf), False)) for side in (here, there)
-        )
-        if shown or other_shown:
-            apart = max(apart, float(np.linalg.norm(place - other_place)))
-    return min(apart, DIAGONAL)
+    """Displacement between frames of two scenes, px at 336 x 336.
+
+    As `frame_displacements`, with objects matched by appearance. An object that is on screen in one
+    scene and absent from the other counts as the image's diagonal.
+    """
+    first, second = _positions_by_look(scene, frame), _positions_by_look(other, other_frame)
+    absent = (np.full(2, np.inf), False)
+    displacement = 0.0
+    for look in first.keys() | second.keys():
+        position, on_screen = first.get(look, absent)
+        other_position, other_on_screen = second.get(look, absent)
+        if on_screen or other_on_screen:
+            distance = float(np.linalg.norm(position - other_position))
+            displacement = max(displacement, distance)
+    return min(displacement, DIAGONAL)
 
 
-def _shown_at(scene: Scene, frame: int) -> dict[tuple[SceneObject, int], tuple[np.ndarray, bool]]:
-    """Where each object is and whether it shows, by its look and which of those that look so."""
-    places, shown = on_screen_positions(scene)
+def _positions_by_look(
+    scene: Scene, frame: int
+) -> dict[tuple[SceneObject, int], tuple[np.ndarray, bool]]:
+    """Position and visibility of each object, by its look and its index among equal looks."""
+    positions, on_screen = on_screen_positions(scene)
     return {
-        (look, scene.objects[:k].count(look)): (places[frame, k], bool(shown[frame, k]))
+        (look, scene.objects[:k].count(look)): (positions[frame, k], bool(on_screen[frame, k]))
         for k, look in enumerate(scene.objects)
     }
 
@@ -63,12 +71,16 @@ def _shown_at(scene: Scene, frame: int) -> dict[tuple[SceneObject, int], tuple[n
 def object_match_scores(
     scene: Scene, target: int, about: tuple[int, ...] | None = None
 ) -> np.ndarray:
-    """(F,) how unlike `target` each frame of a scene looks, 0 for itself: the mean over objects
-    (those in `about`, where that is given) of the image-plane displacement as a share of the
-    image's diagonal, where an object in view in only one of the two counts as 1 and one in view in
-    neither as 0."""
-    apart = np.linalg.norm(scene.image_positions - scene.image_positions[target], axis=-1)
-    share = np.minimum(apart / np.hypot(*scene.image_size), 1.0)
-    seen, seen_too = scene.in_view, scene.in_view[target]
-    unlike = np.where(seen & seen_too, share, seen ^ seen_too)
-    return (unlike if about is None else unlike[:, about]).mean(axis=-1)
+    """(F,) object-match score of each frame with `target`; 0 for the target itself.
+
+    The score is the mean image-plane displacement over objects, as a share of the image's diagonal.
+    An object that is in view in only one of the two frames counts as 1, in neither as 0.
+
+    Args:
+        about: Indices of the objects that count; all by default.
+    """
+    distance = np.linalg.norm(scene.image_positions - scene.image_positions[target], axis=-1)
+    share = np.minimum(distance / np.hypot(*scene.image_size), 1.0)
+    in_view, target_in_view = scene.in_view, scene.in_view[target]
+    scores = np.where(in_view & target_in_view, share, in_view ^ target_in_view)
+    return (scores if about is None else scores[:, about]).mean(axis=-1)

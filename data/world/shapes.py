@@ -7,8 +7,8 @@ from functools import reduce
 import numpy as np
 
 RADIUS = 0.2
-"""Radius of spheres and cylinders and half the cylinder's height, simulator units. Objects of one
-size, as CLEVRER has them."""
+"""Radius of spheres and cylinders and half the cylinder's height, simulator units. All objects have
+one size, as in CLEVRER."""
 CUBE_HALF = 0.18
 """Half of a cube's edge, simulator units."""
 BOUNDING_RADIUS = {"sphere": RADIUS, "cylinder": RADIUS * 2**0.5, "cube": CUBE_HALF * 3**0.5}
@@ -29,7 +29,7 @@ def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
 def intersect_rays(
     shape: str, position: np.ndarray, quaternion: np.ndarray, eye: np.ndarray, rays: np.ndarray
 ) -> np.ndarray:
-    """(P,) ray parameter of the first hit of each ray from `eye` on an object, inf for a miss."""
+    """(P,) ray parameter of each ray's first intersection with an object, inf for a miss."""
     to_local = rotation_matrix(quaternion)
     origin = (eye - position) @ to_local
     direction = rays @ to_local
@@ -51,7 +51,7 @@ def intersect_rays(
 
 
 def _solve_quadric(origin: np.ndarray, direction: np.ndarray, axes: int) -> np.ndarray:
-    """Nearest hit on a sphere (3 axes) or an endless z cylinder (2 axes) of radius RADIUS."""
+    """Nearest intersection with a sphere (3 axes) or an infinite z cylinder (2 axes)."""
     o, d = origin[:axes], direction[:, :axes]
     a = _squares(d)
     b = d @ o
@@ -62,7 +62,7 @@ def _solve_quadric(origin: np.ndarray, direction: np.ndarray, axes: int) -> np.n
 
 
 def _squares(vectors: np.ndarray) -> np.ndarray:
-    """(P,) squared lengths. Column by column, for numpy is slow over so short an axis."""
+    """(P,) squared lengths, column by column because numpy is slow along a short axis."""
     return reduce(np.add, (vectors**2).T)
 
 

@@ -9,8 +9,8 @@ from data.world.camera import Camera
 from data.world.shapes import BOUNDING_RADIUS, intersect_rays
 
 STRIDE = 2
-"""Visibility is counted on every second pixel of every second row: a quarter of the rays, and
-within 2% of the count over all for an object that shows."""
+"""Step in px between the rays that measure visibility. With a quarter of the rays, the fraction of a
+visible object is within 2% of that over all pixels."""
 
 
 def compute_visibility(
@@ -19,11 +19,11 @@ def compute_visibility(
     quaternions: np.ndarray,
     camera: Camera,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which objects are seen, and how much of each, by casting a ray through every pixel that
-    matters.
+    """Measure which objects are in view, and their visible fractions, by ray casting.
 
     Args:
-        positions: (F, N, 3), and quaternions (F, N, 4) in x y z w order.
+        positions: (F, N, 3).
+        quaternions: (F, N, 4) in x y z w order.
 
     Returns:
         in_view (F, N) bool and visible_fraction (F, N) in [0, 1], as `Scene` defines them.
@@ -31,7 +31,7 @@ def compute_visibility(
     centre, depth = camera.project(positions)
     bound = np.array([BOUNDING_RADIUS[o.shape] for o in objects])
     in_front = depth > bound + 0.05
-    # An off-axis ball's outline is a little longer than focal * r / depth: 1.3 covers the view.
+    # The outline of an off-axis sphere is longer than focal * r / depth: 1.3 covers the view.
     reach = np.where(in_front, 1.3 * camera.focal * bound / np.maximum(depth, 1e-3), 0.0)
     size = np.array([camera.width, camera.height])
     inside = in_front & (
@@ -60,20 +60,22 @@ def compute_visibility(
     return in_view, fraction
 
 
-def _may_hide(seen: np.ndarray, bound: np.ndarray) -> np.ndarray:
-    """(F, N, N) whether object j may hide a part of object i: the cones in which the eye sees their
-    bounding balls meet, and j's is not wholly behind i's.
+def _may_hide(centres: np.ndarray, bound: np.ndarray) -> np.ndarray:
+    """(F, N, N) whether object j may hide a part of object i.
+
+    It may where the view cones of their bounding spheres overlap and j is not entirely behind i.
 
     Args:
-        seen: (F, N, 3) centres as seen from the eye, and bound (N,) radii of the balls.
+        centres: (F, N, 3) positions relative to the camera.
+        bound: (N,) radii of the bounding spheres.
     """
-    distance = np.linalg.norm(seen, axis=-1)
-    toward = seen / distance[..., None]
+    distance = np.linalg.norm(centres, axis=-1)
+    toward = centres / distance[..., None]
     cone = np.arcsin(np.minimum(bound / distance, 1))
     angle = np.arccos(np.clip(np.einsum("fic,fjc->fij", toward, toward), -1, 1))
-    meet = angle < cone[:, :, None] + cone[:, None, :]
+    overlap = angle < cone[:, :, None] + cone[:, None, :]
     behind = (distance - bound)[:, None, :] > (distance + bound)[:, :, None]
-    return meet & ~behind & ~np.eye(len(bound), dtype=bool)
+    return overlap & ~behind & ~np.eye(len(bound), dtype=bool)
 
 
 def _pixels_around(
