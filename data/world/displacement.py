@@ -14,7 +14,7 @@ DIAGONAL = MODEL_SIZE * 2**0.5
 
 
 def on_screen_positions(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """(F, N, 2) positions in px at 336 x 336, and (F, N) whether an object's centre is on screen."""
+    """(F, N, 2) positions in px at 336 x 336, and (F, N) whether the centre is on screen."""
     positions = scene.image_positions * (MODEL_SIZE / np.array(scene.image_size))
     inside = (positions >= 0).all(-1) & (positions <= MODEL_SIZE).all(-1)
     return positions, scene.in_view & inside

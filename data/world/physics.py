@@ -1,7 +1,6 @@
-"""Simulate bodies with Bullet: where they start, by what physics, and what becomes of them.
+"""Simulation of rigid bodies with Bullet.
 
-`pybullet` is imported where the world is made, so that reading a built benchmark needs no
-simulator.
+`pybullet` is imported when a client connects, so that reading a built benchmark does not need it.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ import ctypes
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -26,40 +25,39 @@ if TYPE_CHECKING:
     from pybullet_utils.bullet_client import BulletClient
 
 GENERATOR_VERSION = "2"
-"""Changes whenever the same seed and index would give another scene."""
+"""Changes whenever the same seed and index give a different scene."""
 
 SUBSTEPS = 7
-"""Physics steps a frame: 175 Hz, as in CLEVRER's raw records."""
+"""Physics steps per frame: 175 Hz, as in CLEVRER's raw records."""
 SOLVER_ITERATIONS = 20
 GRAVITY = 9.81
 GROUND_FRICTION, OBJECT_FRICTION = 0.1, 0.3
 FRICTION_DECELERATION = GROUND_FRICTION * OBJECT_FRICTION * GRAVITY
 
 CONTACT_FREE_FRAMES = 5
-"""A pair's contact is a new event only after more frames than this without one."""
-CLOSING = 12.5
-"""No two objects come nearer faster than this, simulator units a second."""
+"""A pair's contact is a new event only after more contact-free frames than this."""
+MAX_CLOSING_SPEED = 12.5
+"""Upper bound on the speed at which two objects approach, simulator units per second."""
 
 
 @dataclass(frozen=True)
 class Physics:
-    """What makes bodies move as they do, and how often that is recorded."""
+    """Constants of a simulation, and its frame rate."""
 
     fps: int = FPS
     substeps: int = SUBSTEPS
-    """Physics steps a frame."""
     gravity: float = GRAVITY
     ground_friction: float = GROUND_FRICTION
     object_friction: float = OBJECT_FRICTION
     ground_restitution: float = 0.0
-    """Bullet multiplies it by an object's: on a ground of 0 nothing bounces."""
+    """Bullet multiplies it by the object's: with 0 nothing bounces on the ground."""
     rubber_restitution: float = 0.5
     metal_restitution: float = 0.7
 
     @property
     def reach(self) -> float:
-        """Objects whose centres are further apart than this do not touch within the next frame."""
-        return 2 * max(BOUNDING_RADIUS.values()) + CLOSING / self.fps
+        """Largest distance of centres at which two objects may touch within the next frame."""
+        return 2 * max(BOUNDING_RADIUS.values()) + MAX_CLOSING_SPEED / self.fps
 
 
 STANDARD_PHYSICS = Physics()
@@ -67,20 +65,27 @@ STANDARD_PHYSICS = Physics()
 
 @dataclass(frozen=True)
 class Body:
-    """An object and how it starts: ground position, yaw in radians, ground velocity."""
+    """An object and its initial state: ground position, yaw in radians, ground velocity."""
 
     look: SceneObject
     position: tuple[float, float]
     yaw: float
     velocity: tuple[float, float]
     height: float | None = None
-    """Of its centre, where it starts in the air; None stands on the ground."""
+    """Initial height of the centre of a body in the air; None for a body on the ground."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What Bullet did with some bodies: (F, N, 13) their positions, quaternions, linear and angular
-    velocities as in `Scene`, first contacts, and landings of bodies that started in the air."""
+    """The simulated motion of some bodies.
+
+    Attributes:
+        states: (F, N, 13) positions, quaternions, linear and angular velocities as in `Scene`.
+        collisions: First contacts.
+        touching_at_start: Whether any two bodies touch at the first frame.
+        repeated_pair: Whether any pair collides more than once.
+        landings: Landings of bodies that start in the air.
+    """
 
     states: np.ndarray
     collisions: tuple[Collision, ...]
@@ -106,7 +111,7 @@ class Motion:
 
 
 def connect() -> BulletClient:
-    """A Bullet client without a window, its greetings swallowed."""
+    """Connect a Bullet client without a window and without its console output."""
     with silence(1), silence(2):
         import pybullet
         from pybullet_utils.bullet_client import BulletClient
@@ -116,7 +121,7 @@ def connect() -> BulletClient:
 
 @contextmanager
 def silence(descriptor: int) -> Iterator[None]:
-    """Send what C writes to a file descriptor nowhere."""
+    """Discard the output of C code to a file descriptor."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = os.dup(descriptor)
@@ -125,14 +130,14 @@ def silence(descriptor: int) -> Iterator[None]:
     try:
         yield
     finally:
-        # What C has buffered would else come out later, in the midst of a progress bar.
+        # Otherwise C's buffered output would appear later, in the middle of a progress bar.
         ctypes.CDLL(None).fflush(None)
         os.dup2(kept, descriptor)
         os.close(kept)
 
 
 class World:
-    """A Bullet world without a window, used for one simulation after another."""
+    """A Bullet client that runs one simulation after another."""
 
     def __init__(self) -> None:
         self._bullet = connect()
@@ -140,11 +145,11 @@ class World:
     def simulate(
         self, bodies: list[Body], frames: int = FRAMES, physics: Physics = STANDARD_PHYSICS
     ) -> Motion:
-        """Run `bodies` for `frames` frames. The same bodies give the same bits every time."""
+        """Simulate bodies for `frames` frames; the result is bit-identical every time."""
         ground, handles = self._place(bodies, physics)
         step = self._bullet.stepSimulation
         recorded = np.zeros((frames, len(bodies), 13))
-        contacts: dict[tuple[int, int], list[int]] = {}
+        contacts: dict[tuple[int, int], dict[int, None]] = {}
         in_air = {k for k, body in enumerate(bodies) if body.height is not None}
         landings = []
         recorded[0] = self._state(handles)
@@ -154,29 +159,26 @@ class World:
             for _ in range(physics.substeps):
                 step()
                 for i, j in near:
-                    if self._press(handles[i], handles[j]):
-                        frames_of_pair = contacts.setdefault((i, j), [])
-                        if not frames_of_pair or frames_of_pair[-1] != frame:
-                            frames_of_pair.append(frame)
-                for k in [k for k in in_air if self._press(ground, handles[k])]:
+                    if self._is_contact(handles[i], handles[j]):
+                        contacts.setdefault((i, j), {})[frame] = None
+                for k in [k for k in in_air if self._is_contact(ground, handles[k])]:
                     in_air.remove(k)
                     landings.append(Landing(frame, k))
             recorded[frame] = self._state(handles)
         collisions, repeated = _debounce(contacts)
         return Motion(recorded, collisions, touching_at_start, repeated, tuple(landings))
 
-    def _press(self, one: int, two: int) -> bool:
-        # Bullet keeps points of pairs that no longer press on each other; only a force is a
-        # contact.
+    def _is_contact(self, one: int, two: int) -> bool:
+        # Bullet keeps the points of pairs that have separated, so only a force counts.
         return any(point[9] > 0 for point in self._bullet.getContactPoints(one, two))
 
     def _place(self, bodies: list[Body], physics: Physics) -> tuple[int, list[int]]:
-        """The handles of the ground and of the bodies."""
+        """Reset the world, add the ground and the bodies, and return their handles."""
         bullet = self._bullet
         bullet.resetSimulation()
         bullet.setGravity(0, 0, -physics.gravity)
-        # A residual threshold of 0 keeps the number of iterations from depending on objects that
-        # an object never meets: without it, removing one object moves all the others.
+        # With a residual threshold above 0 the number of iterations depends on all objects, so
+        # that removing one would change the motion of objects that it never touches.
         bullet.setPhysicsEngineParameter(
             fixedTimeStep=1 / (physics.fps * physics.substeps),
             numSolverIterations=SOLVER_ITERATIONS,
@@ -242,12 +244,12 @@ class World:
 
 @cache
 def shared_world() -> World:
-    """This process's world."""
+    """The world of this process."""
     return World()
 
 
 def _near_pairs(positions: np.ndarray, reach: float) -> list[tuple[int, int]]:
-    """Pairs that could touch within the next frame, and are polled."""
+    """Pairs that may touch within the next frame."""
     places = positions.tolist()
     return [
         (i, j)
@@ -256,11 +258,15 @@ def _near_pairs(positions: np.ndarray, reach: float) -> list[tuple[int, int]]:
     ]
 
 
-def _debounce(contacts: dict[tuple[int, int], list[int]]) -> tuple[tuple[Collision, ...], bool]:
-    events, repeated = [], False
+def _debounce(
+    contacts: Mapping[tuple[int, int], Iterable[int]],
+) -> tuple[tuple[Collision, ...], bool]:
+    """The first contact of each pair, and whether any pair has a later, separate contact."""
+    collisions, repeated = [], False
     for pair, frames in contacts.items():
-        events.append(Collision(frames[0], pair))
+        first, *later = frames
+        collisions.append(Collision(first, pair))
         repeated |= any(
-            later - earlier > CONTACT_FREE_FRAMES + 1 for earlier, later in pairwise(frames)
+            after - before > CONTACT_FREE_FRAMES + 1 for before, after in pairwise([first, *later])
         )
-    return tuple(sorted(events, key=lambda c: (c.frame, c.objects))), repeated
+    return tuple(sorted(collisions, key=lambda c: (c.frame, c.objects))), repeated

@@ -1,4 +1,4 @@
-"""Sample scenes in the manner of CLEVRER's collision scenes, and put down their oracle.
+"""Samples collision scenes as CLEVRER does, and records their oracle.
 
 A scene is a pure function of (seed, index, GENERATOR_VERSION) and the benchmark's object and
 collision limits.
@@ -26,23 +26,24 @@ from data.world.shapes import BOUNDING_RADIUS, RADIUS
 from data.world.visibility import compute_visibility
 
 AT_REST = 0.35
-"""Share of the added objects that start at rest."""
+"""Share of the colliding objects that start at rest."""
 SPEED = (1.0, 3.0)
-"""Speeds at the start, simulator units a second."""
+"""Range of initial speeds, simulator units per second."""
 COLLISIONS = {2: 0.63, 3: 0.33, 4: 0.04}
-"""How often a scene aims at how many collisions, as a sample of CLEVRER's release has them."""
+"""Probability of each target number of collisions, from a sample of CLEVRER's release."""
 CLEAR = 2 * max(BOUNDING_RADIUS.values()) + 0.2
-"""Objects whose centres are further apart than this at every frame never touch: between two frames
-one comes nearer by less than a tenth."""
+"""Objects that keep this distance at every frame never touch: the distance of two centres falls by
+less than 0.1 between frames."""
 PLACEMENTS = 40
-"""Tries to place one object before the scene is begun again."""
+"""Attempts to place one object before the scene is sampled again."""
 
 
 def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> tuple[list[Body], Motion]:
-    """The bodies of scene `index` and what they do: one that moves, then one after the other placed
-    or aimed so that it meets an earlier one, until the scene has its collisions; the rest stand by.
+    """Sample the bodies of scene `index` and simulate their motion.
 
-    Scenes whose pairs touch at the start or meet again are thrown away and begun anew.
+    The first body moves. Each further one is placed so that it collides with an earlier one, until
+    the scene has its collisions; the remaining bodies rest clear of all others. Scenes in which a
+    pair touches at the start or collides twice are rejected and sampled again.
     """
     rng = np.random.default_rng([seed, index])
     while True:
@@ -53,23 +54,23 @@ def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> tuple[list[
         bodies = [_entering(looks[0], rng)]
         motion = shared_world().simulate(bodies)
         for look in looks[1:]:
-            grown = _add_body(bodies, motion, look, rng, min(goal, most), most)
-            if grown is None:
+            extended = _add_body(bodies, motion, look, rng, min(goal, most), most)
+            if extended is None:
                 break
-            bodies, motion = grown
+            bodies, motion = extended
         if len(bodies) == count and motion.collisions:
             return bodies, motion
 
 
 def sample_looks(rng: np.random.Generator, limits: BenchmarkConfig) -> list[SceneObject]:
-    """As many looks as a scene has objects, no two alike."""
+    """Sample the number of objects in a scene and their distinct looks."""
     every_look = [SceneObject(*look) for look in product(SHAPES, MATERIALS, COLORS)]
     count = int(rng.integers(limits.min_objects, limits.max_objects + 1))
     return [every_look[k] for k in rng.choice(len(every_look), count, replace=False)]
 
 
 def _entering(look: SceneObject, rng: np.random.Generator) -> Body:
-    """A body that comes in from outside the view, towards its middle."""
+    """Sample a body that enters from outside the view, towards its middle."""
     bearing = rng.uniform(0, 2 * np.pi)
     start = np.array([-0.7, 0.0]) + rng.uniform(2.6, 4.0) * unit_vector(bearing)
     goal = np.array([-0.7, 0.0]) + rng.uniform(-1, 1, 2)
@@ -85,41 +86,49 @@ def _add_body(
     goal: int,
     most: int,
 ) -> tuple[list[Body], Motion] | None:
-    """`bodies` with one more, and their motion: one that meets another while there are fewer than
-    `goal` collisions, then one that meets none. None where no place was found."""
-    wanted = len(motion.collisions) < goal
+    """Add a body that collides with another while there are fewer than `goal` collisions, then one
+    that collides with none.
+
+    Returns:
+        All bodies and their motion, or None where no attempt succeeded.
+    """
+    is_colliding = len(motion.collisions) < goal
     for _ in range(PLACEMENTS):
-        body = _meeting(look, motion, rng) if wanted else _standing_by(look, motion, rng)
+        body = (_colliding if is_colliding else _resting)(look, motion, rng)
         if body is None:
             continue
         trial = [*bodies, body]
-        # A body that is to meet another needs them all; it seldom stays out of reach.
-        result = (None if wanted else _beside(motion, body)) or shared_world().simulate(trial)
-        met = any(len(bodies) in c.objects for c in result.collisions)
+        # A colliding body seldom stays clear of the others, so they are simulated together.
+        result = (None if is_colliding else _combine(motion, body)) or shared_world().simulate(
+            trial
+        )
+        has_collided = any(len(bodies) in c.objects for c in result.collisions)
         if (
             not result.touching_at_start
             and not result.repeated_pair
             and len(result.collisions) <= most
-            and met == wanted
+            and has_collided == is_colliding
         ):
             return trial, result
     return None
 
 
-def _beside(motion: Motion, body: Body) -> Motion | None:
-    """What `body` and the bodies of `motion` do together, where it stays out of reach of them all:
-    what each does alone, to the bit, for Bullet solves what does not touch apart. None where it may
-    touch one."""
+def _combine(motion: Motion, body: Body) -> Motion | None:
+    """Add the motion of a body that stays clear of all others; None where it may touch one.
+
+    Bullet solves separate groups of bodies separately, so the result is bit-identical to a joint
+    simulation.
+    """
     alone = shared_world().simulate([body]).states
-    apart = np.linalg.norm(motion.positions - alone[..., :3], axis=-1)
-    if apart.min() < CLEAR:
+    distance = np.linalg.norm(motion.positions - alone[..., :3], axis=-1)
+    if distance.min() < CLEAR:
         return None
     return replace(motion, states=np.concatenate([motion.states, alone], axis=1))
 
 
-def _meeting(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
-    """A body that should meet one of the others at a moment in view: at rest in its way, or aimed
-    at where it will be."""
+def _colliding(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
+    """Sample a body that should collide with another one in view: at rest in its path, or aimed at
+    its future position."""
     other = int(rng.integers(motion.positions.shape[1]))
     frame = int(rng.integers(15, 111))
     place = motion.positions[frame, other, :2] + rng.normal(0, 0.1, 2)
@@ -138,11 +147,11 @@ def _meeting(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Bod
     return _moving(look, place - travel * direction, direction, speed, rng)
 
 
-def _standing_by(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
-    """A body at rest on screen, clear of every path."""
+def _resting(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
+    """Sample a body at rest on screen, clear of all paths."""
     place = np.array([rng.uniform(-3.5, 1.2), rng.uniform(-2.2, 2.2)])
-    clear = np.linalg.norm(motion.positions[..., :2] - place, axis=-1).min() > 0.7
-    if not (clear and is_on_screen(place)):
+    is_clear = np.linalg.norm(motion.positions[..., :2] - place, axis=-1).min() > 0.7
+    if not (is_clear and is_on_screen(place)):
         return None
     return Body(look, as_pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
 
@@ -160,7 +169,7 @@ def _moving(
 def is_on_screen(
     place: np.ndarray, height: float = RADIUS, camera: Camera = STANDARD_CAMERA
 ) -> bool:
-    """Whether an object's centre at a ground position and height shows, with some margin."""
+    """Whether a point above a ground position is on screen, with a margin of 20 px."""
     pixel, depth = camera.project(np.array([*place, height]))
     margin = 20
     return bool(
@@ -183,13 +192,15 @@ def format_scene_id(seed: int, index: int) -> str:
 
 
 def simulate_scene(seed: int, index: int, split: str, limits: BenchmarkConfig) -> Scene:
-    """Scene `index` of `seed` with its whole oracle."""
+    """Simulate scene `index` of `seed` with its complete oracle."""
     return record_scene(format_scene_id(seed, index), split, *sample_bodies(seed, index, limits))
 
 
 def simulate_without(name: str, split: str, bodies: list[Body], removed: int) -> Scene:
-    """The counterfactual of a scene of `bodies`: run again with object `removed` absent. What that
-    object never touched, directly or through others, moves bit for bit as before."""
+    """Simulate a scene again without object `removed`.
+
+    Objects that it never affects, directly or through others, move bit-identically.
+    """
     rest = bodies[:removed] + bodies[removed + 1 :]
     return record_scene(name, split, rest, shared_world().simulate(rest))
 
@@ -203,7 +214,7 @@ def record_scene(
     camera: Camera = STANDARD_CAMERA,
     scenario: str = "",
 ) -> Scene:
-    """What bodies did, observed by a camera: a scene."""
+    """Record a motion as a scene, with projection and visibility by a camera."""
     objects = tuple(body.look for body in bodies)
     in_view, fraction = compute_visibility(objects, motion.positions, motion.quaternions, camera)
     image_positions, _ = camera.project(motion.positions)

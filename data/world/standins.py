@@ -1,9 +1,9 @@
-"""Bullet's scenes of another look and physics, which stand in for MoVi-A's and Physion's.
+"""Stand-ins: Bullet scenes with the motions of MoVi-A and Physion, a different look and physics.
 
-No release of theirs is needed to try a transfer suite's recipe, or to see whether a student carries
-over to motions, light and a camera that it never saw. They are no measurement of the paper's
-suites, and are named so everywhere: `standin_movi_a`, `standin_physion`. As there, MoVi-A's objects
-fall and bounce for two seconds; Physion's stand, and are struck or fallen upon.
+They try a transfer suite's recipe, or a student's transfer to unseen motions, light and camera,
+without that suite's release. They do not measure the paper's suites, which is why their names are
+`standin_movi_a` and `standin_physion`. MoVi-A's objects fall and bounce for two seconds; Physion's
+rest until another object hits them or falls on them.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from data.world.sampling import as_pair, is_on_screen, record_scene, sample_look
 from data.world.shapes import RADIUS
 
 STANDINS_VERSION = "2"
-"""Changes whenever a stand-in would have other scenes or another look."""
+"""Changes whenever a stand-in's scenes or look change."""
 
 ROW_STEP = (0.75, 1.1)
-"""From one standing object to the next, simulator units."""
+"""Range of distances between neighbours in a row, simulator units."""
 
 Start = tuple[str, list[Body]]
-"""A scenario and the bodies that begin it."""
+"""A scenario and its bodies."""
 
 
 @dataclass(frozen=True)
 class Standin:
-    """A kind of scenes: how long, by what physics, how it looks, and how one begins."""
+    """A kind of scenes: length, physics, view, and a sampler of initial bodies."""
 
     frames: int
     physics: Physics
     view: View
     start: Callable[[list[SceneObject], View, np.random.Generator], Start | None]
-    """Bodies of such looks; None where a place was not found."""
+    """Samples bodies with given looks; None where a position is off screen."""
 
 
 def thrown(looks: list[SceneObject], view: View, rng: np.random.Generator) -> Start | None:
-    """Objects in the air, thrown towards the middle."""
+    """Sample objects in the air that move towards the middle."""
     bodies = []
     for look in looks:
         place = rng.uniform([-1.5, -1.6], [0.9, 1.6])
@@ -57,10 +57,10 @@ def thrown(looks: list[SceneObject], view: View, rng: np.random.Generator) -> St
 
 
 def struck(looks: list[SceneObject], view: View, rng: np.random.Generator) -> Start | None:
-    """Objects in a row, the first of which is struck by one that comes from afar, along the row
-    (scenario Collide), or on which one falls (Drop)."""
+    """Sample a row of objects. Another one slides into the first of them along the row (scenario
+    Collide) or falls on it (Drop)."""
     last, *row = looks
-    # Across the view: of a row that leads away from the camera, little shows.
+    # Across the view, because objects in a row away from the camera hide each other.
     bearing = rng.choice([-1, 1]) * np.pi / 2 + rng.uniform(-0.7, 0.7)
     place = rng.uniform([-0.8, -1.0], [1.0, 1.0])
     first, bodies = place, []
@@ -101,30 +101,32 @@ STANDINS = {
         start=struck,
     ),
 }  # fmt: skip
-"""By the suite that they stand in for, with its frame rate. Neither's physics is its suite's own:
-things fall more slowly than on Earth, so that some are still in the air when a prefix ends."""
+"""Stand-ins by suite, with the suite's frame rate. Gravity is weaker than on Earth, so that some
+objects are still in the air when a prefix ends."""
 
 
 def generator_version(standin: str | None) -> str:
-    """Of what simulates a benchmark's scenes."""
+    """Version of the code that simulates a benchmark's scenes."""
     return GENERATOR_VERSION + (f", stand-ins {STANDINS_VERSION}" if standin else "")
 
 
 def standin_view(standin: str | None) -> View:
-    """How a stand-in's scenes are watched and lit, or standard ones."""
+    """Camera and light of a stand-in, or the standard ones."""
     return STANDINS[standin].view if standin else STANDARD_VIEW
 
 
 def simulate_standin(name: str, index: int, split: str, cfg: BenchmarkConfig) -> Scene:
-    """Scene `index` of the benchmark's stand-in, a pure function of that and its seed; one in which
-    no two objects meet, or some touch at the start, is begun anew."""
+    """Simulate scene `index` of the benchmark's stand-in, a pure function of index and seed.
+
+    Scenes without a collision, or with objects that touch at the start, are sampled again.
+    """
     kind = STANDINS[cfg.standin]
     rng = np.random.default_rng([cfg.seed, index])
     while True:
-        began = kind.start(sample_looks(rng, cfg), kind.view, rng)
-        if began is None:
+        start = kind.start(sample_looks(rng, cfg), kind.view, rng)
+        if start is None:
             continue
-        scenario, bodies = began
+        scenario, bodies = start
         motion = shared_world().simulate(bodies, kind.frames, kind.physics)
         if motion.collisions and not motion.touching_at_start:
             return record_scene(

@@ -1,9 +1,9 @@
-"""What a benchmark's queries must hold before a retriever is trained or measured on them."""
+"""Checks of a benchmark's queries before a retriever is trained or evaluated on them."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Sequence
 
 from conf.errors import UserError
 from data.records import FrameRef, RetrievalQuery
@@ -11,89 +11,92 @@ from data.store import Store
 
 
 def check_training(store: Store, queries: Sequence[RetrievalQuery], negatives: int) -> None:
-    """Hold the training queries against each other and against the test split; `negatives` is how
-    many hard negatives each is to be trained with.
+    """Check training queries against each other and against the test split.
+
+    Args:
+        negatives: Number of hard negatives that training uses for each query.
 
     Raises:
-        UserError: an id stands there twice, a query's scene is measured on, or a query has too few
+        UserError: a query id occurs twice, a query's scene is a test scene, or a query has too few
             hard negatives.
     """
     _check_ids(store, queries)
     tested = {*store.scene_ids("test"), *(q.scene_id for q in store.retrieval("test"))}
-    if shared := [q for q in queries if _scenes(q) & tested]:
-        query = shared[0]
+    if leaked := [q for q in queries if _scenes(q) & tested]:
+        query = leaked[0]
         raise UserError(
-            f"training query {query.query_id} is about scene {min(_scenes(query) & tested)}, which "
-            f"is in the test split of {store.folder} too{_more(shared)}: a retriever would be "
-            f"measured on what it was trained on; {_again(store)}"
+            f"training query {query.query_id} refers to scene {min(_scenes(query) & tested)} of "
+            f"the test split{_others(leaked)}, which would invalidate the evaluation; "
+            f"{_rebuild(store)}",
+            code="split-leak",
         )
     if lacking := [q for q in queries if len(q.hard_negatives) < negatives]:
         query = min(lacking, key=lambda q: len(q.hard_negatives))
         fewest = len(query.hard_negatives)
         raise UserError(
-            f"train.hard_negatives={negatives} is more than the {fewest} that query "
-            f"{query.query_id} of {store.folder} has{_more(lacking)}: give "
-            f"train.hard_negatives={fewest}, or {_again(store)}"
+            f"train.hard_negatives={negatives}, but query {query.query_id} of {store.folder} has "
+            f"{fewest}{_others(lacking)}: set train.hard_negatives={fewest}, or {_rebuild(store)}",
+            code="too-few-negatives",
         )
-
-
-def _scenes(query: RetrievalQuery) -> set[str]:
-    """Those that a query, its target and its wrong frames show."""
-    wrong = (frame.scene_id for frame in query.hard_negatives)
-    return {query.scene_id, query.target.scene_id, *wrong}
 
 
 def check_test(
     store: Store, queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]
 ) -> None:
-    """Hold the test queries and their database against each other and against the training split.
+    """Check test queries and their database against each other and against the training split.
 
     Raises:
-        UserError: there is no query, an id or a frame stands there twice, a target is not in the
-            database, or a query's scene is trained on.
+        UserError: the benchmark has no test queries, a query id or a frame occurs twice, a target
+            is missing from the database, or a query's scene is a training scene.
     """
     if not queries:
-        raise UserError(f"{store.folder} has no queries of the standard test to measure on")
-    _check_ids(store, queries)
-    if twice := _repeated((f.scene_id, f.frame) for f in database):
-        scene_id, frame = twice[0]
         raise UserError(
-            f"{store.folder}/database.parquet has frame {frame} of scene {scene_id} more than once "
-            f"in database test{_more(twice)}: {_again(store)}"
+            f"{store.folder} has no queries of the standard test", code="missing-queries"
         )
-    there = set(database)
-    if lacking := [q for q in queries if q.target not in there]:
+    _check_ids(store, queries)
+    _check_unique(store, [f"frame {f.frame} of scene {f.scene_id}" for f in database], "database")
+    frames = set(database)
+    if lacking := [q for q in queries if q.target not in frames]:
         query = lacking[0]
         raise UserError(
             f"{store.folder}/database.parquet lacks frame {query.target.frame} of scene "
             f"{query.target.scene_id}, the target of query {query.query_id}, in database test"
-            f"{_more(lacking)}: {_again(store)}"
+            f"{_others(lacking)}: {_rebuild(store)}",
+            code="missing-target",
         )
     trained = {*store.scene_ids("train"), *(q.scene_id for q in store.retrieval("train"))}
-    if shared := [q for q in queries if {q.scene_id, q.target.scene_id} & trained]:
-        query = shared[0]
+    if leaked := [q for q in queries if {q.scene_id, q.target.scene_id} & trained]:
+        query = leaked[0]
         raise UserError(
-            f"test query {query.query_id} is about scene {query.scene_id}, which is in the "
-            f"training split of {store.folder} too{_more(shared)}: what was trained on proves "
-            f"nothing; {_again(store)}"
+            f"test query {query.query_id} refers to scene {query.scene_id} and target scene "
+            f"{query.target.scene_id}, one of which is in the training split of {store.folder}"
+            f"{_others(leaked)}; {_rebuild(store)}",
+            code="split-leak",
         )
+
+
+def _scenes(query: RetrievalQuery) -> set[str]:
+    """The scenes of a query's prefix, target and hard negatives."""
+    negatives = (frame.scene_id for frame in query.hard_negatives)
+    return {query.scene_id, query.target.scene_id, *negatives}
 
 
 def _check_ids(store: Store, queries: Sequence[RetrievalQuery]) -> None:
-    if twice := _repeated(q.query_id for q in queries):
+    _check_unique(store, [f"query {q.query_id}" for q in queries], "retrieval")
+
+
+def _check_unique(store: Store, names: Sequence[str], table: str) -> None:
+    if repeated := [name for name, count in Counter(names).items() if count > 1]:
         raise UserError(
-            f"{store.folder}/retrieval.parquet has query {twice[0]} more than once"
-            f"{_more(twice)}: {_again(store)}"
+            f"{store.folder}/{table}.parquet has {repeated[0]} more than once{_others(repeated)}: "
+            f"{_rebuild(store)}",
+            code="duplicate-record",
         )
 
 
-def _repeated(names: Iterable[Hashable]) -> list:
-    return [name for name, times in Counter(names).items() if times > 1]
+def _others(records: Sequence) -> str:
+    return f" ({len(records) - 1} more)" if len(records) > 1 else ""
 
 
-def _more(found: Sequence) -> str:
-    return f" ({len(found) - 1} more such)" if len(found) > 1 else ""
-
-
-def _again(store: Store) -> str:
+def _rebuild(store: Store) -> str:
     return f"delete {store.folder} and build it again with python -m data.build"
