@@ -1,4 +1,4 @@
-"""Strategies without foresight, on scenes where what they get is known."""
+"""Statistics and baselines, on scenes for which they are known."""
 
 from __future__ import annotations
 
@@ -7,22 +7,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from data.statistics import (
-    cell_counts,
-    hard_margin,
-    item_statistics,
-    scene_statistics,
-    strategy_accuracy,
-    table,
-)
+from data.publish.baselines import BASELINES, score_baselines
+from data.publish.statistics import compute_statistics, count_cells, format_statistics, hard_margin
 from tests.teacher import synthetic
 
 STANDARD = {"config": {"simulator": "bullet"}}
 """A manifest of standard scenes."""
 
 
-def made(count: int = 24) -> tuple[list, SimpleNamespace]:
-    """Items over scenes that move at constant velocity, each with its target at a random letter."""
+def synthetic_store(count: int = 24) -> tuple[list, SimpleNamespace]:
+    """Items over scenes that move at constant velocity, with targets at random letters."""
     rng = np.random.default_rng(3)
     scenes, items = {}, []
     for k in range(count):
@@ -41,50 +35,59 @@ def made(count: int = 24) -> tuple[list, SimpleNamespace]:
     return items, SimpleNamespace(scene=scenes.__getitem__, manifest=STANDARD)
 
 
-def test_constant_velocity_foresees_what_moves_so() -> None:
-    items, store = made()
-    found = strategy_accuracy(items, store)["event"]
-    assert found["velocity"] == 1
-    assert found["items"] == len(items)
+def accuracy(items: list, store: SimpleNamespace) -> dict[str, float]:
+    scores = [score_baselines(item, store) for item in items]
+    return {name: np.mean([score[name] for score in scores]) for name in BASELINES}
 
 
-def test_nearest_and_farthest_go_by_the_frames_after_the_observation() -> None:
-    items, store = made()
-    found = strategy_accuracy(items, store)["event"]
+def test_constant_velocity_is_right_where_velocities_are_constant() -> None:
+    assert accuracy(*synthetic_store())["velocity"] == 1
+
+
+def test_nearest_and_farthest_compare_with_the_last_observed_frame() -> None:
+    items, store = synthetic_store()
+    scores = accuracy(items, store)
     # At constant velocity the earliest frame is the nearest, and the latest the farthest.
-    assert found["nearest"] == np.mean([i.target_frame == 50 for i in items])
-    assert found["farthest"] == np.mean([i.target_frame == 120 for i in items])
-    assert found["first"] == np.mean([i.answer == 0 for i in items])
+    assert scores["nearest"] == np.mean([i.target_frame == 50 for i in items])
+    assert scores["farthest"] == np.mean([i.target_frame == 120 for i in items])
+    assert scores["first"] == np.mean([i.answer == 0 for i in items])
 
 
 def test_a_tie_counts_its_share() -> None:
-    items, _ = made(4)
+    items, _ = synthetic_store(4)
     still = synthetic.scene([(0, 0)], [(0, 0)])
     store = SimpleNamespace(scene=lambda _: still, manifest=STANDARD)
-    assert strategy_accuracy(items, store)["event"]["nearest"] == pytest.approx(0.25)
+    assert accuracy(items, store)["nearest"] == pytest.approx(0.25)
+
+
+def test_cells_are_counted_beside_their_quotas() -> None:
+    items, _ = synthetic_store(4)
+    quota = {"train": 5, "test": 2}
+    quotas = {
+        "event": {items[0].subtype: quota},
+        "time": {},
+        "window": {"G1_A_h8_easy": quota, "G1_C_h8_easy": quota},
+    }
+    cells = count_cells(items, quotas)
+    split = items[0].split
+    assert cells["event"][split] == cells[f"event/{items[0].subtype}"][split] == 4
+    assert cells["window/G1"] == {"train": 0, "test": 0, "train quota": 10, "test quota": 4}
 
 
 @pytest.mark.slow
-def test_a_real_benchmark_is_told_whole(micro_store) -> None:
+def test_statistics_of_a_benchmark_are_consistent(micro_store) -> None:
     items = micro_store.selection()
-    found = {
-        "scenes": scene_statistics(micro_store),
-        "cells": cell_counts(items),
-        "items": item_statistics(items, micro_store),
-        "strategies": strategy_accuracy(items, micro_store),
-    }
-    assert sum(found["scenes"]["collisions a scene"].values()) == 10
-    assert sum(found["items"]["answers"].values()) == len(items)
-    by_family = [found["strategies"][f]["items"] for f in ("event", "time", "window")]
-    assert sum(by_family) == len(items)
-    assert found["strategies"]["event, cross_scene"]["nearest"] == 1
-    assert found["cells"]["window"]["test"] == sum(
-        n["test"] for name, n in found["cells"].items() if name.startswith("window/G1_")
-    ) + sum(found["cells"][f"window/{group}"]["test"] for group in ("G2", "G3", "G4"))
-    # A median over items of distances that are at least the items' least.
-    for group, far in found["items"]["median to the nearest distractor"].items():
-        assert far >= found["items"]["median least displacement"][group] - 1e-3
-    assert hard_margin(found["strategies"]) > 0.3
-    told = table(found)
-    assert max(map(len, told.splitlines())) <= 100
-    assert all(group in told for group in found["strategies"])
+    statistics = compute_statistics(micro_store)
+    baselines, cells = statistics["baselines"], statistics["cells"]
+    assert sum(statistics["scenes"]["collisions"].values()) == 10
+    assert sum(statistics["answers"].values()) == len(items)
+    assert sum(baselines[family]["items"] for family in ("event", "time", "window")) == len(items)
+    assert baselines["event, cross_scene"]["nearest"] == 1
+    groups = [cells[f"window/{group}"]["test"] for group in ("G1", "G2", "G3", "G4")]
+    assert cells["window"]["test"] == sum(groups)
+    for row in statistics["candidates"].values():
+        assert row["nearest distractor"] >= row["least"] - 1e-3
+    assert hard_margin(baselines) > 0.3
+    text = format_statistics(statistics)
+    assert max(map(len, text.splitlines())) <= 100
+    assert all(category in text for category in baselines)

@@ -1,0 +1,143 @@
+"""Statistics of a benchmark's scenes and selection items, as a dictionary and as text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from data.publish.baselines import BASELINES, score_baselines
+from data.records import LETTERS, SPLITS, SelectionItem
+from data.store import Store
+from data.world.displacement import cross_scene_displacement
+
+
+def compute_statistics(store: Store) -> dict[str, Any]:
+    """Return the statistics of a store that has selection items.
+
+    Returns:
+        ``scenes``: distributions of objects, collisions and event frames. ``answers``: items by
+        letter. ``cells``: items and quotas by family, window group and subtype. ``candidates``:
+        median displacements and positions in time by category. ``baselines``: accuracies by
+        category.
+    """
+    items = store.selection()
+    rows = pd.DataFrame([_describe_item(item, store) for item in items])
+    categories = rows.explode("category").groupby("category")
+    earlier = pd.crosstab(categories.obj["category"], categories.obj["earlier"])
+    candidates = categories[["nearest distractor", "least"]].median()
+    for count in range(4):
+        candidates[f"{count} earlier"] = earlier.get(count, pd.Series(dtype=int))
+    baselines = categories[list(BASELINES)].mean()
+    baselines["items"] = categories.size()
+    return {
+        "scenes": describe_scenes(store),
+        "answers": rows["letter"].value_counts().reindex(list(LETTERS), fill_value=0).to_dict(),
+        "cells": count_cells(items, store.manifest["config"]["selection"]),
+        "candidates": candidates.fillna(0).to_dict("index"),
+        "baselines": baselines.to_dict("index"),
+    }
+
+
+def describe_scenes(store: Store) -> dict[str, Any]:
+    """Return the scenes by number of objects and of collisions, and quantiles of event frames."""
+    scenes = [store.scene(name) for split in SPLITS for name in store.scene_ids(split)]
+    counts = pd.DataFrame({s.scene_id: (len(s.objects), len(s.collisions)) for s in scenes}).T
+    frames = [c.frame for scene in scenes for c in scene.collisions]
+    objects, collisions = (counts[k].value_counts().sort_index().to_dict() for k in (0, 1))
+    return {
+        "objects": {str(n): scenes for n, scenes in objects.items()},
+        "collisions": {str(n): scenes for n, scenes in collisions.items()},
+        "mean collisions": len(frames) / len(scenes),
+        "event frames": np.percentile(frames, [0, 25, 50, 75, 100]).tolist() if frames else [],
+    }
+
+
+def count_cells(
+    items: list[SelectionItem], quotas: dict[str, dict[str, dict[str, int]]]
+) -> dict[str, dict[str, int]]:
+    """Return items and quotas by split, for each family, window group and subtype."""
+    counts: dict[str, dict[str, int]] = {}
+
+    def add(family: str, subtype: str, column: str, count: int) -> None:
+        names = [family, f"{family}/{subtype}"]
+        if family == "window":
+            names.append(f"window/{subtype.partition('_')[0]}")
+        for name in names:
+            row = counts.setdefault(
+                name, dict.fromkeys((*SPLITS, *(f"{split} quota" for split in SPLITS)), 0)
+            )
+            row[column] += count
+
+    for item in items:
+        add(item.family, item.subtype, item.split, 1)
+    for family in ("event", "time", "window"):
+        for subtype, quota in quotas[family].items():
+            for split in SPLITS:
+                add(family, subtype, f"{split} quota", quota[split])
+    return dict(sorted(counts.items()))
+
+
+def _describe_item(item: SelectionItem, store: Store) -> dict[str, Any]:
+    frames = [(store.scene(c.scene_id), c.frame) for c in item.candidates]
+    target = frames.pop(item.answer)
+    same_scene = all(scene is target[0] for scene, _ in frames)
+    return {
+        "category": list(_categories(item)),
+        "letter": item.letter,
+        "least": item.min_displacement,
+        "nearest distractor": min(cross_scene_displacement(*target, *frame) for frame in frames),
+        "earlier": sum(frame < item.target_frame for _, frame in frames) if same_scene else None,
+        **score_baselines(item, store),
+    }
+
+
+def _categories(item: SelectionItem) -> Iterator[str]:
+    yield item.family
+    if item.family == "event":
+        yield f"event, {item.distractors}"
+    if item.difficulty is not None:
+        yield f"window, {item.difficulty}"
+
+
+def format_statistics(statistics: dict[str, Any]) -> str:
+    """Return the statistics as tables of at most 100 columns."""
+    scenes = statistics["scenes"]
+    candidates = pd.DataFrame(statistics["candidates"]).T.round().astype(int)
+    baselines = pd.DataFrame(statistics["baselines"]).T
+    baselines[list(BASELINES)] *= 100
+    cells = pd.DataFrame(statistics["cells"]).T
+    sections = [
+        f"Objects per scene:    {_join(scenes['objects'])}\n"
+        f"Collisions per scene: {_join(scenes['collisions'])} "
+        f"(mean {scenes['mean collisions']:.2f})\n"
+        f"Event frames:         {' '.join(f'{q:g}' for q in scenes['event frames'])} "
+        "(minimum, quartiles, maximum)\n"
+        f"Answers:              {_join(statistics['answers'])}",
+        "Accuracy of baselines without prediction, %\n"
+        + baselines.astype({"items": int}).to_string(float_format="{:.1f}".format),
+        "Candidates: median displacement in px from the target to the nearest distractor and\n"
+        "between any two candidates; items by number of distractors earlier than the target\n"
+        + candidates.to_string(),
+        "Items and quotas\n" + cells.to_string(),
+    ]
+    margin = hard_margin(statistics["baselines"])
+    if margin is not None:
+        sections[1] += (
+            f"\nThe candidate nearest to the prefix is the target {100 * margin:.1f} points less "
+            "often in\nhard window items than in easy ones."
+        )
+    return "\n\n".join(sections)
+
+
+def hard_margin(baselines: dict[str, dict[str, float]]) -> float | None:
+    """Return by how much the nearest candidate is more often right in easy than in hard window
+    items, or None without such items."""
+    easy, hard = (baselines.get(f"window, {difficulty}") for difficulty in ("easy", "hard"))
+    return easy["nearest"] - hard["nearest"] if easy and hard else None
+
+
+def _join(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name}: {count:,}" for name, count in counts.items())
