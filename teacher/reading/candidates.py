@@ -1,4 +1,4 @@
-"""Reads what sentences say of candidates: what each shows, lacks, adds or moves, and which one
+"""Reads claims about candidates: what each shows, lacks, adds or displaces, and which one
 agrees."""
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ NOUNS = {"error", "errors", "mistake", "mistakes", "fault", "faults", "flaw", "f
 
 
 class CandidateReader(TopicReader):
-    """Holds what is said of candidates and of the objects in them."""
+    """Collects claims about candidates and about the objects in them."""
 
     def end(self) -> None:
         if not self.lasting and len(self.letters) == 1 and not self.doubted:
@@ -21,11 +21,11 @@ class CandidateReader(TopicReader):
             if claim.candidate != "":
                 self.claims.append(claim)
             elif claim.kind == "region" and not self.lasting:
-                # Before any candidate is named, an outcome tells of the target.
+                # Before it names a candidate, an outcome describes the target.
                 self.claims.append(claim._replace(candidate=None))
 
     def _choose(self, letter: str) -> None:
-        """An outcome that only names a candidate, all others being wrong, chooses it."""
+        """Choose the candidate of an outcome that names only one and no error in it."""
         named = {str(t.value) for t in self.sentence if t.tag == "candidate"}
         wrong = {c.candidate for c in self.found if c.kind == "agrees" and not c.affirmed}
         told = any(c.candidate == letter for c in self.found)
@@ -33,7 +33,7 @@ class CandidateReader(TopicReader):
             tag = self.choice or self.sentence[-1]
             self.found.append(self.claim("agrees", (), "", True, TARGET, tag, letter))
 
-    # What is said of an object in a candidate.
+    # Claims about an object in a candidate.
 
     def on_region(self, tag: Tag) -> None:
         if self.skipped:
@@ -127,7 +127,7 @@ class CandidateReader(TopicReader):
             self.whole("other objects", not self.negated, tag)
         self.objects, self.adding = [], False
 
-    # What is said of a whole candidate.
+    # Claims about a whole candidate.
 
     def on_agree(self, tag: Tag) -> None:
         if self.near(1).tag == "candidate" and self.is_compared(self.at + 1):
@@ -141,7 +141,7 @@ class CandidateReader(TopicReader):
             self.whole("agrees", not (self.negated or self.refused), tag)
 
     def _is_choice_ahead(self) -> bool:
-        """Whether it is the candidate named next that agrees: "the answer is therefore B"."""
+        """Whether the candidate named next is the one that agrees: "the answer is therefore B"."""
         step = 1
         while self.near(step).tag in ("be", "word", "break", "future"):
             step += 1
@@ -165,7 +165,7 @@ class CandidateReader(TopicReader):
             self.whole("agrees", False, tag)
 
     def _is_between(self) -> bool:
-        """Whether it is from one another that candidates differ."""
+        """Whether the candidates differ from each other."""
         if not self.word(self.sentence[self.at]).startswith("differ"):
             return False
         step = 1
@@ -176,7 +176,7 @@ class CandidateReader(TopicReader):
         return len(self.letters) > 1 and self.near(1).tag != "ignore"
 
     def _partial(self) -> bool:
-        """Whether an agreement is said to be in an object, or to have an exception."""
+        """Whether an agreement is limited to an object or has an exception."""
         rest = self.sentence[self.at + 1 :]
         ahead = [t.tag for t in rest]
         if any(t.tag in ("lack", "gone", "off", "differ", "misplace", "extra") for t in rest):

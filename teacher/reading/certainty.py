@@ -1,9 +1,8 @@
-"""Whether it is certain what a claim speaks of: only then may the predicates contradict it.
+"""Decides whether the subject of a claim is certain; predicates contradict only certain claims.
 
-A claim is certain in a plain clause. Its subject and what is said of it stand close together, with
-no word between them that the vocabulary does not know, no further object but those listed with the
-subject, and a negation, if any, right at the verb. Whatever else the vocabulary reads may turn out
-supported, but is not held against a rationale.
+A claim is certain in a plain clause: its subject and its predicate are close together, every word
+between them is in the vocabulary, every further object is listed with the subject, and a negation,
+if any, is next to the verb. Other claims can be supported but never contradicted.
 """
 
 from __future__ import annotations
@@ -22,33 +21,33 @@ closes closing come comes crawls crossed driven gathered gets got joins knocked 
 pushed reached rested sent set shown slipped stayed turned unmoved
 """
 PLAIN = frozenset(PLAIN_WORDS.split())
-"""Words outside the vocabulary that leave a clause plain: adverbs, nouns of place and way, verbs of
-moving and of being moved."""
+"""Words outside the vocabulary that keep a clause plain: adverbs, nouns of place and direction,
+verbs of moving and of being moved."""
 LISTING = {"and", "comma", "object", "region", "not", "all"}
-"""Tags between the objects of a list, each with its place at most."""
+"""Tags allowed between the objects of a list."""
 BESIDE_NOT = {"be", "future", "moves", "moving", "show", "pronoun", "stays", "past", "by", "close"}
-"""Tags that may stand between a negation and what it denies."""
+"""Tags allowed between a negation and what it denies."""
 ENDS = {"comma", "semicolon", "break", "stop", "and"}
 KEPT = {"leaves", "moves", "moving", "stays"}
-"""Tags of what may be denied and leaves the place standing: "has not left its place"."""
+"""Tags whose negation keeps the stated place: "has not left its place"."""
 PAIRED = {"meeting", "course", "close", "time", "close region", "place of either"}
 UNBOUND = {"region", "direction", "displaced", "close region", "place of either"}
-"""Kinds of claims that may be false of whatever they are about."""
+"""Kinds of claims that may be false whatever their subject is."""
 NAMING = {"lack", "gone", "adds", "extra", "misplace", "passed"}
-"""Tags that make the object after them what a candidate lacks, adds or displaces."""
+"""Tags after which an object is one that a candidate lacks, adds or displaces."""
 CLOSING = {"stop", "semicolon", "break", "which", "show", "lack", "adds", "extra", "candidate"}
-"""Tags that may follow a list and leave its last object in it."""
+"""Tags that may follow a list without ending it before its last object."""
 COMPARED = {"slight", "clear", "off", "direction"}
-"""Tags after "gone" and its like that make it a verb of motion: "has gone slightly too far"."""
+"""Tags after words such as "gone" that make them verbs of motion: "has gone slightly too far"."""
 
 
 class Sentence:
-    """A sentence's tags, and which objects its noun phrases name."""
+    """A sentence's tags and the objects that its noun phrases name."""
 
     def __init__(
         self, text: str, tags: Sequence[Tag], bound: Mapping[int, Sequence[str | None]]
     ) -> None:
-        """`bound`: the names by where in the text their noun phrase begins."""
+        """`bound`: object names by the start of their noun phrase in the text."""
         self.text = text
         self.tags = tags
         self.bound = bound
@@ -59,14 +58,15 @@ class Sentence:
                 self.places.setdefault(name, []).append(self.positions[start])
 
     def is_certain(self, claim: Claim) -> bool:
-        """Whether subject, candidate and negation of a claim of this sentence are beyond doubt."""
+        """Whether the subject, candidate and negation of a claim of this sentence are
+        unambiguous."""
         at = self.positions[claim.span[0]]
         if claim.kind == "mention":
             return True
         if claim.candidate is not None and not self._is_letter_plain(claim.candidate, at):
             return False
         if claim.kind == "other objects":
-            # "The other objects" are those of the scene.
+            # "The other objects" refers to objects of the scene.
             return not self.text[: claim.span[0]].lower().endswith("the ")
         if claim.kind == "agrees":
             return self._is_verdict_whole(claim, at)
@@ -84,12 +84,12 @@ class Sentence:
         )
 
     def _is_letter_plain(self, letter: str, at: int) -> bool:
-        """Whether the sentence names the candidate that the claim is about, or none before it."""
+        """Whether the sentence names the claim's candidate, or no candidate before the claim."""
         before = any(tag.tag == "candidate" for tag in self.tags[:at])
         return not before or any(t.tag == "candidate" and t.value == letter for t in self.tags)
 
     def _is_verdict_whole(self, claim: Claim, at: int) -> bool:
-        """Whether an agreement is of the candidate named last, and nothing qualifies it ("in
+        """Whether an agreement refers to the candidate named last without a qualification ("in
         placing the A near the left")."""
         if not self._is_named_last(claim.candidate, at):
             return False
@@ -111,13 +111,13 @@ class Sentence:
         return not named or letter in named | later
 
     def _is_general(self, at: int) -> bool:
-        """Whether what is said without a known subject is said of some object all the same."""
+        """Whether a claim without a known subject still refers to some object."""
         opening = self.tags[:at]
         steered = any(t.tag in ("not", "contrast", "maybe", "none") for t in opening)
         return not steered and any(t.tag not in ("word", "be") for t in opening)
 
     def _is_naming_plain(self, at: int) -> bool:
-        """Whether the object is named in the clause of "lacks", "adds" or its like."""
+        """Whether the object is named in the clause of a verb such as "lacks" or "adds"."""
         ahead = at
         while self.tags[ahead].tag in ("object", "and", "comma") and ahead + 1 < len(self.tags):
             ahead += 1
@@ -138,14 +138,14 @@ class Sentence:
             spots += self._nearest(name, at)
         following = self.tags[max(spots) + 1 : max(spots) + 2]
         if len(claim.subjects) < 2 and any(map(_is_strange, following)):
-            # "Touches nothing" and its like.
+            # "Touches nothing" and similar phrases.
             return False
         between = self.tags[min(spots) : max(spots) + 1]
         told = self.tags[: max(spots) + 1]
         return not any(map(_is_strange, between)) and not self._is_pronoun_open(claim, told)
 
     def _is_pronoun_open(self, claim: Claim, told: Sequence[Tag]) -> bool:
-        """Whether an "it" may stand for another object than those of the claim."""
+        """Whether an "it" may refer to an object outside the claim."""
         names = {name for t in told for name in self.bound.get(t.start, ())}
         pronoun = any(
             t.tag == "pronoun" and self.text[t.start : t.stop].lower() == "it" for t in told
@@ -153,7 +153,7 @@ class Sentence:
         return pronoun and not names <= set(claim.subjects)
 
     def _is_complete(self, claim: Claim, at: int) -> bool:
-        """Whether what is said ends with its phrase ("covered", but not "covered more ground")."""
+        """Whether the claim ends with its phrase ("covered", but not "covered more ground")."""
         following = self.tags[at + 1] if at + 1 < len(self.tags) else None
         if following is None:
             return True
@@ -165,7 +165,8 @@ class Sentence:
         )
 
     def _is_second(self, at: int) -> bool:
-        """Whether the clause has placed its object before: "near the left, <...> near the top"."""
+        """Whether the clause states an earlier place of its object: "near the left, <...> near the
+        top"."""
         back = at - 1
         while back >= 0 and self.tags[back].tag in ("break", "by", "word", "be"):
             back -= 1
@@ -175,7 +176,7 @@ class Sentence:
         before = [i for i in self.places.get(name, []) if i < at]
         after = [i for i in self.places.get(name, []) if i > at]
         if not before and not after:
-            # The sentence before named it, and this one no other object.
+            # The previous sentence named it, and this one names no other object.
             return not any(t.tag == "object" or _is_strange(t) for t in self.tags[:at])
         return bool(before and self._is_told_after(before[-1], at)) or bool(
             after and self._is_told_ahead(at, after[0])
@@ -186,7 +187,7 @@ class Sentence:
         return not any(map(_is_strange, between)) and _is_one_list(between)
 
     def _is_told_ahead(self, at: int, spot: int) -> bool:
-        """Whether what is said opens the clause of a subject that comes late."""
+        """Whether the claim opens the clause and its subject follows."""
         between = self.tags[at + 1 : spot]
         first = next((i for i, t in enumerate(between) if t.tag == "object"), len(between))
         if any(t.tag in ("semicolon", "stop", "and", "break") for t in between[:first]):
@@ -208,7 +209,7 @@ class Sentence:
         )
 
     def _is_denied(self, at: int, kept: set[str]) -> bool:
-        """Whether a negation stands in the clause that ends here: "cannot be near the top yet",
+        """Whether the clause that ends here contains a negation: "cannot be near the top yet",
         but not "near the left, not near the top"."""
         back = at - 1
         while back >= 0 and self.tags[back].tag not in ENDS | kept:
@@ -221,7 +222,7 @@ class Sentence:
         return self.text[self.tags[at].start : self.tags[at].stop].lower()
 
     def _nearest(self, name: str, at: int) -> list[int]:
-        """The last place before a position where an object is named, or else the first after."""
+        """The last position before `at` where an object is named, otherwise the first after it."""
         places = self.places.get(name, [])
         return [i for i in places if i < at][-1:] or places[:1]
 
@@ -231,7 +232,7 @@ def _is_strange(tag: Tag) -> bool:
 
 
 def _without_aside(between: Sequence[Tag]) -> Sequence[Tag]:
-    """What follows a subject, less a part between commas: "the A, struck by the B, moves"."""
+    """The text after a subject without a part between commas: "the A, struck by the B, moves"."""
     if between and between[0].tag == "comma":
         for i, tag in enumerate(between[1:], 1):
             if tag.tag == "semicolon":

@@ -1,5 +1,5 @@
-"""What steers a clause about the scene: where it begins and ends, its verb, its negation, its
-moment; and the holding of what is said of its subject."""
+"""Tracks the structure of a clause about the scene: its start and end, verb, negation and moment;
+and records the claims about its subject."""
 
 from __future__ import annotations
 
@@ -8,41 +8,41 @@ from teacher.reading.reader import BOUNDARIES, Names
 from teacher.reading.tagging import Tag
 
 SAID = {"from", "region", "direction", "speed", "still", "moving", "rest", "out", "hidden"}
-"""Tags of what may be said of an object before it is named."""
+"""Tags of claims that may precede the name of their object."""
 OPENING = SAID | {"into", "toward", "slight", "word", "by", "be", "comma", "pronoun", "future"}
 OPENING |= {"expected"}
-"""Tags that may stand between a clause's beginning and a subject that comes late."""
+"""Tags allowed between the start of a clause and a late subject."""
 WAS = {"was", "were", "had"}
-"""Opening words of phrases of the past that are verbs."""
+"""First words of phrases about the past that are verbs."""
 
 
 class ClauseReader(PairReader):
-    """Keeps what a clause's words of time, negation and doubt leave open or settle."""
+    """Tracks a clause's time, negation and doubt."""
 
     def begin(self) -> None:
         self.before = self.subjects
-        """Whom the sentence before told of last."""
+        """The subjects at the end of the previous sentence."""
         self.begin_pairs()
         self.group_start = 0
-        """Where in `subjects` the part begins that a comma's afterthought is said of."""
+        """The index in `subjects` from which an afterthought behind a comma applies."""
         self.pending: list[tuple[str, str, bool, str, Tag]] = []
-        """What has been said before its subject was named."""
+        """Claims that precede their subject."""
         self.finite = False
-        """Whether the subject has its verb, so that a further noun phrase is a new subject."""
+        """Whether the subject already has a verb, so that another noun phrase is a new subject."""
         self.blocked = self.complement = False
-        """Whether what follows may be said of another object than the subject."""
+        """Whether the following words may refer to an object other than the subject."""
         self.crossed = self.moved = self.absolute = False
         self.last: Names = []
-        """Whom "which" stands for."""
+        """The antecedents of "which"."""
         self.hypothetical = False
         self.inner = False
-        """Whether a clause of a place is being read ("where the A was"), within another's."""
+        """Whether the current clause is a place clause inside another one ("where the A was")."""
         self.neither = self.relative = False
         self.pronominal = False
-        """Whether the subject is a pronoun, which no list goes on from."""
+        """Whether the subject is a pronoun, which cannot start a list."""
         self.gapped = self.verbal = False
-        """Whether the subject has what is said of it without a verb ("the A moves east, the B
-        west"), and whether an earlier subject of the sentence had its verb."""
+        """Whether the subject has a claim without a verb ("the A moves east, the B west"), and
+        whether an earlier subject of the sentence had a verb."""
         self._boundary()
 
     def end(self) -> None:
@@ -62,7 +62,7 @@ class ClauseReader(PairReader):
     def on_comma(self, tag: Tag) -> None:
         if not self.is_incomplete():
             self.flush()
-            # "Neither the A, which moves, nor the B, ...": what is denied of both comes later.
+            # "Neither the A, which moves, nor the B, ...": the denied claim about both follows.
             self.hypothetical |= self.neither and self.relative
             self._boundary()
             if self.inner and self.near(1).tag != "break":
@@ -85,14 +85,14 @@ class ClauseReader(PairReader):
             self.flush()
             self.negated = self.slight = False
             self.crossed = True
-            # "Near the left and near the right, the A ..." goes on with a list.
+            # "Near the left and near the right, the A ..." continues a list.
             listed = self.near(-1).tag == self.near(1).tag == "region"
             if not (listed and self.near(2).tag == "comma"):
                 self._open()
 
     def _open(self) -> None:
-        """Forget the subject where a clause opens with what is said of the next: "and near the
-        top is the A", "while moving slowly, the A"."""
+        """Drop the subject if the clause opens with a claim about the next one: "and near the top
+        is the A", "while moving slowly, the A"."""
         step = 1
         while self.near(step).tag in OPENING:
             if self.word(self.near(step)) == "where":
@@ -103,7 +103,7 @@ class ClauseReader(PairReader):
             if said and self.near(step).tag == "object":
                 self.subjects, self.finite, self.blocked, self.nobody = [], False, False, False
 
-    # Words that steer.
+    # Function words.
 
     def on_not(self, tag: Tag) -> None:
         self.negated = True
@@ -134,7 +134,7 @@ class ClauseReader(PairReader):
 
     def on_word(self, tag: Tag) -> None:
         if self.near(-1).tag == "object":
-            # A verb that is not in the vocabulary, if it is one, may be of motion.
+            # An unknown word may be a verb of motion.
             self.verb()
             self.moved |= str(tag.value).endswith("s")
 
@@ -153,7 +153,7 @@ class ClauseReader(PairReader):
         if self.subjects or self.nobody:
             self.finite = True
 
-    # What is said of the subject.
+    # Claims about the subject.
 
     def tell(
         self,
@@ -183,7 +183,7 @@ class ClauseReader(PairReader):
             self.shared.append((kind, value, tuple(subjects), tag))
 
     def _is_verbless(self, kind: str) -> bool:
-        """Whether a motion is said of the subject without so much as a participle."""
+        """Whether the subject has a motion without a verb or participle."""
         step = -1
         while self.near(step).tag not in ("object", *BOUNDARIES):
             if self.near(step).tag in ("moving", "moves"):

@@ -1,4 +1,5 @@
-"""Holds single claims against the predicates: true, false, or None where they do not tell."""
+"""Checks single claims against the predicates: true, false, or None if the predicates are
+silent."""
 
 from __future__ import annotations
 
@@ -9,20 +10,20 @@ from teacher.predicates import COMPASS, OUT_OF_VIEW, Difference, ObjectFacts, Pr
 from teacher.reading.phrases import COARSE
 
 CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
-"""What a claim is about: the cut, the way from there to the target, the target, or, where the
-words leave it open, the cut or the target."""
+"""The moment of a claim: the cut, the path from the cut to the target, the target, or, if the
+words are ambiguous, the cut or the target."""
 
 
 VERDICTS = ("supported", "contradicted", "unknown")
 
 
 class Claim(NamedTuple):
-    """What a piece of a rationale says, and the predicates' verdict on it.
+    """A statement of a rationale and the predicates' verdict on it.
 
-    `value` is a word of the predicates, "" where the kind says all; a leading "~" marks one that
-    need only roughly hold. `when` is the moment it speaks of, `candidate` the letter of the
-    candidate that is said to show it, `span` where it stands in the text. `verdict` is
-    "supported", "contradicted" or "unknown"; `certain` says whether it may be contradicted.
+    `value` is a word of the predicates, or "" if the kind needs none; a leading "~" marks a value
+    that must hold only approximately. `when` is the moment of the claim, `candidate` the letter of
+    the candidate it describes, `span` its position in the text. `verdict` is "supported",
+    "contradicted" or "unknown"; only a `certain` claim can be contradicted.
     """
 
     kind: str
@@ -43,7 +44,7 @@ class Claim(NamedTuple):
 
 
 class Ground:
-    """An item's predicates, ready to be looked up."""
+    """An item's predicates, indexed for lookup."""
 
     def __init__(self, predicates: Predicates) -> None:
         self.objects = {o.object: o for o in predicates.objects}
@@ -72,7 +73,7 @@ class Ground:
         return "contradicted" if claim.certain else "unknown"
 
     def truth(self, claim: Claim) -> bool | None:
-        """Whether what a claim says, its negation aside, holds."""
+        """Whether a claim holds, ignoring its negation."""
         if claim.candidate is not None:
             if claim.candidate not in self.candidates:
                 return None
@@ -91,8 +92,8 @@ class Ground:
         return None if facts is None else OBJECTS[claim.kind](facts, claim.value, claim.when)
 
     def _of_none(self, claim: Claim) -> bool | None:
-        """False for a region or a direction that no object of the scene is in or goes: whatever
-        the claim is about, it does not hold."""
+        """False for a region without any object or a direction without any moving object: the claim
+        is then false whatever its subject is."""
         if claim.kind not in ("region", "direction") or not claim.affirmed:
             return None
         told = [OBJECTS[claim.kind](o, claim.value, EITHER) for o in self.objects.values()]
@@ -100,7 +101,7 @@ class Ground:
         return False if set(told) == {False} and not near else None
 
     def _of_none_shown(self, claim: Claim) -> bool | None:
-        """False for a region or a displacement that a candidate shows no object in or by."""
+        """False for a region or a displacement that no object of a candidate has."""
         if claim.kind not in ("region", "displaced") or not claim.affirmed:
             return None
         found = self.differences[claim.candidate].values()
@@ -109,7 +110,7 @@ class Ground:
                 return None
             told = [_same(claim.value, d.heading) for d in found if d.heading]
         else:
-            # Words may also tell of where an object should be.
+            # The words may also describe where an object should be.
             told = [_region(o, claim.value, EITHER) for o in self.objects.values()]
             told += [_same(claim.value, d.region) for d in found if d.region]
             told += [None for d in found if d.kind == "extra"]
@@ -118,12 +119,12 @@ class Ground:
 
 def _mention(ground: Ground, claim: Claim) -> bool:
     known = claim.subjects[0] in ground.objects
-    # A candidate may show what the scene does not hold.
+    # A candidate may show an object that the scene lacks.
     return known or (claim.when == EITHER and claim.subjects[0] in ground.extras)
 
 
 def _same(value: str, actual: str | None) -> bool | None:
-    """Whether a word holds; a coarse one is false only where no part of it does."""
+    """Whether a word holds; a coarse word is false only if none of its parts holds."""
     if actual is None:
         return None
     if not value.startswith(COARSE):
@@ -161,7 +162,7 @@ def _direction(o: ObjectFacts, value: str, when: str) -> bool | None:
         return False if staying and resting else travel
     if resting and staying:
         return False
-    # What stays in place may still head somewhere; what rests may still be sent off.
+    # An object in place may still be heading somewhere; an object at rest may still be pushed.
     return _either(heading, False if staying else travel)
 
 
@@ -210,7 +211,7 @@ OBJECTS: dict[str, Callable[[ObjectFacts, str, str], bool | None]] = {
     "leaves": _leaves,
     "enters": _enters,
 }
-"""How a claim of each kind about an object is held against its facts."""
+"""The check of each kind of claim about an object."""
 
 
 def _known(ground: Ground, claim: Claim) -> bool:
@@ -227,7 +228,7 @@ def _course(ground: Ground, claim: Claim) -> bool | None:
     if _any_pair(claim, ground.courses):
         return True
     if claim.value == COARSE and _any_pair(claim, ground.contacts):
-        # "Headed for contact" may be said of every pair that meets.
+        # "Headed for contact" applies to every pair that meets.
         return True if claim.affirmed else None
     return False
 
@@ -237,7 +238,7 @@ def _meeting(ground: Ground, claim: Claim) -> bool | None:
         return None
     met = [when for pair, when in ground.courses.items() if set(claim.subjects) <= pair]
     if not claim.affirmed and claim.when != BETWEEN:
-        # "They have not met yet" tells nothing of later meetings.
+        # "They have not met yet" does not exclude later meetings.
         return None if claim.when == CUT else _any_pair(claim, ground.contacts)
     if _any_pair(claim, ground.contacts) or any(when not in (None, "unseen") for when in met):
         return True
@@ -274,7 +275,7 @@ def _place_of_either(ground: Ground, claim: Claim) -> bool | None:
 
 
 PLACES = ("close region", "place of either")
-"""Kinds of claims that place a pair."""
+"""Kinds of claims about the place of a pair."""
 PAIRS: dict[str, Callable[[Ground, Claim], bool | None]] = {
     "course": _course,
     "meeting": _meeting,
@@ -283,7 +284,7 @@ PAIRS: dict[str, Callable[[Ground, Claim], bool | None]] = {
     "close region": _close_region,
     "place of either": _place_of_either,
 }
-"""How a claim about a pair is held against the courses, the contacts and the close pairs."""
+"""The check of each kind of claim about a pair."""
 
 
 def _shown_region(ground: Ground, claim: Claim) -> bool | None:
@@ -338,4 +339,4 @@ CANDIDATE: dict[str, Callable[[Ground, Claim], bool | None]] = {
     "agrees": _agrees,
     "other objects": _strangers,
 }
-"""How a claim about a candidate is held against its differences."""
+"""The check of each kind of claim about a candidate."""

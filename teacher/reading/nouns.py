@@ -1,4 +1,4 @@
-"""The words that noun phrases for objects and for regions are made of."""
+"""The words of noun phrases for objects and regions."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ COLOR_WORDS = {**{c: c for c in COLORS}, "grey": "gray"}
 MATERIAL_WORDS = {**{m: m for m in MATERIALS}, "metallic": "metal", "rubbery": "rubber"}
 SHAPE_WORDS = {**{s: s for s in SHAPES}, "ball": "sphere", "block": "cube"}
 ANY_SHAPE = ("object", "one", "body", "item", "thing", "solid")
-"""Nouns that stand for an object of any shape."""
+"""Nouns for an object of any shape."""
 PLURALS = {**{f"{word}s": shape for word, shape in SHAPE_WORDS.items()}, "objects": ""}
 
 ROWS = {"top": 0, "upper": 0, "bottom": 2, "lower": 2}
 COLUMNS = {"left": 0, "right": 2}
 MIDDLE = {"center", "centre", "middle", "central"}
 PLACES = {"corner", "area", "region", "part", "portion", "zone", "section"}
-"""Nouns that may follow a region's words."""
+"""Nouns that may follow the words of a region."""
 SIDES = {"side", "edge", "border", "boundary"}
-"""Nouns that make "left" and its like coarse: the left side has three regions."""
+"""Nouns that make a side such as "left" coarse: the left side has three regions."""
 RIGHT_ONES = {"place", "places", "spot", "spots", "position", "positions", "location", "locations"}
 RIGHT_ONES |= {
     "object",
@@ -30,9 +30,9 @@ RIGHT_ONES |= {
     "order",
     "time",
 }
-"""Nouns before which "right" is no side."""
+"""Nouns before which "right" does not mean a side."""
 AT = {"near", "at", "in", "on", "along", "by", "around", "within", "inside", "toward", "towards"}
 AT |= {"to", "into", "from", "onto"}
 WAYS = {"toward": "toward", "towards": "toward", "to": "into", "into": "into", "from": "from"}
-"""Prepositions that tell a region that an object is bound for, ends in or comes from."""
+"""Prepositions of a region that an object moves to, ends in or comes from."""
 IMAGE = {"view", "scene", "image", "frame", "picture", "screen", "field"}

@@ -1,4 +1,4 @@
-"""Reads what sentences about the scene say of pairs: courses, contacts, when, and nearness."""
+"""Reads claims about pairs of objects: collision courses, contacts, their time, and closeness."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from teacher.reading.tagging import Tag
 
 RELATIONS = {"course", "meet", "contact", "passed", "close"}
 LIMITS = {"moment", "yet", "then", "before", "until", "far"}
-"""Last words of phrases that a denied event is denied up to."""
+"""Last words of phrases that limit the time up to which an event is denied."""
 
 
 @dataclass
 class Relation:
-    """A pair that is being told of: who takes part, and when, as far as it has been read."""
+    """A pair in the current clause: its participants and time, as far as they have been read."""
 
     kind: str
     tag: Tag
@@ -28,10 +28,10 @@ class Relation:
 
 
 class PairReader(Reader):
-    """Gathers who takes part in a relation until its clause ends, and holds it then."""
+    """Collects the participants of a relation and records it when its clause ends."""
 
     def __init__(self, text: str, ground: Ground, moment: str) -> None:
-        """`moment`: what the section's present tense speaks of."""
+        """`moment`: the moment of the section's present tense."""
         super().__init__(text, ground)
         self.moment = moment
         self.still_when = CUT if moment == CUT else EITHER
@@ -39,25 +39,25 @@ class PairReader(Reader):
         self.negated = self.maybe = self.future = False
 
     def verb(self) -> None:
-        """Take note that the clause has its verb."""
+        """Record that the clause has its verb."""
         raise NotImplementedError
 
     def begin_pairs(self) -> None:
         self.subjects = []
         self.nobody = False
-        """Whether the subject is "no pair" or its like."""
+        """Whether the subject is a phrase such as "no pair"."""
         self.relation: Relation | None = None
         self.time: tuple[str, Tag] | None = None
         self.met: tuple[str | None, ...] = ()
-        """The pair that the sentence told of last."""
+        """The last pair of the sentence."""
         self.companions: Names = []
-        """Who stands after "with" before the relation is named."""
+        """The object after "with" before the relation is named."""
 
     def is_incomplete(self) -> bool:
         return bool(self.relation and self.relation.between and len(self.relation.partners) < 2)
 
     def both(self) -> Names:
-        """The two objects that "they" stands for, where it is safe to say."""
+        """The two objects that "they" refers to, if unambiguous."""
         named = list(dict.fromkeys(self.mentioned)) or list(self.before)
         return named if len(named) == 2 and None not in named else [None]
 
@@ -71,7 +71,7 @@ class PairReader(Reader):
         if self.word(tag).startswith("no ") and not self._ahead({"between", "with"}):
             opening = self.near(-1) is END or self.near(-1).tag in BOUNDARIES
             if opening or "there" in (self.word(self.near(-1)), self.word(self.near(-2))):
-                # "No contact awaits the A" is not about the pair told of before.
+                # "No contact awaits the A" is not about the previous pair.
                 return
         self._relate("meeting", tag, "", self.negated)
 
@@ -80,7 +80,7 @@ class PairReader(Reader):
         if following.tag in ("between", "with", "object"):
             self._relate("meeting", tag, "", not self.negated)
         elif self.negated or self._ahead({"not", "none", "contrast"}):
-            # A contact that is denied need not be that of the pair told of before.
+            # A denied contact need not be that of the previous pair.
             return
         elif self.relation is None and self.near(-1).tag not in ("by", "past"):
             pair = self.met or tuple(self.both())
@@ -90,7 +90,7 @@ class PairReader(Reader):
                     self.relation.partners, self.relation.between = list(pair), True
 
     def is_limited(self) -> bool:
-        """Whether the sentence tells of events up to the target alone: "do not touch by then"."""
+        """Whether the sentence is limited to events up to the target: "do not touch by then"."""
         marked = any(self.last_word(t) in LIMITS for t in self.sentence)
         return self.moment == TARGET or marked
 
@@ -134,13 +134,13 @@ class PairReader(Reader):
             self.verb()
 
     def close_region(self, relation: Relation, tag: Tag) -> None:
-        """The region of a pair that is close, said right after it."""
+        """The region of a close pair, stated right after it."""
         pair = self._pairs(relation)
         if len(pair) != 1 or self.maybe or self.negated:
             return
         if relation.partners or self.near(-1).tag in ("close", "ignore"):
             when = TARGET if self.moment == TARGET or self.future else EITHER
-            # "Close to the A near the top" may place the A alone.
+            # "Close to the A near the top" may describe only the place of the A.
             kind = "place of either" if self.near(-1).tag == "object" else "close region"
             self.claims.append(self.claim(kind, pair[0], str(tag.value), True, when, tag))
 
@@ -156,7 +156,7 @@ class PairReader(Reader):
         return []
 
     def flush(self, keep: bool = False) -> None:
-        """End the relation that is being told of, and hold it as claims."""
+        """End the current relation and record its claims."""
         relation, time = self.relation, self.time
         self.relation = None
         if not keep:

@@ -13,7 +13,8 @@ _COMPASS = {
 }
 _SCREEN = {"upward": "north", "downward": "south", "leftward": "west", "rightward": "east"}
 COARSE = "~"
-"""Marks a value that need only roughly hold, such as "leftward" for an object going northwest."""
+"""Marks a value that must hold only approximately, such as "leftward" for a motion to the
+northwest."""
 
 _TABLE: dict[tuple[str, str], str] = {
     # Motion.
@@ -275,7 +276,7 @@ _TABLE: dict[tuple[str, str], str] = {
         "the collision; at the moment of the collision; at the instant of collision; as in the "
         "prediction; when the observation ends; as the observation ends; at the end"
     ),
-    # Words that steer the reading.
+    # Function words.
     ("not", ""): "not; never; neither; nor; no; hardly; cannot; without being; nowhere",
     ("maybe", ""): (
         "no longer; if; unless; until; may; might; could; once; when; whenever; even if; would "
@@ -378,4 +379,4 @@ def _trie() -> dict[str, list[tuple[tuple[str, ...], str, str]]]:
 
 
 PHRASES = _trie()
-"""By their opening word, every phrase with its tag and value, the longest first."""
+"""Every phrase with its tag and value by its first word, the longest first."""

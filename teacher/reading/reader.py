@@ -1,4 +1,4 @@
-"""What the readers of sentences share: a cursor over tags, noun phrases and the claims found."""
+"""The base of the sentence readers: a cursor over tags, noun phrases and the extracted claims."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from teacher.reading.tagging import Noun, Tag
 BOUNDARIES = {"comma", "semicolon", "and", "break", "stop"}
 END = Tag("stop", "", 0, 0)
 MOST = 9
-"""Objects that are followed at a time."""
+"""The largest number of objects tracked at a time."""
 
 Names = list[str | None]
 
 
 class Reader:
-    """Reads sentences tag by tag; a tag's handler is the method `on_<tag>`, if there is one."""
+    """Reads sentences tag by tag and calls the method `on_<tag>` where it exists."""
 
     def __init__(self, text: str, ground: Ground) -> None:
         self.text = text
@@ -29,7 +29,7 @@ class Reader:
         self.shared: list[tuple[str, str, tuple[str | None, ...], Tag]] = []
 
     def read(self, sentence: list[Tag]) -> list[Claim]:
-        """What a sentence claims, not yet held against anything."""
+        """The claims of a sentence, without verdicts."""
         self.claims = []
         self.sentence, self.at, self.shared = sentence, 0, []
         self.mentioned: list[str | None] = []
@@ -52,7 +52,7 @@ class Reader:
         raise NotImplementedError
 
     def near(self, offset: int) -> Tag:
-        """The tag so far from the current one; a full stop beyond the sentence's ends."""
+        """The tag at an offset from the current one; a full stop outside the sentence."""
         index = self.at + offset
         return self.sentence[index] if 0 <= index < len(self.sentence) else END
 
@@ -72,13 +72,13 @@ class Reader:
         span: Tag,
         candidate: str | None = None,
     ) -> Claim:
-        # A claim about what cannot be told apart names no subject, and stays unknown.
+        # A claim with an ambiguous subject names none and stays unknown.
         names = () if None in subjects else subjects
         return Claim(kind, names, value, affirmed, when, candidate, (span.start, span.stop))
 
     def group(self, most: int = MOST) -> tuple[list[str | None], Tag]:
-        """The objects that are listed from the current tag on, and the last tag; leaves the cursor
-        there. "The A, the B and the C" is a list, "the A, the B" is not."""
+        """The listed objects from the current tag on, and the last tag; moves the cursor there.
+        "The A, the B and the C" is a list, "the A, the B" is not."""
         ends = [self.at]
         joined = False
         while len(ends) < most:
@@ -103,7 +103,8 @@ class Reader:
         return self.sentence[index] if index < len(self.sentence) else END
 
     def _joint(self, index: int) -> tuple[int, bool]:
-        """How many tags join two listed objects, and whether the list ends with the next."""
+        """The number of tags that join two listed objects, and whether the next object is the
+        last."""
         tag, following = self._tag(index), self._tag(index + 1)
         if tag.tag == "and" or (tag.tag == "not" and self.word(tag) == "nor"):
             return 1, True
@@ -112,8 +113,8 @@ class Reader:
         return (1, False) if tag.tag == "comma" else (0, False)
 
     def distributed(self, claims: list[Claim]) -> list[Claim]:
-        """The claims, save those of a sentence that gives several objects several values of a
-        kind: it gives each its own ("near the top and near the left, respectively")."""
+        """The claims without those that give several objects several values of one kind, since each
+        value then belongs to one object ("near the top and near the left, respectively")."""
         for kind in {s[0] for s in self.shared} & {"region", "direction", "speed", "displaced"}:
             told = [
                 s for s in self.shared if s[0] == kind and s[1] not in ("", "slightly", "clearly")
@@ -134,8 +135,8 @@ class Reader:
         return claims
 
     def named(self, tag: Tag) -> list[str | None]:
-        """The objects that a noun phrase names, None for one that cannot be told; claims that they
-        are there."""
+        """The objects that a noun phrase names (None if ambiguous); records claims that they
+        exist."""
         noun = tag.value
         assert isinstance(noun, Noun)
         known = [*self.ground.objects, *(self.ground.extras if self.shows_extras else ())]
@@ -168,9 +169,9 @@ class Reader:
         return [fitting[0]]
 
     shows_extras = False
-    """Whether what only a candidate shows may be named."""
+    """Whether the text may name objects that only a candidate shows."""
     still_when = EITHER
-    """When "the stationary A" is said to be stationary."""
+    """The moment at which "the stationary A" is stationary."""
 
 
 @cache

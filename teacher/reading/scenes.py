@@ -1,4 +1,4 @@
-"""Reads what sentences about the scene say of one object: where it is and how it moves."""
+"""Reads claims about one object of the scene: its place and its motion."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ STILL_VERBS = {
     *("does", "do", "did", "is", "are", "has", "have", "shows", "show", "keeps", "keep"),
     *("rest", "rests", "stand", "stands", "sit", "sits", "lie", "lies"),
 }
-"""Opening words of phrases for rest that hold a verb ("does not move", but not "at rest")."""
+"""First words of phrases for rest that contain a verb ("does not move", but not "at rest")."""
 DENYING = {"not", "be", "moves", "moving", "contrast", "still"}
-"""Tags between which and a negation a direction is denied: "does not move east"."""
+"""Tags between a negation and a denied direction: "does not move east"."""
 SIDE_WORDS = {*ROWS, *COLUMNS, *MIDDLE}
 
 
 class SceneReader(SubjectReader):
-    """Holds what is said of the subject of each clause."""
+    """Records the claims about the subject of each clause."""
 
     def on_region(self, tag: Tag, when: str = "") -> None:
         relation = self.relation
@@ -35,7 +35,7 @@ class SceneReader(SubjectReader):
         if self.negated and self.near(-1).tag not in ("not", "be", "future", "contrast"):
             return
         if self.near(1).tag == "and" and self.near(2).value in SIDE_WORDS:
-            # "Near the left and the right are ..." gives each its own.
+            # "Near the left and the right are ..." gives each object one place.
             return
         unplaced = self.near(1).tag == "be" and self.word(tag).startswith("the ")
         if unplaced or self.near(1).tag == "none":
@@ -59,8 +59,8 @@ class SceneReader(SubjectReader):
         self.tell("region", str(tag.value), not self.negated, when, tag)
 
     def _is_kept(self, tag: Tag) -> bool:
-        """Whether a negation leaves a region standing: "has not moved from near the top", "does
-        not leave its place near the top", "nor has the A near the top"."""
+        """Whether a negation keeps a region true: "has not moved from near the top", "does not
+        leave its place near the top", "nor has the A near the top"."""
         previous = self.near(-1)
         if tag.tag == "from":
             return previous.tag in ("moves", "moving")
@@ -71,7 +71,7 @@ class SceneReader(SubjectReader):
         )
 
     def _is_former(self) -> bool:
-        """Whether a word after the current one puts it before the target: "out of view before"."""
+        """Whether a following word dates the claim before the target: "out of view before"."""
         return self.near(1).tag == "past" or self.word(self.near(1)) == "before"
 
     def on_into(self, tag: Tag) -> None:
@@ -89,7 +89,7 @@ class SceneReader(SubjectReader):
             return
         when = self.moment
         if when != CUT:
-            # "Toward the east, the A shifts slightly" tells the way from cut to target.
+            # "Toward the east, the A shifts slightly" describes the path from cut to target.
             ahead = not self.subjects and any(t.tag in ("slight", "across") for t in self.sentence)
             when = BETWEEN if self.slight or ahead else EITHER
         self.tell("direction", str(tag.value), not self.negated, when, tag)
@@ -163,11 +163,11 @@ class SceneReader(SubjectReader):
             self._event("leaves", tag)
 
     def _is_bare(self, tag: Tag) -> bool:
-        """Whether "leaves" or its like stands without what is left."""
+        """Whether a verb such as "leaves" has no object."""
         return " " not in self.word(tag)
 
     def _event(self, kind: str, tag: Tag) -> None:
-        # What has not happened by the cut may happen later.
+        # An event that has not happened by the cut may happen later.
         when = CUT if self.negated and self.moment == CUT and not self.future else BETWEEN
         self.tell(kind, "", not self.negated, when, tag)
 

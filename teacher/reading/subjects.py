@@ -1,4 +1,4 @@
-"""Follows whom a sentence about the scene speaks of: its subjects, its partners, its pronouns."""
+"""Tracks the subjects, partners and pronouns of a sentence about the scene."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from teacher.reading.reader import BOUNDARIES, END, MOST, Names
 from teacher.reading.tagging import Tag
 
 VERBS = {"be", "moves", "stays", "rest", "future", "across", "leaves", "enters", "still", "past"}
-"""Tags of words that may be a clause's verb."""
+"""Tags of possible verbs of a clause."""
 INVERTED = {"be", "still", "rest", "future", "expected", "word"}
 """Tags of a verb before its subject: "near the top is the A"."""
 TAKERS = {"by", "close", "meet", "passed", "contact", "between", "course", "show"}
-"""Tags before a noun phrase that is no subject."""
+"""Tags before a noun phrase that is not a subject."""
 ASIDE = {"unlike", "besides", "despite", "except", "excepting", "apart", "beside", "given"}
-"""Words before a noun phrase that is only set against the subject."""
+"""Words before a noun phrase that is only contrasted with the subject."""
 
 
 class SubjectReader(ClauseReader):
-    """Tells the subject of a clause from what stands beside it, where that is safe to say."""
+    """Distinguishes the subject of a clause from other objects, if unambiguous."""
 
     def on_object(self, tag: Tag) -> None:
         previous = self.near(-1)
@@ -38,26 +38,27 @@ class SubjectReader(ClauseReader):
             self.flush()
             self.last = self.group()[0]
             self.inner = previous.tag != "which"
-            # What is done to "the A, which the B hits" is not told apart.
+            # The claims in "the A, which the B hits" are ambiguous.
             self.subjects, self.group_start = self.last if self.inner else [None], 0
             self.finite = self.blocked = self.nobody = self.gapped = False
             self.pending = []
             return
         fresh = self.finite or not self.subjects or self.nobody
         fresh |= self.pronominal or self.gapped
-        # "Near the top is the A, and the B ..." places the A alone.
+        # "Near the top is the A, and the B ..." states the place of the A only.
         names, _ = self.group(1 if self.pending and self._parted() else MOST)
         self.subjects = names if fresh else [*self.subjects, *names][-MOST:]
         self.group_start = 0 if fresh else max(0, len(self.subjects) - len(names))
         self.last = names[-1:]
-        # "With the A at rest, the B ...": the A's part ends with the comma.
+        # "With the A at rest, the B ...": the clause of the A ends with the comma.
         self.absolute = previous.tag == "with"
         inverted = bool(self.pending) and previous.tag in INVERTED
         self.finite, self.blocked, self.nobody, self.complement = inverted, False, False, False
         self.pronominal = self.gapped = False
         if relation and not relation.subjects:
             relation.subjects = self.subjects
-        # "Near the top, the A and the B are close" places the pair, not its objects.
+        # "Near the top, the A and the B are close" states the place of the pair, not of its
+        # objects.
         self._settle(places=not self._is_pair_ahead())
 
     def _is_relative(self, previous: Tag) -> bool:
@@ -72,7 +73,7 @@ class SubjectReader(ClauseReader):
         return previous.tag == "which" and self.near(step).tag in places
 
     def _settle(self, places: bool) -> None:
-        """Tell of the subject what was said before it was named."""
+        """Apply the claims that precede the subject to it."""
         for pending in self.pending:
             if places or pending[0] != "region":
                 self.tell(*pending, subjects=self.subjects)
@@ -89,7 +90,7 @@ class SubjectReader(ClauseReader):
 
     def _is_complement(self, previous: Tag) -> bool:
         if previous.tag == "with":
-            # "With the A near the top, ..." tells of the A.
+            # "With the A near the top, ..." is about the A.
             return self.near(-2) is not END and self.near(-2).tag not in BOUNDARIES
         if previous.tag == "contrast" and self.subjects:
             # "The A, rather than the B, ..."
@@ -101,7 +102,7 @@ class SubjectReader(ClauseReader):
         # "Meets the A, and the B ...": the B begins a clause.
         names, _ = self.group(1 if self._parted() else MOST)
         if len(names) > 1 and self.near(1).tag in VERBS | {"not", "word", "show", "speed"}:
-            # "meets the A and the B stays": the B is a subject of its own.
+            # "meets the A and the B stays": the B is a new subject.
             self.at = start
             names, _ = self.group(1)
         if self.relation and not self.relation.partners:
@@ -137,7 +138,7 @@ class SubjectReader(ClauseReader):
             return
         done = previous.tag == "word" and self.word(previous).endswith(("s", "ed", "ing"))
         if done and self.word(previous) not in ("joins", "joining"):
-            # "The A pushes it east": what follows is of another than the A.
+            # "The A pushes it east": the rest is not about the A.
             self.subjects, self.group_start = [None], 0
             return
         possessive = self.word(tag) in ("its", "their") or self.near(1).tag == "object"
@@ -155,14 +156,14 @@ class SubjectReader(ClauseReader):
         self._settle(places=False)
 
     def _listed(self, previous: Tag) -> Names:
-        """The two just listed, which "both" stands for: "the A and the B, both near the left"."""
+        """The two listed objects that "both" refers to: "the A and the B, both near the left"."""
         listed = self.subjects[self.group_start :]
         beside = previous.tag == "comma" and self.near(-2).tag == "object"
         safe = len(listed) == 2 and None not in listed and (beside or previous.tag == "which")
         return listed if safe else []
 
     def _antecedent(self, pronoun: str) -> Names:
-        """Whom a pronoun stands for where that is safe to say, else None."""
+        """The antecedents of a pronoun, or None if ambiguous."""
         subjects = self.subjects or self.before
         if pronoun == "it":
             return list(subjects) if len(subjects) == 1 and not self.complement else [None]
@@ -172,14 +173,14 @@ class SubjectReader(ClauseReader):
         return self.both()
 
     def _is_ahead(self) -> bool:
-        """Whether a pronoun may stand for whom the next clause names: "although it was at rest,
-        the A moves"."""
+        """Whether a pronoun may refer to an object that the next clause names: "although it was at
+        rest, the A moves"."""
         opening = self.sentence[: self.at]
         subordinate = any(t.tag in ("break", "maybe", "by") for t in opening)
         return subordinate and all(t.tag != "object" for t in opening)
 
     def _refer(self, previous: Tag, tag: Tag) -> None:
-        """A pronoun that is no subject."""
+        """Handle a pronoun that is not a subject."""
         relation = self.relation
         self.complement = True
         if relation and not relation.partners:

@@ -1,4 +1,5 @@
-"""Cuts a section of a rationale into tags: noun phrases, regions and the vocabulary's phrases."""
+"""Splits a section of a rationale into tags: noun phrases, regions and phrases of the
+vocabulary."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ QUALITIES = STILL_WORDS | {
     ),
     *("incoming", "approaching", "lone", "only", "distant", "colliding", "remaining", "other"),
 }
-"""Adjectives that may stand before an object's colour."""
+"""Adjectives allowed before an object's colour."""
 CANDIDATES = frozenset(LETTERS)
 EVENTS = {"pair", "collision", "contact", "course", "slight", "short", "layout", "scene", "motion"}
 STOPS = {".", "!", "?"}
@@ -41,7 +42,7 @@ PUNCTUATION = {
 
 
 class Noun(NamedTuple):
-    """A noun phrase for an object: what it says of its looks, "" for what it leaves open."""
+    """A noun phrase for an object; attributes that it does not state are ""."""
 
     color: str
     material: str
@@ -56,7 +57,7 @@ class Noun(NamedTuple):
 
 
 class Tag(NamedTuple):
-    """A piece of a sentence: its tag, its value, and where it stands in the text."""
+    """A piece of a sentence: its tag, value and position in the text."""
 
     tag: str
     value: str | Noun
@@ -65,7 +66,7 @@ class Tag(NamedTuple):
 
 
 def tags(text: str, start: int, stop: int) -> list[Tag]:
-    """The tags of text[start:stop] in order. A word of no meaning here is tagged "word"."""
+    """The tags of text[start:stop] in order. Words outside the vocabulary are tagged "word"."""
     words, raw, spans = _words(text, start, stop)
     found: list[Tag] = []
     i, count = 0, len(words)
@@ -121,8 +122,8 @@ def _at(words: list[str], raw: list[str], i: int) -> tuple[str, str | Noun, int]
 
 
 def _is_article(words: list[str], letter: str, i: int) -> bool:
-    """Whether an "A" is no candidate. In doubt it is one (unlike in `teacher.letters`), for what
-    is wrongly held to be an article has the claims that follow put down to another candidate."""
+    """Whether an "A" is an article. In doubt it is a candidate (unlike in `teacher.letters`),
+    since a letter taken for an article would assign the following claims to another candidate."""
     following = words[i + 1] if i + 1 < len(words) else "."
     described = following in ADJECTIVES or following in EVENTS
     return letter == "A" and described and not (i > 0 and words[i - 1] in LISTED)
@@ -154,7 +155,7 @@ def _noun(words: list[str], i: int) -> tuple[Noun | None, int]:
 
 
 def _region(words: list[str], i: int) -> tuple[str, str, int]:
-    """A region from word i on, as a tag, a value and the word after it: "near the top-left", "to
+    """A region from word i on as a tag, a value and the index after it: "near the top-left", "to
     the upper left corner", "the center"."""
     count, way = len(words), ""
     prepared = False
@@ -182,7 +183,7 @@ def _region(words: list[str], i: int) -> tuple[str, str, int]:
     noun = words[i] if i < count else ""
     named = noun in nouns.PLACES or noun in nouns.SIDES
     if words[i - 1] == "right" and noun in nouns.RIGHT_ONES:
-        # "In the right place" is no region.
+        # "In the right place" is not a region.
         return "", "", i
     if i == begin or not (named or corner or (prepared and (article or middle))):
         return "", "", i
@@ -192,7 +193,7 @@ def _region(words: list[str], i: int) -> tuple[str, str, int]:
         if words[end : end + 1] and words[end] in nouns.IMAGE:
             i = end + 1
         elif not named:
-            # "to the left of the cube" is no region.
+            # "to the left of the cube" is not a region.
             return "", "", i
     region = REGIONS[1 if row is None else row][1 if column is None else column]
     coarse = noun in nouns.SIDES and not corner

@@ -1,4 +1,4 @@
-"""Follows which candidate and which of its objects a sentence speaks of."""
+"""Tracks the candidate that a sentence is about, and the candidate's object."""
 
 from __future__ import annotations
 
@@ -7,33 +7,33 @@ from teacher.reading.reader import BOUNDARIES, END, Names, Reader
 from teacher.reading.tagging import Tag
 
 COMPARED = {"of", "as", "like", "with", "what", "to", "does", "same"}
-"""Words before a candidate that another is only compared with."""
+"""Words before a candidate that serves only as a comparison."""
 ASIDE = {"unlike", "like", "than", "besides", "beyond", "except"}
-"""Words before a candidate that is not the one spoken of, wherever it stands."""
+"""Words before a candidate that is never the topic."""
 TELLING = {"lack", "gone", "show", "stays", "misplace", "adds"}
-"""Tags after which an object is what the candidate shows or lacks."""
+"""Tags after which an object is one that the candidate shows or lacks."""
 COMPARING = {
     *("compared", "comparison", "similar", "similarly", "identical", "equal", "relative", "akin"),
     *("as", "contrasted", "next", "like", "unlike", "than"),
 }
-"""Words before such a word, whatever candidate was spoken of before."""
+"""Words before such a word that do not change the topic."""
 EXCEPTING = {"but", "except", "save"}
 PARTED = ("in", "from", "by", "for")
-"""Words before a candidate that the clause so far has been about."""
+"""Words before the candidate that the clause has been about."""
 
 
 class TopicReader(Reader):
-    """Tells the candidate that a clause is about from those that it is only compared with."""
+    """Distinguishes the candidate that a clause is about from those it is compared with."""
 
     shows_extras = True
 
     def __init__(self, text: str, ground: Ground, lasting: bool) -> None:
-        """`lasting`: a candidate stays the one spoken of in later sentences."""
+        """`lasting`: a candidate stays the topic in later sentences."""
         super().__init__(text, ground)
         self.lasting = lasting
         self.letters: tuple[str, ...] = ()
         self.two: tuple[str, ...] = ()
-        """The two candidates that "the former" and "the latter" stand for."""
+        """The two candidates that "the former" and "the latter" refer to."""
 
     def begin(self) -> None:
         if not self.lasting:
@@ -52,10 +52,10 @@ class TopicReader(Reader):
         self.negated = self.expected = self.skipped = self.contrasted = self.refused = False
         self.clause = len(self.found)
 
-    # Boundaries and words that steer.
+    # Boundaries and function words.
 
     def on_comma(self, tag: Tag) -> None:
-        # "Unlike A, where it is near the left, ..." goes on about A.
+        # "Unlike A, where it is near the left, ..." is still about A.
         aside = self.skipped and (
             self.near(1).tag in ("which", "put", "ignore")
             or (self.near(1).tag == "word" and self.near(1).value != "there")
@@ -100,7 +100,7 @@ class TopicReader(Reader):
     def on_contrast(self, tag: Tag) -> None:
         self.expected = self.contrasted = True
 
-    # Who is spoken of.
+    # The topic.
 
     def on_candidate(self, tag: Tag) -> None:
         previous = self.word(self.near(-1)) if self.at else ""
@@ -114,14 +114,14 @@ class TopicReader(Reader):
             return
         if before in ASIDE or (before in COMPARED and self.letters) or self.is_compared(start):
             if all(t.tag != "and" for t in self.sentence[start : self.at]):
-                # "Compared with A, B ..." is no list.
+                # "Compared with A, B ..." is not a list.
                 self.at = start
             self.skipped = True
         elif before in PARTED and self.skipped:
             self.letters = ()
         elif before in PARTED and len(self.found) > self.clause:
             self._put_down_to(letters)
-            # Where another candidate was spoken of, what follows may be about either.
+            # After another topic, the rest may be about either candidate.
             self.letters = () if named else letters
         else:
             self.letters, self.choice = letters, tag
@@ -135,7 +135,7 @@ class TopicReader(Reader):
                 self.passing = False
 
     def _put_down_to(self, letters: tuple[str, ...]) -> None:
-        """Hold what the clause has said so far of the candidates that it names only now."""
+        """Assign the clause's earlier claims to the candidates that it names only now."""
         kept, moved = self.found[: self.clause], self.found[self.clause :]
         seen = dict.fromkeys((c.kind, c.subjects, c.value, c.affirmed, c.span) for c in moved)
         whole = [c for c in moved if c.candidate is None and c.kind != "agrees"]
@@ -148,8 +148,8 @@ class TopicReader(Reader):
             ]
 
     def is_compared(self, start: int) -> bool:
-        """Whether the candidate at `start` is only compared with the one that its clause is about
-        ("D resembles A"), or with one that is named next ("as in A, D ...")."""
+        """Whether the candidate at `start` is only a comparison for the topic ("D resembles A") or
+        for the candidate named next ("as in A, D ...")."""
         back = start - 1
         if self._tag_at(back).tag == "contrast" and self.word(self._tag_at(back)) != "and not":
             return True
@@ -184,7 +184,7 @@ class TopicReader(Reader):
             between = self.text[self.sentence[self.at].stop : self.near(step).start].lower()
             alone = self.near(1).tag == "and" and len(self.found) == self.clause
             if "candidate" in between and not alone:
-                # "It is in candidate A, and candidate B ..." is no list.
+                # "It is in candidate A, and candidate B ..." is not a list.
                 return tuple(dict.fromkeys(letters))
             self.at += step
             letters.append(str(self.sentence[self.at].value))
@@ -204,7 +204,7 @@ class TopicReader(Reader):
         start, told = self.at, self.near(-1).tag in TELLING
         names, last = self.group()
         if told and len(names) > 1 and self.near(1).tag in ("be", "stays", "moves", "gone"):
-            # "A lacks the X, and the Y is ...": the Y begins a clause of its own.
+            # "A lacks the X, and the Y is ...": the Y begins a new clause.
             self.at = start
             names, last = self.group(1)
         self.objects = names
@@ -231,7 +231,7 @@ class TopicReader(Reader):
             self._choose_of_two(tag.value == "latter")
 
     def _choose_of_two(self, last: bool) -> None:
-        """Go on about the first or the last of two candidates, or of two objects."""
+        """Make the first or the last of two candidates, or of two objects, the topic."""
         if len(self.two) == 2 and len(self.objects) < 2:
             self.letters, self.objects = (self.two[last],), []
         elif len(self.objects) == 2 and not self.two:
@@ -256,7 +256,7 @@ class TopicReader(Reader):
             # "It differs in nothing."
             self.found = [c for c in self.found if c.kind != "agrees"]
 
-    # What is said of them.
+    # Claims about the topic.
 
     def tell(self, kind: str, value: str, affirmed: bool, tag: Tag) -> None:
         if self.skipped or self.refused:
@@ -268,7 +268,7 @@ class TopicReader(Reader):
             self.shared.append((kind, value, tuple(self.objects), tag))
 
     def tell_of_any(self, kind: str, tag: Tag) -> None:
-        """Hold what a candidate shows of an object that cannot be told apart."""
+        """Record a claim about an ambiguous object of a candidate."""
         for letter in () if self.refused or self.skipped else self.letters:
             self.found.append(self.claim(kind, (), str(tag.value), True, TARGET, tag, letter))
 
