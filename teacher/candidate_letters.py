@@ -1,4 +1,4 @@
-"""Where a rationale names candidates by their letters, and the same rationale for another order."""
+"""Candidates' letters in a rationale, and the same rationale for permuted candidates."""
 
 from __future__ import annotations
 
@@ -9,58 +9,58 @@ from dataclasses import replace
 from data.records import LETTERS, SelectionItem
 
 LETTER = re.compile(rf"\b[{''.join(LETTERS)}]\b")
-OPENING = re.compile(r"(?:\A|[.!?:;\n(\"“—–-])\s*\Z")
-FOLLOWING = re.compile(r"[ \n]+([A-Za-z]+)")
-BESIDE_VERBS = re.compile(
+SENTENCE_START = re.compile(r"(?:\A|[.!?:;\n(\"“—–-])\s*\Z")
+NEXT_WORD = re.compile(r"[ \n]+([A-Za-z]+)")
+FOLLOWS_LETTER = re.compile(
     "and|or|nor|alone|also|too|then|still|never|always|only|itself|again|cannot|can|will|would"
     "|should|could|must|may|might|did|had|now|likewise|here|thus|therefore|instead|however|meanwhile"
 )
-"""What may follow a letter that opens a sentence, beside verbs in -s and marks."""
+"""Words after a letter at the start of a sentence, besides verbs in -s and punctuation."""
 
 
-def letters(text: str) -> list[tuple[int, int]]:
-    """Spans of the letters that name candidates, in order; the article "A" is none of them."""
+def find_letters(text: str) -> list[tuple[int, int]]:
+    """Spans of the letters that name candidates, in order; the article "A" is not one of them."""
     return [
         m.span() for m in LETTER.finditer(text) if m[0] != "A" or not _is_article(text, *m.span())
     ]
 
 
 def relabel_text(text: str, order: Sequence[int]) -> str:
-    """A rationale for the same candidates in another order.
+    """A valid rationale for the same candidates in another order.
 
     Args:
-        text: a rationale whose letters are those of the first order, as the validator lets through.
-        order: for each place in the new order, the place that its candidate had in the first one.
+        text: A rationale that passes the validator, for the old order.
+        order: For each new position of a candidate, its old position.
     """
-    _check(order)
+    _check_order(order)
     letter_of = {LETTERS[old]: LETTERS[new] for new, old in enumerate(order)}
-    pieces, at = [], 0
-    for start, stop in letters(text):
-        pieces += [text[at:start], letter_of[text[start:stop]]]
-        at = stop
-    return "".join([*pieces, text[at:]])
+    pieces, end = [], 0
+    for start, stop in find_letters(text):
+        pieces += [text[end:start], letter_of[text[start:stop]]]
+        end = stop
+    return "".join([*pieces, text[end:]])
 
 
 def reorder_candidates(item: SelectionItem, order: Sequence[int]) -> SelectionItem:
-    """An item with its candidates in another order; see `relabel`."""
-    _check(order)
+    """An item with its candidates in another order; see `relabel_text`."""
+    _check_order(order)
     candidates = tuple(item.candidates[old] for old in order)
     return replace(item, candidates=candidates, answer=list(order).index(item.answer))
 
 
-def _check(order: Sequence[int]) -> None:
+def _check_order(order: Sequence[int]) -> None:
     if sorted(order) != list(range(len(LETTERS))):
-        raise ValueError(f"{list(order)} is no order of {len(LETTERS)} candidates")
+        raise ValueError(f"{list(order)} is not a permutation of {len(LETTERS)} candidates")
 
 
 def _is_article(text: str, start: int, stop: int) -> bool:
     """Whether an "A" opens a sentence and a noun phrase, as in "A slowly moving cube"."""
-    if not OPENING.search(text, max(0, start - 4), start):
+    if not SENTENCE_START.search(text, max(0, start - 4), start):
         return False
-    while following := FOLLOWING.match(text, stop):
+    while following := NEXT_WORD.match(text, stop):
         word = following[1].lower()
         if not word.endswith("ly"):
-            ends_as_verb = word.endswith("s") and not word.endswith(("ss", "ous"))
-            return not ends_as_verb and not BESIDE_VERBS.fullmatch(word)
+            is_verb = word.endswith("s") and not word.endswith(("ss", "ous"))
+            return not is_verb and not FOLLOWS_LETTER.fullmatch(word)
         stop = following.end()
     return False

@@ -1,7 +1,7 @@
-"""The grammar that a server decodes a rationale under, so that its form holds by construction.
+"""Grammar for constrained decoding, which enforces the form of a rationale at the server.
 
-It is stricter than `validate` about form and numbers, for it cannot see what stands around a word,
-and says nothing of what is true or which letter is right: the validator still judges.
+It is stricter than the validator about form and numbers, because it cannot see the context of a
+word. It ensures neither true claims nor the right letter, so rationales are still validated.
 """
 
 from __future__ import annotations
@@ -14,50 +14,50 @@ from conf.errors import UserError
 from conf.schema import TeacherConfig
 from data.records import LETTERS
 from teacher.numbers import WORDS, lexicon
-from teacher.validation.validator import SECTIONS, word_count
+from teacher.sections import SECTIONS
+from teacher.validation.validator import count_words
 
 GRAMMAR_VERSION = "1"
 
 Trie = dict[str, "Trie"]
 State = tuple[bool, tuple[tuple[str, str], ...]]
-"""Whether a word may end here, and the name of the rule that each letter leads to."""
+"""Whether a word may end, and the rule that follows each letter."""
 STEM, WHOLE = "stem", "whole"
-"""Marks in a trie: no word may go through a stem, nor end where a whole word does."""
-SPELT = "(=[' ,;:.-])"
-"""What follows letters. Without it the engine would try tens of thousands of tokens, such as
-" fooBar", at every step instead of once, when it compiles."""
-LONGEST = 16
-"""Letters at most behind the point where a word parts from every number word, so that a model that
-repeats itself comes to an end. Rules cost less here than a repeat count, which the engine follows
-at every step."""
-ANSWER_WORDS = word_count("Answer: A")
+"""Marks in a trie: a stem bars all words that begin with it, a whole word only itself."""
+WORD_END = "(=[' ,;:.-])"
+"""Lookahead for what follows letters. Without it the engine tries tens of thousands of tokens, such
+as " fooBar", at every step of the compilation instead of once."""
+MAX_TAIL = 16
+"""Letters after the point at which a word differs from every number word, so that the words of a
+model that repeats itself end. Rules are cheaper than a repeat count, which the engine evaluates at
+every step."""
+ANSWER_WORDS = count_words("Answer: A")
 
 CONTEXTUAL = ("one", "once", "first", "minute", "frame", "pixel", "feet", "px")
-"""Words that state a number in some contexts, which a grammar does not see: barred in all."""
+"""Words that state a number in some contexts; a grammar sees no context and bars them."""
 VAGUE = ("few", "several", "many", "multiple", "numerous", "countless", "handful", "lots")
-"""The words of `lexicon.VAGUE` that a rationale can do without. The others are as often innocent;
-the plurals that they would count are barred instead."""
+"""Words of `lexicon.VAGUE` that a rationale does not need. The others are often harmless; the
+plural units after them are barred instead."""
 OPENERS = ("ten", "cent", "sec")
-"""Number words that innocent ones begin with ("tends", "center", "section")."""
+"""Number words that harmless words begin with ("tends", "center", "section")."""
 TENS = (
-    "twenties",
-    "thirties",
-    "forties",
-    "fifties",
-    "sixties",
-    "seventies",
-    "eighties",
-    "nineties",
-)
+    "twenties", "thirties", "forties", "fifties", "sixties", "seventies", "eighties", "nineties"
+)  # fmt: skip
 AFTER_ONCE = ("struck", "hit", "the", "it", "they", "this", "that", "contact", "moving")
-"""Words before which "once" is a conjunction, and so no number."""
+"""Words before which "once" is a conjunction and not a number."""
 ENDINGS = ("s", "t", "d", "re", "ve", "ll")
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A stretch of a rationale: what it opens with in GBNF, how many words that is, how many
-    follow at least, and whether it opens only after a full stop."""
+    """A part of a rationale that opens with fixed text.
+
+    Attributes:
+        opening: The fixed text as GBNF.
+        words: Words of the fixed text.
+        least: Fewest words after it.
+        after_stop: Whether a full stop precedes it.
+    """
 
     opening: str
     words: int
@@ -67,7 +67,7 @@ class Segment:
 
 def _section(name: str, least: int, then: str = "", words: int = 0) -> Segment:
     line = "" if name == SECTIONS[0] else r"\n"
-    return Segment(f'"{line}{name}:"{then}', word_count(name) + words, least)
+    return Segment(f'"{line}{name}:"{then}', count_words(name) + words, least)
 
 
 def _candidate(letter: str) -> Segment:
@@ -87,31 +87,33 @@ SEGMENTS = (
     *map(_candidate, LETTERS[1:]),
     _section(OUTCOME, 4),
 )
-"""Candidates come by their letters in order: an analysis that could name them in any order would
-need an automaton for every set of letters and count of words."""
+"""Candidates come in the order of their letters: any order would need an automaton for every set of
+letters and number of words."""
 NAMES = ascii_lowercase[: len(SEGMENTS)]
 
 
-def grammar(cfg: TeacherConfig) -> str:
-    """GBNF of the texts that have a rationale's form: every section, every candidate's letter, an
-    answer at the end, `cfg.min_words` to `cfg.max_words` words, and no number word. It is the
-    same for all items.
+def build_grammar(cfg: TeacherConfig) -> str:
+    """GBNF of the texts that have the form of a rationale; it is the same for all items.
+
+    The texts have every section, every candidate's letter, an answer at the end, `cfg.min_words` to
+    `cfg.max_words` words, and no number word.
 
     Raises:
-        UserError: `cfg.max_words` leaves no room for the sections.
+        UserError: The sections do not fit into `cfg.max_words` words.
     """
     fewest = sum(s.words + s.least for s in SEGMENTS) + ANSWER_WORDS
     if cfg.max_words < fewest:
         raise UserError(
-            f"teacher.max_words={cfg.max_words} leaves no room for the sections that "
-            f"teacher.grammar=true asks for; they take {fewest} words"
+            f"teacher.max_words={cfg.max_words} is too low for the sections that "
+            f"teacher.grammar=true enforces: set at least {fewest}",
+            code="too-few-words",
         )
     rules = [*_openings(), *_counts(cfg.min_words, cfg.max_words), *_words()]
     return "\n".join(rules) + "\n"
 
 
 def _openings() -> list[str]:
-    """How each segment opens, up to the last of its words but one; and the answer."""
+    """Rules for each segment up to its last required word but one, and for the answer."""
     rules = [
         f"open-{name}::={segment.opening} least-{segment.least - 1}"
         for name, segment in zip(NAMES, SEGMENTS, strict=True)
@@ -123,15 +125,17 @@ def _openings() -> list[str]:
 
 
 def _counts(low: int, high: int) -> list[str]:
-    """Rules that count words: `c57` is what may follow the 57th word where that is of the third
-    segment. There is one for every segment and count, but decoding and compiling hardly notice
-    them, for the letters stand in other rules, which all of these share."""
+    """Rules that count words: `c57` follows word 57 if that belongs to the third segment.
+
+    There is a rule for every segment and count, but compiling and decoding stay fast, because the
+    letters of words are in separate rules that all of these share.
+    """
     needs = [segment.words + segment.least for segment in SEGMENTS]
     rules = [f"root::=open-{NAMES[0]} {NAMES[0]}{needs[0] - 1}"]
     for k, name in enumerate(NAMES):
         last = high - ANSWER_WORDS - sum(needs[k + 1 :])
         for n in range(sum(needs[: k + 1]) - 1, last):
-            # A further word is to come, and ends the segment or does not.
+            # Another word follows, which ends the segment or does not.
             follow = [f"word {name}{n + 1}"] if n + 1 < last else []
             follow += [f"once {name}{n + 2}"] if n + 2 < last else []
             if k + 1 < len(SEGMENTS):
@@ -145,8 +149,11 @@ def _counts(low: int, high: int) -> list[str]:
 
 
 def _words() -> list[str]:
-    """Rules for a word with the space before it: letters, of which none but the first of a part is
-    a capital, parts that hyphens join, and an apostrophe. A letter alone is "a" or a candidate."""
+    """Rules for a word with the space before it.
+
+    A word is letters, of which only the first of a part may be a capital, in parts joined by
+    hyphens, with an optional apostrophe; or a single letter, which is "a" or a candidate.
+    """
     states: dict[State, str] = {}
     part = _state(_barred(), states)
     letters = f'([aA-{LETTERS[-1]}]|{part} ("-" {part}){{0,2}})'
@@ -155,15 +162,18 @@ def _words() -> list[str]:
         r'stop::=spelt "." (=[ \n])',
         f'once::=" " [Oo] "nce " ({_either(AFTER_ONCE)}) [,;:]? (=[ ])',
         f"""spelt::=" " {letters} ("'" ({_either(ENDINGS)})?)? (=[ ,;:.])""",
-        *(f'any{n}::=[a-z] any{n - 1}|"" {SPELT}' for n in range(LONGEST, 1, -1)),
-        f'any1::=[a-z]|"" {SPELT}',
+        *(f'any{n}::=[a-z] any{n - 1}|"" {WORD_END}' for n in range(MAX_TAIL, 1, -1)),
+        f'any1::=[a-z]|"" {WORD_END}',
         *(_rule(name, state, name == part) for state, name in states.items()),
     ]
 
 
 def _barred() -> Trie:
-    """The words that state numbers, letters alone, and no word at all. Behind a stem the trie ends:
-    a word that began with one would leave a server nowhere to go but nonsense ("twoness")."""
+    """A trie of number words, single letters and the empty word.
+
+    Nothing follows a stem: a server that began a word with one could only complete it to nonsense
+    ("twoness").
+    """
     stems = {*lexicon.CARDINALS, *lexicon.ORDINALS, *lexicon.QUANTITIES, *lexicon.TIMES}
     stems = stems - set(OPENERS) | {*CONTEXTUAL, *VAGUE}
     whole = {word for word in WORDS if word.isascii()} | {*lexicon.ROMAN, *lexicon.PLURAL_UNITS}
@@ -181,12 +191,12 @@ def _barred() -> Trie:
 
 
 def _state(node: Trie, states: dict[State, str]) -> str:
-    """The name of the rule for a node of the trie; nodes that the same letters follow share it."""
+    """The rule for a node of the trie; equal subtries share a rule."""
     edges = []
     for letter in ascii_lowercase:
         child = node.get(letter, {})
         if STEM not in child:
-            edges.append((letter, _state(child, states) if child else f"any{LONGEST}"))
+            edges.append((letter, _state(child, states) if child else f"any{MAX_TAIL}"))
     return states.setdefault((WHOLE not in node, tuple(edges)), f"s{len(states)}")
 
 
@@ -196,7 +206,7 @@ def _rule(name: str, state: State, either_case: bool) -> str:
     for letter, target in edges:
         letters[target] += letter + letter.upper() * either_case
     follow = [f"[{choice}] {target}" for target, choice in letters.items()] + ['""'] * ends
-    return f"{name}::={'|'.join(follow)} {SPELT}"
+    return f"{name}::={'|'.join(follow)} {WORD_END}"
 
 
 def _either(texts: tuple[str, ...]) -> str:

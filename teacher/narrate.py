@@ -1,19 +1,19 @@
-"""Writes a rationale for every training item of the selection track: the command.
+"""Command: writes a rationale for every training item of the selection track.
 
-An answer goes into the store's rationales.jsonl as it comes, accepted or not. A run that was
-killed goes on from there; the built-in narrator then ends with the very bytes of a whole run.
+Every response is appended to the store's rationales.jsonl, accepted or not, so that a killed run
+resumes. The built-in narrator then writes the same bytes as an uninterrupted run.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 from collections import Counter, defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,52 +24,58 @@ from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
 from teacher.narrator import write_rationale
 from teacher.predicates import extract_predicates
-from teacher.progress import Progress, kinds
+from teacher.progress import Progress, rejection_kinds
 from teacher.rationale_log import Journal, save_accepted
-from teacher.report.summary import Summary, accepted_of, summarise
+from teacher.report.summary import Summary, select_accepted, summarize
 from teacher.servers.responses import Response
-from teacher.validation.grader import RationaleGrader, signature
+from teacher.validation.grader import RationaleGrader
 
 if TYPE_CHECKING:
     from data.store import Store
-    from teacher.server_narrator import Job, Keep
+    from teacher.server_narrator import Job, SaveResponses
 
 log = logging.getLogger(__name__)
 
 JOURNAL_FILE = "rationales.jsonl"
-BATCH = 200
-"""Lines of the built-in narrator between two waits for the disk."""
+BATCH_SIZE = 200
+"""Responses of the built-in narrator per write to the disk."""
 
 
 @dataclass(frozen=True)
 class Narration:
-    """A teacher's answers for a store: the accepted rationales in item order, all answers by item,
-    and how many items have too short a prefix."""
+    """A teacher's responses to the training items of a store.
+
+    Attributes:
+        rationales: The accepted rationale of each item that has one, in item order.
+        items: The training items.
+        responses: All responses by item.
+        attempts: The most attempts that an item has.
+        seed: The teacher's seed.
+        too_short: Number of items whose prefix is too short.
+    """
 
     rationales: list[Rationale]
     items: list[SelectionItem]
-    answers: dict[str, list[Rationale]]
+    responses: dict[str, list[Rationale]]
     attempts: int
     seed: int
     too_short: int
 
     @cached_property
     def summary(self) -> Summary:
-        """The figures of a report. They read every word, so they are worked out when asked for."""
-        return summarise(self.items, self.answers, self.attempts, self.too_short)
+        """The figures of a report; lazy, because they count every word."""
+        return summarize(self.items, self.responses, self.attempts, self.too_short)
 
     def __str__(self) -> str:
-        rejected = Counter(
-            kind for given in self.answers.values() for r in given for kind in kinds(r)
-        )
-        reasons = ", ".join(f"{count} {kind}" for kind, count in rejected.most_common())
-        instead = sum(r.fallback for r in self.rationales)
-        told = f" ({instead} by the built-in narrator instead)" if instead else ""
-        aside = len(self.items) - self.too_short - len(self.rationales)
+        every = [r for responses in self.responses.values() for r in responses]
+        rejected = Counter(kind for r in every for kind in rejection_kinds(r)).most_common()
+        fallback = sum(r.fallback for r in self.rationales)
+        set_aside = len(self.items) - self.too_short - len(self.rationales)
         return (
-            f"rationales: {len(self.rationales)} accepted{told}, {aside} items set aside, "
-            f"{self.too_short} with too short a prefix; answers were rejected for: "
-            f"{reasons or 'nothing'}"
+            f"rationales: {len(self.rationales)} accepted"
+            f"{f' ({fallback} by the built-in narrator)' if fallback else ''}, "
+            f"{set_aside} items set aside, {self.too_short} items with too short a prefix; "
+            f"rejections: {', '.join(f'{n} {kind}' for kind, n in rejected) or 'none'}"
         )
 
 
@@ -80,147 +86,146 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     narration = narrate_store(store, cfg.teacher)
     log.info(narration)
-    report = ensure_report(store, narration, cfg.examples, run.folder)
+    write_report(store, narration, cfg.examples, run.folder)
+    summary = narration.summary
     return {
-        "accepted": float(report["accepted"]),
-        "answers": float(sum(report["asked"])),
-        "set_aside": float(report["set_aside"]),
-        "too_short": float(report["too_short"]),
-        "mean_words": float(np.mean(report["lengths"] or [0])),
+        "accepted": float(summary.accepted),
+        "answers": float(sum(summary.responses)),
+        "set_aside": float(summary.set_aside),
+        "too_short": float(summary.too_short),
+        "mean_words": float(np.mean(summary.lengths or [0])),
     }
 
 
-def ensure_report(store: Store, narration: Narration, shown: int, folder: Path) -> dict[str, Any]:
-    """The figures of a folder's report.json, with `shown` rationales on report.html. Both are
-    written anew where they are older than the last answer."""
-    figures, page = folder / "report.json", folder / "report.html"
-    answered = (store.folder / JOURNAL_FILE).stat().st_mtime
-    if not page.exists() or page.stat().st_mtime < answered:
-        from teacher.report.page import write_page
+def write_report(store: Store, narration: Narration, examples: int, folder: Path) -> None:
+    """Write report.json, report.txt and report.html, the last with some rationales."""
+    from teacher.report.page import write_page
 
-        told = narration.summary.text()
-        write_json(figures, narration.summary.to_dict())
-        write_text(folder / "report.txt", told + "\n")
-        write_page(store, narration.rationales, told, shown, narration.seed, folder)
+    figures = narration.summary.text()
+    write_json(folder / "report.json", narration.summary.to_dict())
+    write_text(folder / "report.txt", figures + "\n")
+    page = write_page(store, narration.rationales, figures, examples, narration.seed, folder)
     log.info("report: %s", page)
-    return json.loads(figures.read_bytes())
 
 
 def ensure_rationales(store: Store, cfg: TeacherConfig) -> list[Rationale]:
-    """The accepted rationale of each training item that has one, in item order; asks for those
-    that are still to come."""
+    """The accepted rationales of the training items in item order; missing ones are requested.
+
+    Raises:
+        UserError: See `narrate_store`.
+    """
     narration = narrate_store(store, cfg)
     log.info(narration)
     return narration.rationales
 
 
 def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
-    """Ask a teacher for what is missing, and sum up all of its answers. The accepted ones are put
-    into the store's rationales.parquet too.
+    """Request the missing rationales, and save the accepted ones to rationales.parquet too.
 
     Raises:
-        UserError: rationales.jsonl is damaged or of another benchmark, or the servers fail
+        UserError: rationales.jsonl is damaged or belongs to another benchmark, or the servers fail
             for good.
     """
     items = store.selection("train")
-    judge = RationaleGrader(cfg)
+    grader = RationaleGrader(cfg)
     with Journal(store.folder / JOURNAL_FILE) as journal:
         check_items(journal, items)
-        answers = defaultdict(list)
+        responses: dict[str, list[Rationale]] = defaultdict(list)
         for rationale in journal.rationales:
-            wanted = cfg.fallback or not rationale.fallback
-            if wanted and signature(rationale) == judge.signature:
-                answers[rationale.item_id].append(rationale)
-        # Settled items are left out here, so that none takes a place among the requests in flight.
-        jobs = [(i, len(answers[i.item_id])) for i in items if _open(answers[i.item_id], cfg)]
+            if grader.is_current(rationale) and (cfg.fallback or not rationale.fallback):
+                responses[rationale.item_id].append(rationale)
 
-        def keep(new: list[Rationale]) -> None:
+        def is_settled(item: SelectionItem) -> bool:
+            return any(r.accepted for r in responses[item.item_id])
+
+        def save(new: list[Rationale]) -> None:
             journal.append(new)
             for rationale in new:
-                answers[rationale.item_id].append(rationale)
+                responses[rationale.item_id].append(rationale)
 
+        # Finished items are left out here, so that none occupies a slot of the requests in flight.
+        jobs = [
+            (item, made)
+            for item in items
+            if (made := len(responses[item.item_id])) < cfg.attempts and not is_settled(item)
+        ]
         progress, too_short = Progress(len(items), len(items) - len(jobs)), 0
         with progress.bar:
             if cfg.url is None:
-                too_short = _narrate_all(jobs, store, judge, keep, progress)
+                too_short = _narrate_by_template(jobs, store, grader, save, progress)
             elif jobs:
                 from teacher.server_narrator import ServerNarrator
 
-                too_short = asyncio.run(ServerNarrator(store, cfg, judge, keep, progress).run(jobs))
+                narrator = ServerNarrator(store, cfg, grader, save, progress)
+                too_short = asyncio.run(narrator.run(jobs))
         if cfg.fallback:
-            aside = [item for item in items if _set_aside(answers[item.item_id], cfg)]
-            keep([r for item in aside for r in _stand_in(item, store, judge)])
-        rationales = accepted_of(items, answers)
+            set_aside = (
+                i for i in items if not is_settled(i) and len(responses[i.item_id]) >= cfg.attempts
+            )
+            save([r for item in set_aside for r in _write_fallback(item, store, grader)])
+        rationales = select_accepted(items, responses)
         save_accepted(rationales, store.folder / "rationales.parquet")
-    return Narration(rationales, items, dict(answers), cfg.attempts, cfg.seed, too_short)
+    return Narration(rationales, items, dict(responses), cfg.attempts, cfg.seed, too_short)
 
 
 def check_items(journal: Journal, items: list[SelectionItem]) -> None:
-    """Raises UserError where a journal has answers to items that are not among these: it was
-    narrated for another benchmark, and no answer is passed over in silence."""
-    strangers = {r.item_id for r in journal.rationales} - {item.item_id for item in items}
-    if strangers:
+    """Raises UserError if a journal has responses to items that are not among `items`."""
+    unknown = {r.item_id for r in journal.rationales} - {item.item_id for item in items}
+    if unknown:
         raise UserError(
-            f"{journal.path} has rationales for {len(strangers)} items that the training split "
-            f"there does not hold, such as {min(strangers)}: it is of another benchmark. Put the "
-            "file there that was narrated for this one, or delete it to narrate anew"
+            f"{journal.path} has rationales for {len(unknown)} items that the training split does "
+            f"not have, such as {min(unknown)}, so it belongs to another benchmark. Replace it by "
+            "the file of this benchmark, or delete it to narrate again",
+            code="other-data",
         )
 
 
-def _open(given: list[Rationale], cfg: TeacherConfig) -> bool:
-    return len(given) < cfg.attempts and not any(r.accepted for r in given)
-
-
-def _set_aside(given: list[Rationale], cfg: TeacherConfig) -> bool:
-    return len(given) >= cfg.attempts and not any(r.accepted for r in given)
-
-
-def _stand_in(item: SelectionItem, store: Store, judge: RationaleGrader) -> list[Rationale]:
-    """The built-in narrator's rationale for an item that was set aside, marked as such; none where
-    it does not stand before the validator either."""
-    predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
-    cfg = judge.cfg
-    if predicates is None:
-        return []
-    for attempt in range(cfg.attempts):
-        reply = Response(write_rationale(predicates, item, cfg.seed, attempt))
-        rationale = judge.judge(reply, predicates, item, cfg.attempts + attempt)
-        if rationale.accepted:
-            return [replace(rationale, fallback=True)]
-    return []
-
-
-def _narrate_all(
-    jobs: list[Job], store: Store, judge: RationaleGrader, keep: Keep, progress: Progress
+def _narrate_by_template(
+    jobs: list[Job],
+    store: Store,
+    grader: RationaleGrader,
+    save: SaveResponses,
+    progress: Progress,
 ) -> int:
-    """Narrate in item order without a server; gives the count of too short prefixes."""
-    too_short, batch = 0, []
-    for job in jobs:
-        given = _narrate_one(job, store, judge)
-        too_short += not given
-        batch += given
-        if len(batch) >= BATCH:
-            keep(batch)
+    """Narrate in item order without a server; returns the number of too short prefixes."""
+    too_short = 0
+    batch: list[Rationale] = []
+    for item, first in jobs:
+        responses = []
+        for rationale in _write_rationales(item, store, grader, first):
+            responses.append(rationale)
+            if rationale.accepted:
+                break
+        too_short += not responses
+        batch += responses
+        if len(batch) >= BATCH_SIZE:
+            save(batch)
             batch = []
-        progress.add(given)
-        progress.settle()
-    keep(batch)
+        progress.add_responses(responses)
+        progress.finish_item()
+    save(batch)
     return too_short
 
 
-def _narrate_one(job: Job, store: Store, judge: RationaleGrader) -> list[Rationale]:
-    """An item's answers up to the accepted one or the last attempt; none for a short prefix."""
-    item, first = job
+def _write_fallback(item: SelectionItem, store: Store, grader: RationaleGrader) -> list[Rationale]:
+    """The built-in narrator's first accepted rationale for an item that was set aside, if any."""
+    attempts = _write_rationales(item, store, grader)
+    return [
+        replace(r, fallback=True, attempt=grader.cfg.attempts + r.attempt)
+        for r in attempts
+        if r.accepted
+    ][:1]
+
+
+def _write_rationales(
+    item: SelectionItem, store: Store, grader: RationaleGrader, first: int = 0
+) -> Iterator[Rationale]:
+    """The built-in narrator's rationales from attempt `first` on; none for a too short prefix."""
     predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
-    given: list[Rationale] = []
-    if predicates is None:
-        return given
-    for attempt in range(first, judge.cfg.attempts):
-        reply = Response(write_rationale(predicates, item, judge.cfg.seed, attempt))
-        given.append(judge.judge(reply, predicates, item, attempt))
-        if given[-1].accepted:
-            break
-    return given
+    if predicates is not None:
+        for attempt in range(first, grader.cfg.attempts):
+            text = write_rationale(predicates, item, grader.cfg.seed, attempt)
+            yield grader.grade(Response(text), predicates, item, attempt)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
-"""The built-in narrator: predicates become varied prose without a model.
+"""Built-in narrator: writes rationales from predicates with templates, without a model.
 
-Every statement has a few phrasings over a small vocabulary, so that a small student can learn it.
+Each statement has a few phrasings over a small vocabulary, so that a small student can learn it.
 """
 
 from __future__ import annotations
 
 import hashlib
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,81 +23,100 @@ from teacher.predicates import (
 )
 
 NARRATOR_VERSION = "5"
-ENOUGH, ROOM = 110, 250
-"""Words under which a rationale is told in full, well above the 80 that it needs, and over which it
-is told in brief (paper, Rationale construction)."""
-BRIEF, SPARSE, FULL = (3, 1, 1, 1), (4, 1, 2, 1), (6, 4, 6, 2)
-"""Objects parsed, movers analysed, objects predicted and pairs of each kind that are named: in a
-rationale, where four candidates take the room, and else."""
+FEW_WORDS, MOST_WORDS = 110, 250
+"""Words below which a rationale is rewritten in full detail, well above the 80 that it needs, and
+above which it is rewritten briefly (paper, Rationale construction)."""
+
+
+class Detail(NamedTuple):
+    """Most objects and pairs that each part of a text names."""
+
+    parsed: int
+    analysed: int
+    predicted: int
+    pairs: int
+
+
+BRIEF, SPARSE, FULL = Detail(3, 1, 1, 1), Detail(4, 1, 2, 1), Detail(6, 4, 6, 2)
 
 
 def write_rationale(
     predicates: Predicates, item: SelectionItem, seed: int, attempt: int = 0
 ) -> str:
     """A rationale of 80 to 250 words; the same arguments give the same text."""
-    text = _Voice(SPARSE, seed, item.item_id, attempt).rationale(predicates)
-    if len(text.split()) > ROOM:
-        text = _Voice(BRIEF, seed, item.item_id, attempt).rationale(predicates)
-    if len(text.split()) < ENOUGH:
-        text = _Voice(FULL, seed, item.item_id, attempt, padded=True).rationale(predicates)
+    keys = (seed, item.item_id, attempt)
+    text = _Writer(SPARSE, *keys).rationale(predicates)
+    if len(text.split()) > MOST_WORDS:
+        text = _Writer(BRIEF, *keys).rationale(predicates)
+    if len(text.split()) < FEW_WORDS:
+        text = _Writer(FULL, *keys, padded=True).rationale(predicates)
     return text
 
 
 def write_description(scene: Scene, start: int, stop: int, target: int, seed: int) -> str | None:
-    """What happens between the prefix [start, stop] and the target frame, without candidates;
-    None if the prefix is too short to tell."""
+    """What happens from the prefix [start, stop] to the target frame, without candidates.
+
+    Returns None if the prefix is too short.
+    """
     facts = extract_facts(scene, start, stop, target)
     if facts is None:
         return None
-    return _Voice(FULL, seed, scene.scene_id, start, stop, target).description(facts)
+    return _Writer(FULL, seed, scene.scene_id, start, stop, target).description(facts)
 
 
 def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:
-    """Whether each candidate matches the predicted state and why, a line a candidate; the same
-    arguments give the same lines."""
-    voice, key = _Voice(SPARSE, item.item_id, "matches"), most_discriminative_object(predicates)
+    """One line per candidate: whether it matches the predicted state, and why.
+
+    The same arguments give the same lines.
+    """
+    writer, key = _Writer(SPARSE, item.item_id, "matches"), most_discriminative_object(predicates)
     expected = {o.object: o.target_region for o in predicates.objects}
-    return tuple(voice.match(c, key, expected) for c in predicates.candidates)
+    return tuple(writer.match(c, key, expected) for c in predicates.candidates)
 
 
 def most_discriminative_object(predicates: Predicates) -> ObjectFacts:
-    """The object by whose place most candidates are told from the target; of several the first
-    that the prediction is about. All candidates are compared by it, so that each is described
-    before it is judged."""
+    """The object whose place distinguishes most wrong candidates from the target.
+
+    Ties go to the object that comes first in the prediction. All candidates are compared by this
+    object, so that each is described before it is judged.
+    """
     wrong = [c.differences for c in predicates.candidates if not c.agrees]
 
-    def told_apart(o: ObjectFacts) -> int:
+    def count_distinguished(o: ObjectFacts) -> int:
         return sum(
             any(d.object == o.object and d.kind in ("region", "missing") for d in differences)
             for differences in wrong
         )
 
-    ranked = sorted(predicates.objects, key=lambda o: _rank(predicates, o))
-    return max([o for o in ranked if o.target_sight == "shown"] or ranked, key=told_apart)
+    ranked = _rank_objects(predicates)
+    visible = [o for o in ranked if o.target_sight == "shown"]
+    return max(visible or ranked, key=count_distinguished)
 
 
-def _sentences(statements: list[str]) -> str:
-    return " ".join(s[0].upper() + s[1:] + "." for s in statements)
+def _sentences(parts: list[str]) -> str:
+    return " ".join(s[0].upper() + s[1:] + "." for s in parts)
 
 
 def _pair(objects: tuple[str, str]) -> str:
     return f"the {objects[0]} and the {objects[1]}"
 
 
-def _rank(facts: Facts, o: ObjectFacts) -> tuple[bool, bool, bool]:
-    met = any(o.object in m.objects for m in (*facts.courses, *facts.contacts))
-    return (not met, o.extent == "stays", o.speed in (None, "stationary"))
+def _rank_objects(facts: Facts) -> list[ObjectFacts]:
+    """Objects in order of relevance: first those of a meeting, then moving ones."""
+    met = {name for m in (*facts.courses, *facts.contacts) for name in m.objects}
+    return sorted(
+        facts.objects,
+        key=lambda o: (o.object not in met, o.extent == "stays", o.speed in (None, "stationary")),
+    )
 
 
-class _Voice:
-    """A narrator whose choices of phrasing follow from `keys` alone."""
+class _Writer:
+    """Writes the parts of a text; `keys` determine its choices of phrasing."""
 
-    def __init__(
-        self, detail: tuple[int, int, int, int], *keys: int | str, padded: bool = False
-    ) -> None:
+    def __init__(self, detail: Detail, *keys: int | str, padded: bool = False) -> None:
         digest = hashlib.sha256(repr(keys).encode()).digest()
         self.rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-        self.parsed, self.analysed, self.predicted, self.pairs = detail
+        self.detail = detail
         self.padded = padded
 
     def pick(self, *options: str) -> str:
@@ -119,8 +139,8 @@ class _Voice:
         )
 
     def opening(self, facts: Facts, key: ObjectFacts | None = None) -> list[str]:
-        """All before the candidates, whose `key` object is predicted first."""
-        ranked = sorted(facts.objects, key=lambda o: _rank(facts, o))
+        """The sections before the candidate analysis; the prediction begins with `key`."""
+        ranked = _rank_objects(facts)
         predicted = sorted(ranked, key=lambda o: o is not key) if key else ranked
         return [
             f"Scene parse: {_sentences(self.parse(facts, ranked))}",
@@ -129,16 +149,16 @@ class _Voice:
         ]
 
     def parse(self, facts: Facts, ranked: list[ObjectFacts]) -> list[str]:
-        told = [self.seen(o) for o in ranked[: self.parsed]]
-        told[0] = f"{facts.instant}, {told[0]}"
+        parts = [self.observed(o) for o in ranked[: self.detail.parsed]]
+        parts[0] = f"{facts.instant}, {parts[0]}"
         if not facts.courses:
             free = self.pick("no pair is on a collision course", "no pair is heading for contact")
-            return [*told, free]
-        for course in facts.courses[: self.pairs]:
-            told.append(f"{_pair(course.objects)} are on a collision course")
-        return told
+            return [*parts, free]
+        for course in facts.courses[: self.detail.pairs]:
+            parts.append(f"{_pair(course.objects)} are on a collision course")
+        return parts
 
-    def seen(self, o: ObjectFacts) -> str:
+    def observed(self, o: ObjectFacts) -> str:
         if o.sight == OUT_OF_VIEW:
             return f"the {o.object} is out of view"
         if o.sight == "hidden":
@@ -149,27 +169,27 @@ class _Voice:
                 f"the {o.object} rests {o.region}",
                 f"the {o.object} is {o.region} and does not move",
             )
-        way = f" toward the {o.heading}" if o.heading else ""
+        toward = f" toward the {o.heading}" if o.heading else ""
         return self.pick(
-            f"the {o.object} is {o.region}, moving {o.speed}{way}",
-            f"the {o.object} is {o.region} and moves {o.speed}{way}",
-            f"the {o.object} {o.region} is moving {o.speed}{way}",
+            f"the {o.object} is {o.region}, moving {o.speed}{toward}",
+            f"the {o.object} is {o.region} and moves {o.speed}{toward}",
+            f"the {o.object} {o.region} is moving {o.speed}{toward}",
         )
 
     def motion(self, facts: Facts, ranked: list[ObjectFacts]) -> list[str]:
-        told = [self.meeting(m) for m in facts.courses[: self.pairs] if m.when != "unseen"]
+        parts = [self.meeting(m) for m in facts.courses[: self.detail.pairs] if m.when != "unseen"]
         on_course = {frozenset(m.objects) for m in facts.courses}
-        for contact in facts.contacts[: self.pairs]:
+        for contact in facts.contacts[: self.detail.pairs]:
             if frozenset(contact.objects) not in on_course:
-                told.append(f"{_pair(contact.objects)} will also meet")
+                parts.append(f"{_pair(contact.objects)} will also meet")
         still = ("stays", "unseen")
         movers = [o for o in ranked if o.extent not in still or o.enters or o.leaves]
         struck = {name for m in facts.contacts for name in m.objects}
-        told += [self.travel(o, o.object in struck) for o in movers[: self.analysed]]
+        parts += [self.travel(o, o.object in struck) for o in movers[: self.detail.analysed]]
         if not movers:
-            told.append("the objects remain where they are")
-        elif any(o.extent == "stays" for o in ranked) and len(movers) <= self.analysed:
-            told.append(
+            parts.append("the objects remain where they are")
+        elif any(o.extent == "stays" for o in ranked) and len(movers) <= self.detail.analysed:
+            parts.append(
                 self.pick(
                     "the other objects remain where they are",
                     "the other objects hardly move",
@@ -177,10 +197,10 @@ class _Voice:
                 )
             )
         elif any(o.extent == "stays" and o.speed == "stationary" for o in ranked):
-            told.append("the stationary objects remain where they are unless struck")
+            parts.append("the stationary objects remain where they are unless struck")
         if self.padded:
-            told.append("an object keeps its heading until contact turns it or it comes to rest")
-        return told
+            parts.append("an object keeps its heading until contact turns it or it comes to rest")
+        return parts
 
     def meeting(self, meeting: Meeting) -> str:
         pair = _pair(meeting.objects)
@@ -197,22 +217,23 @@ class _Voice:
             return self.pick(f"the {o.object} leaves the view", f"the {o.object} moves out of view")
         if o.enters:
             return f"the {o.object} enters the view {o.target_region}"
-        way = f" toward the {o.travel}" if o.travel else ""
+        toward = f" toward the {o.travel}" if o.travel else ""
         if o.speed in (None, "stationary"):
             cause = "once struck, " if struck and o.speed else ""
         else:
             cause = self.pick("", f"moving {o.speed}, ", "given its speed, ")
-        return f"{cause}the {o.object} {o.extent}{way}"
+        return f"{cause}the {o.object} {o.extent}{toward}"
 
     def prediction(self, facts: Facts, ranked: list[ObjectFacts]) -> list[str]:
-        told = [
-            f"{_pair(c.objects)} will be very close {c.region}" for c in facts.close[: self.pairs]
+        parts = [
+            f"{_pair(c.objects)} will be very close {c.region}"
+            for c in facts.close[: self.detail.pairs]
         ]
-        told += [self.expected(o) for o in ranked[: self.predicted]]
-        told[0] = f"{facts.moment}, {told[0]}"
+        parts += [self.expected(o) for o in ranked[: self.detail.predicted]]
+        parts[0] = f"{facts.moment}, {parts[0]}"
         if self.padded:
-            told.append("the layout at the target moment follows from these motions")
-        return told
+            parts.append("the layout at the target moment follows from these motions")
+        return parts
 
     def expected(self, o: ObjectFacts) -> str:
         if o.target_sight == OUT_OF_VIEW:
@@ -236,22 +257,22 @@ class _Voice:
     def candidate(
         self, candidate: CandidateFacts, key: ObjectFacts, expected: dict[str, str]
     ) -> str:
-        """Where a candidate shows the `key` object, and then whether it agrees."""
-        name, shown = f"candidate {candidate.letter}", f"shows the {key.object}"
+        """The place of the `key` object in a candidate, and then whether the candidate agrees."""
+        name, shows = f"candidate {candidate.letter}", f"shows the {key.object}"
         if candidate.agrees:
             end = self.pick("", " with the prediction")
-            return f"{name} {shown} {key.target_region} and agrees{end}"
+            return f"{name} {shows} {key.target_region} and agrees{end}"
         others = ", and shows other objects" * candidate.other_objects
-        differs = {d.object: d for d in candidate.differences}.get(key.object)
-        if differs is None:
+        difference = {d.object: d for d in candidate.differences}.get(key.object)
+        if difference is None:
             why = self.difference(candidate.differences[0], expected)
-            return f"{name} {shown} {key.target_region} but {why}{others}"
-        if differs.kind == "displaced":
-            way = f" toward the {differs.heading}" if differs.heading else ""
-            return f"{name} {shown} {key.target_region} but {differs.extent} off{way}{others}"
-        if differs.kind == "missing":
+            return f"{name} {shows} {key.target_region} but {why}{others}"
+        if difference.kind == "displaced":
+            toward = f" toward the {difference.heading}" if difference.heading else ""
+            return f"{name} {shows} {key.target_region} but {difference.extent} off{toward}{others}"
+        if difference.kind == "missing":
             return f"{name} lacks the {key.object}{others}"
-        return f"{name} {shown} {differs.region}, not {key.target_region}{others}"
+        return f"{name} {shows} {difference.region}, not {key.target_region}{others}"
 
     def match(self, candidate: CandidateFacts, key: ObjectFacts, expected: dict[str, str]) -> str:
         name = f"Candidate {candidate.letter}"
@@ -275,23 +296,25 @@ class _Voice:
                 f"shows the {d.object} {d.region}, not {expected[d.object]}",
                 f"has the {d.object} {d.region} and not {expected[d.object]}",
             )
-        way = f" toward the {d.heading}" if d.heading else ""
+        toward = f" toward the {d.heading}" if d.heading else ""
         return self.pick(
-            f"has the {d.object} {d.extent} off{way}",
-            f"shows the {d.object} {d.extent} too far{way}" if way else f"has the {d.object} off",
+            f"has the {d.object} {d.extent} off{toward}",
+            f"shows the {d.object} {d.extent} too far{toward}"
+            if toward
+            else f"has the {d.object} off",
         )
 
     def outcome(self, facts: Facts, letter: str | None) -> list[str]:
-        told = [f"{_pair(c.objects)} are very close {c.region}" for c in facts.close[:1]]
-        ranked = sorted(facts.objects, key=lambda o: _rank(facts, o))
-        shown = [o for o in ranked if o.target_sight == "shown"]
-        told += [f"the {o.object} is {o.target_region}" for o in shown[: 2 - len(told)]]
+        parts = [f"{_pair(c.objects)} are very close {c.region}" for c in facts.close[:1]]
+        ranked = _rank_objects(facts)
+        visible = [o for o in ranked if o.target_sight == "shown"]
+        parts += [f"the {o.object} is {o.target_region}" for o in visible[: 2 - len(parts)]]
         if letter is not None:
-            told.append(
+            parts.append(
                 self.pick(
                     f"candidate {letter} shows this layout",
                     f"this layout is that of candidate {letter}",
                     f"only candidate {letter} agrees",
                 )
             )
-        return told or ["no object is in view"]
+        return parts or ["no object is in view"]

@@ -1,7 +1,7 @@
-"""What a rationale may say: qualitative facts read from the oracle, with no number in any of them.
+"""Predicates: qualitative facts that a rationale may state, read from the oracle.
 
-A fact is taken at the cut, an instant at or before the prefix's end that lies clear of the next
-collision, and at the target. The thresholds below are the only numbers, and none leaves this file.
+Facts hold at the cut, an instant at or before the end of the prefix and clear of the next
+collision, and at the target. No fact contains a number; the thresholds stay in this file.
 """
 
 from __future__ import annotations
@@ -18,34 +18,34 @@ from data.records import FPS, LETTERS, Candidate, Collision, Scene, SelectionIte
 CUT_MARGIN = 12
 """Frames between the cut and the first collision (paper, Rationale construction)."""
 COURSE_FRAMES = 5
-"""Frames before the cut that give headings and collision courses; also the shortest prefix
-(paper, Rationale construction)."""
+"""Frames up to the cut that determine headings and collision courses; also the length of the
+shortest prefix (paper, Rationale construction)."""
 STATIONARY = 0.05
-"""Simulator units a second under which an object is stationary (paper, Rationale construction)."""
+"""Speed (simulator units/s) below which an object is stationary (paper, Rationale construction)."""
 SPEEDS = ((0.6, "slowly"), (1.5, "steadily"), (3.0, "quickly"))
-"""Upper bounds (simulator units a second) of the speed words; anything faster is VERY_FAST."""
+"""Upper bounds (simulator units/s) of the speed words; anything faster is VERY_FAST."""
 VERY_FAST = "very quickly"
 IMMINENT, SOON = 15, 40
-"""Frames from the cut within which an event is imminent, or soon (paper, Rationale
+"""Most frames from the cut to an imminent event, and to one that comes soon (paper, Rationale
 construction)."""
 CONTACT = 0.4
 """Ground-plane distance (simulator units) at which two objects of radius 0.2 touch."""
 COURSE_MARGIN = 0.1
-"""Simulator units by which a straight-line pass may miss and still be a collision course."""
+"""Gap (simulator units) at the closest approach up to which a pass counts as a collision course."""
 COURSE_HORIZON = 60
-"""Frames that a straight line is followed to judge a collision course."""
+"""Frames over which straight paths are extrapolated."""
 VERY_CLOSE = 0.6
-"""Ground-plane distance (simulator units) under which a pair is very close."""
-SHOWN = 0.05
-"""Visible fraction at and under which an object in view is hidden."""
-VIEW = 336
-"""Side (px) of the square image in which displacements are judged: what a model is shown."""
+"""Ground-plane distance (simulator units) below which a pair is very close."""
+MIN_VISIBLE = 0.05
+"""Visible fraction at or below which an object in view is hidden."""
+IMAGE_SIZE = 336
+"""Side (px) of the square image in which displacements are measured: the models' input size."""
 STAYS, SHIFTS = 8.0, 60.0
-"""Bounds (px at 336) of "stays" and "shifts slightly"; anything further "moves across"."""
+"""Upper bounds (px at 336) of "stays" and "shifts slightly"; anything further "moves across"."""
 BORDER = 6.0
-"""Displacement (px at 336) under which a change of region is only a border crossed."""
+"""Displacement (px at 336) below which a change of region is ignored."""
 DISPLACED, CLEARLY = 12.0, 40.0
-"""Displacements (px at 336) from which an object is off, and clearly so."""
+"""Lower bounds (px at 336) of a displacement, and of a clear one."""
 
 COMPASS = (
     "east",
@@ -57,7 +57,7 @@ COMPASS = (
     "north",
     "northeast",
 )
-"""Clockwise from the image's x axis; y points down, so south is down."""
+"""Directions in the image plane, clockwise from the x axis; south is down."""
 REGIONS = (
     ("near the top-left", "near the top", "near the top-right"),
     ("near the left", "near the center", "near the right"),
@@ -70,11 +70,17 @@ OUT_OF_VIEW = "out of view"
 class ObjectFacts:
     """One object at the cut and at the target.
 
-    `sight` and `target_sight` are "shown", "hidden" (in view but covered) or "out of view";
-    `speed` is "stationary" or a speed word, None where the object is out of view at the cut, for
-    nobody sees how it moves; `heading` and `travel` are compass words of the motion at the cut and
-    from cut to target, None where there is none to speak of or, at a contact, none to see yet;
-    `extent` says how far it goes from cut to target, "unseen" where it is out of view at both.
+    Attributes:
+        object: Color, material and shape.
+        region: Cell of the 3x3 grid at the cut, or "out of view".
+        sight: Visibility at the cut: "shown", "hidden" (in view but covered) or "out of view".
+        speed: "stationary" or a speed word; None if the object is out of view at the cut.
+        heading: Compass word of the motion at the cut; None if stationary, or if a contact at the
+            cut leaves no frame of the motion after it.
+        target_region: Region at the target.
+        target_sight: Visibility at the target.
+        extent: Distance from cut to target; "unseen" if the object is out of view at both.
+        travel: Compass word of the way from cut to target; None if the object stays or is unseen.
     """
 
     object: str
@@ -98,8 +104,11 @@ class ObjectFacts:
 
 @dataclass(frozen=True)
 class Meeting:
-    """A pair and when it collides, from the cut: imminent, soon, later, None for never, or
-    "unseen" where the clip ends with the pair still closing."""
+    """A pair of objects and when it collides, counted from the cut.
+
+    `when` is "imminent", "soon" or "later"; None if the pair never collides, and "unseen" if the
+    scene ends while the pair still approaches.
+    """
 
     objects: tuple[str, str]
     when: str | None
@@ -107,7 +116,7 @@ class Meeting:
 
 @dataclass(frozen=True)
 class Closeness:
-    """A pair that is very close at the target, and the region that it is around."""
+    """A pair that is very close at the target, and the region of its midpoint."""
 
     objects: tuple[str, str]
     region: str
@@ -115,11 +124,11 @@ class Closeness:
 
 @dataclass(frozen=True)
 class Difference:
-    """How a candidate shows one object otherwise than the target.
+    """A difference between a candidate and the target in one object.
 
-    `kind` is "region" (shown in `region`), "displaced" (right region, off by `extent`, slightly or
-    clearly, toward `heading`), "missing" (should be seen and is not) or "extra" (is seen and
-    should not be).
+    `kind` is "region" (the object is in another `region`), "displaced" (same region, but displaced
+    "slightly" or "clearly", the `extent`, toward `heading`), "missing" (visible only in the target)
+    or "extra" (visible only in the candidate).
     """
 
     object: str
@@ -131,8 +140,10 @@ class Difference:
 
 @dataclass(frozen=True)
 class CandidateFacts:
-    """A candidate's layout against the target's: it agrees, or differs in these objects, the
-    most telling first. `other_objects` is true where it shows a different set of objects."""
+    """A candidate compared with the target: its differences, the largest first.
+
+    `other_objects` is true if the candidate's scene has a different set of objects.
+    """
 
     letter: str
     agrees: bool
@@ -142,11 +153,17 @@ class CandidateFacts:
 
 @dataclass(frozen=True)
 class Facts:
-    """A scene at the cut and at the target: `instant` and `moment` name the two in words.
+    """A scene at the cut and at the target.
 
-    `entering` and `leaving` are the objects that come into view and go out of it from cut to
-    target. `courses` are pairs on a collision course at the cut, `contacts` pairs that collide
-    between cut and target, whether or not they were on a course.
+    Attributes:
+        instant: The cut in words.
+        moment: The target's moment in words.
+        objects: One entry per object.
+        entering: Objects that come into view between cut and target.
+        leaving: Objects that go out of view between cut and target.
+        courses: Pairs on a collision course at the cut.
+        contacts: Pairs that collide between cut and target, on a course or not.
+        close: Pairs that are very close at the target.
     """
 
     instant: str
@@ -159,7 +176,7 @@ class Facts:
     close: tuple[Closeness, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain lists, strings and booleans, ready for JSON."""
+        """Plain values, ready for JSON."""
         return asdict(self)
 
 
@@ -175,8 +192,11 @@ class Predicates(Facts):
 
 
 def find_cut(scene: Scene, start: int, stop: int) -> int | None:
-    """The frame that facts are taken at for the prefix [start, stop]: its end, or CUT_MARGIN
-    frames before the first collision from there on; None if that leaves too short a prefix."""
+    """The cut for the prefix [start, stop]; None if it leaves too short a prefix.
+
+    The cut is the end of the prefix, or CUT_MARGIN frames before the first collision at or after
+    the end, whichever is earlier.
+    """
     upcoming = [c.frame for c in scene.collisions if c.frame >= stop]
     cut = min([stop, *(frame - CUT_MARGIN for frame in upcoming)])
     return cut if cut - start + 1 >= COURSE_FRAMES else None
@@ -185,7 +205,10 @@ def find_cut(scene: Scene, start: int, stop: int) -> int | None:
 def extract_facts(
     scene: Scene, start: int, stop: int, target: int, moment: str = "at the target moment"
 ) -> Facts | None:
-    """Facts for a prefix and a target frame; None if the cut leaves too short a prefix."""
+    """Facts for the prefix [start, stop] and a target frame; None if the prefix is too short.
+
+    `moment` names the target's moment in words.
+    """
     cut = find_cut(scene, start, stop)
     if cut is None:
         return None
@@ -199,8 +222,8 @@ def extract_facts(
         entering=tuple(o.object for o in objects if o.enters),
         leaving=tuple(o.object for o in objects if o.leaves),
         courses=tuple(
-            Meeting((names[i], names[j]), _outcome(scene, i, j, cut))
-            for i, j in courses(scene, cut)
+            Meeting((names[i], names[j]), _course_outcome(scene, i, j, cut))
+            for i, j in find_collision_courses(scene, cut)
         ),
         contacts=tuple(
             Meeting((names[i], names[j]), _when(contacts, i, j, cut))
@@ -213,9 +236,12 @@ def extract_facts(
 def extract_predicates(
     item: SelectionItem, scene: Scene, scene_of: Callable[[str], Scene]
 ) -> Predicates | None:
-    """Predicates of an item; None if its prefix is too short after the cut.
+    """Predicates of an item; None if the cut leaves too short a prefix.
 
-    `scene_of` gives the scenes that cross-scene candidates come from.
+    Args:
+        item: The item.
+        scene: Its scene.
+        scene_of: Returns the scene of a candidate from another scene, by its id.
     """
     moment = {"future": "at the collision", "contact": "just after the collision"}.get(
         item.framing or "", "at the target moment"
@@ -232,48 +258,51 @@ def extract_predicates(
     return Predicates(**vars(facts), candidates=candidates)
 
 
-def courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
-    """Pairs that straight lines through the last COURSE_FRAMES frames bring together, each line
-    through the frames since its object's last contact; none that has just met."""
+def find_collision_courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
+    """Pairs that collide if both objects move on in straight lines.
+
+    A line goes through an object's last COURSE_FRAMES frames, or those of them since its last
+    contact. Pairs that have met within these frames are left out.
+    """
     ground = scene.positions[:, :, :2]
     count = len(scene.objects)
-    starts = [free_since(scene, i, cut) for i in range(count)]
+    starts = [motion_start(scene, i, cut) for i in range(count)]
     met = {c.objects for c in scene.collisions if cut - COURSE_FRAMES < c.frame <= cut}
     step = [(ground[cut, i] - ground[starts[i], i]) / max(cut - starts[i], 1) for i in range(count)]
     pairs = []
     for i, j in combinations(range(count), 2):
         if (i, j) in met or cut in (starts[i], starts[j]):
             continue
-        apart, closing = ground[cut, j] - ground[cut, i], step[j] - step[i]
+        gap, closing = ground[cut, j] - ground[cut, i], step[j] - step[i]
         speed = float(np.linalg.norm(closing))
-        if speed * FPS < STATIONARY or np.dot(apart, closing) >= 0:
+        if speed * FPS < STATIONARY or np.dot(gap, closing) >= 0:
             continue
-        time = min(-float(np.dot(apart, closing)) / speed**2, COURSE_HORIZON)
-        if np.linalg.norm(apart + time * closing) < CONTACT + COURSE_MARGIN:
+        time = min(-float(np.dot(gap, closing)) / speed**2, COURSE_HORIZON)
+        if np.linalg.norm(gap + time * closing) < CONTACT + COURSE_MARGIN:
             pairs.append((i, j))
     return pairs
 
 
-def free_since(scene: Scene, index: int, cut: int) -> int:
-    """The first of the COURSE_FRAMES frames up to the cut that an object passed without a contact
-    after it: its motion is one motion from there on. The cut itself where it has just been hit."""
+def motion_start(scene: Scene, index: int, cut: int) -> int:
+    """The first of the COURSE_FRAMES frames up to the cut after which an object has no contact; the
+    cut itself if the object is hit there."""
     hits = [c.frame for c in scene.collisions if index in c.objects and c.frame <= cut]
     return max([cut - COURSE_FRAMES + 1, *hits])
 
 
-def _outcome(scene: Scene, i: int, j: int, cut: int) -> str | None:
+def _course_outcome(scene: Scene, i: int, j: int, cut: int) -> str | None:
     when = _when(scene.collisions, i, j, cut)
     return "unseen" if when is None and _closing_at_end(scene, i, j) else when
 
 
 def _closing_at_end(scene: Scene, i: int, j: int) -> bool:
-    apart = scene.positions[-1, j, :2] - scene.positions[-1, i, :2]
+    gap = scene.positions[-1, j, :2] - scene.positions[-1, i, :2]
     closing = scene.velocities[-1, j, :2] - scene.velocities[-1, i, :2]
-    return bool(np.dot(apart, closing) < -STATIONARY * np.linalg.norm(apart))
+    return bool(np.dot(gap, closing) < -STATIONARY * np.linalg.norm(gap))
 
 
-def compass(delta: np.ndarray) -> str | None:
-    """The compass word of an image-plane displacement (x right, y down); None for no movement."""
+def compass_direction(delta: np.ndarray) -> str | None:
+    """Compass word of a displacement in the image plane (x right, y down); None for zero."""
     if np.hypot(*delta) < 1e-6:
         return None
     eighth = round(float(np.arctan2(delta[1], delta[0])) / (np.pi / 4))
@@ -281,7 +310,7 @@ def compass(delta: np.ndarray) -> str | None:
 
 
 def object_region(scene: Scene, frame: int, index: int) -> str:
-    """The cell of the 3x3 grid that an object's centre lies in, in words, or "out of view"."""
+    """Cell of the 3x3 grid that contains an object's center, in words, or "out of view"."""
     if not scene.in_view[frame, index]:
         return OUT_OF_VIEW
     return _cell(scene, scene.image_positions[frame, index])
@@ -296,11 +325,11 @@ def _cell(scene: Scene, point: np.ndarray) -> str:
 def _sight(scene: Scene, frame: int, index: int) -> str:
     if not scene.in_view[frame, index]:
         return OUT_OF_VIEW
-    return "shown" if scene.visible_fraction[frame, index] > SHOWN else "hidden"
+    return "shown" if scene.visible_fraction[frame, index] > MIN_VISIBLE else "hidden"
 
 
 def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFacts:
-    pixels = scene.image_positions[:, index] * VIEW / np.asarray(scene.image_size)
+    pixels = scene.image_positions[:, index] * IMAGE_SIZE / np.asarray(scene.image_size)
     sight, target_sight = _sight(scene, cut, index), _sight(scene, target, index)
     speed = _speed(scene, index, cut) if sight != OUT_OF_VIEW else None
     moving = speed not in (None, "stationary")
@@ -311,23 +340,23 @@ def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFact
         region=object_region(scene, cut, index),
         sight=sight,
         speed=speed,
-        heading=object_heading(scene, index, free_since(scene, index, cut), cut)
+        heading=object_heading(scene, index, motion_start(scene, index, cut), cut)
         if moving
         else None,
         target_region=object_region(scene, target, index),
         target_sight=target_sight,
         extent=extent,
-        travel=None if extent in ("stays", "unseen") else compass(travelled),
+        travel=None if extent in ("stays", "unseen") else compass_direction(travelled),
     )
 
 
 def object_heading(scene: Scene, index: int, since: int, frame: int) -> str | None:
-    """The compass word of the way that an object has gone since an earlier frame; None where it
-    does not move."""
+    """Compass word of an object's displacement since an earlier frame; None if it is stationary at
+    `frame`."""
     if _speed(scene, index, frame) == "stationary":
         return None
-    pixels = scene.image_positions[:, index] * VIEW / np.asarray(scene.image_size)
-    return compass(pixels[frame] - pixels[since])
+    pixels = scene.image_positions[:, index] * IMAGE_SIZE / np.asarray(scene.image_size)
+    return compass_direction(pixels[frame] - pixels[since])
 
 
 def _speed(scene: Scene, index: int, frame: int) -> str:
@@ -375,38 +404,42 @@ def _candidate_facts(
     scene_of: Callable[[str], Scene],
 ) -> CandidateFacts:
     other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
-    here = {o.phrase: i for i, o in enumerate(scene.objects)}
-    there = {o.phrase: i for i, o in enumerate(other.objects)}
-    found: list[tuple[float, Difference]] = []
+    in_target = {o.phrase: i for i, o in enumerate(scene.objects)}
+    in_candidate = {o.phrase: i for i, o in enumerate(other.objects)}
+    large: list[tuple[float, Difference]] = []
     small: list[tuple[bool, float, Difference]] = []
-    for name in {**here, **there}:
-        i, j = here.get(name), there.get(name)
+    for name in {**in_target, **in_candidate}:
+        i, j = in_target.get(name), in_candidate.get(name)
         expected = i is not None and _sight(scene, target, i) == "shown"
-        shown = j is not None and _sight(other, candidate.frame, j) == "shown"
-        if expected != shown:
-            found.append((float(VIEW), Difference(name, "missing" if expected else "extra")))
+        visible = j is not None and _sight(other, candidate.frame, j) == "shown"
+        if expected != visible:
+            large.append((float(IMAGE_SIZE), Difference(name, "missing" if expected else "extra")))
         elif i is not None and j is not None:
             difference, distance = _displacement(scene, target, i, other, candidate.frame, j)
-            if shown and distance >= (BORDER if difference.kind == "region" else DISPLACED):
-                found.append((distance, difference))
+            if visible and distance >= (BORDER if difference.kind == "region" else DISPLACED):
+                large.append((distance, difference))
             else:
-                small.append((shown, distance, difference))
-    found.sort(key=lambda pair: -pair[0])
-    if not found:
-        # Two candidates always differ somewhere; the largest difference is named even if faint.
-        found = [max(small, key=lambda entry: entry[:2])[1:]]
-    return CandidateFacts(letter, False, set(here) != set(there), tuple(d for _, d in found))
+                small.append((visible, distance, difference))
+    large.sort(key=lambda pair: -pair[0])
+    if not large:
+        # Two candidates always differ: name the largest difference even if it is below the bounds.
+        large = [max(small, key=lambda entry: entry[:2])[1:]]
+    return CandidateFacts(
+        letter, False, set(in_target) != set(in_candidate), tuple(d for _, d in large)
+    )
 
 
 def _displacement(
     scene: Scene, target: int, i: int, other: Scene, frame: int, j: int
 ) -> tuple[Difference, float]:
     name = scene.objects[i].phrase
-    wanted = scene.image_positions[target, i] * VIEW / np.asarray(scene.image_size)
-    actual = other.image_positions[frame, j] * VIEW / np.asarray(other.image_size)
+    wanted = scene.image_positions[target, i] * IMAGE_SIZE / np.asarray(scene.image_size)
+    actual = other.image_positions[frame, j] * IMAGE_SIZE / np.asarray(other.image_size)
     distance = float(np.hypot(*(actual - wanted)))
     region = object_region(other, frame, j)
     if region != object_region(scene, target, i):
         return Difference(name, "region", region=region), distance
     extent = "clearly" if distance >= CLEARLY else "slightly"
-    return Difference(name, "displaced", heading=compass(actual - wanted), extent=extent), distance
+    return Difference(
+        name, "displaced", heading=compass_direction(actual - wanted), extent=extent
+    ), distance

@@ -1,4 +1,4 @@
-"""The line that tells how narrating goes."""
+"""Progress bar of a narration."""
 
 from __future__ import annotations
 
@@ -9,38 +9,33 @@ from tqdm import tqdm
 
 from data.records import Rationale
 
-SHOWN = 3
-"""Reasons for rejections that the progress line names."""
+LISTED_REASONS = 3
+"""Most frequent reasons for rejections that the bar lists."""
 
 
 class Progress:
-    """The progress line: accepted, rejected by reason, tokens a second, time left."""
+    """A bar with accepted and rejected responses, tokens per second and the remaining time."""
 
     def __init__(self, total: int, done: int) -> None:
         self.bar = tqdm(total=total, initial=done, desc="narrating", unit="item", mininterval=1.0)
-        self.accepted = 0
-        self.tokens = 0
+        self.accepted = self.tokens = 0
         self.rejected: Counter[str] = Counter()
-        self.since = time.monotonic()
+        self.started = time.monotonic()
 
-    def add(self, answers: list[Rationale]) -> None:
-        self.accepted += sum(r.accepted for r in answers)
-        self.tokens += sum(r.completion_tokens or 0 for r in answers)
-        self.rejected.update(kind for r in answers for kind in kinds(r))
-        self.bar.set_postfix_str(str(self), refresh=False)
+    def add_responses(self, responses: list[Rationale]) -> None:
+        self.accepted += sum(r.accepted for r in responses)
+        self.tokens += sum(r.completion_tokens or 0 for r in responses)
+        self.rejected.update(kind for r in responses for kind in rejection_kinds(r))
+        words = [f"{self.accepted} accepted"]
+        words += [f"{n} {kind}" for kind, n in self.rejected.most_common(LISTED_REASONS)]
+        if self.tokens:
+            words.append(f"{self.tokens / (time.monotonic() - self.started):,.0f} tokens/s")
+        self.bar.set_postfix_str(", ".join(words), refresh=False)
 
-    def settle(self) -> None:
-        """An item is done with."""
+    def finish_item(self) -> None:
         self.bar.update()
 
-    def __str__(self) -> str:
-        words = [f"{self.accepted} accepted"]
-        words += [f"{n} {kind}" for kind, n in self.rejected.most_common(SHOWN)]
-        if self.tokens:
-            words.append(f"{self.tokens / (time.monotonic() - self.since):,.0f} tokens/s")
-        return ", ".join(words)
 
-
-def kinds(rationale: Rationale) -> set[str]:
-    """The kinds of reasons that an answer was rejected for, without their details."""
+def rejection_kinds(rationale: Rationale) -> set[str]:
+    """The kinds of reasons for which a response was rejected, without their details."""
     return {reason.partition(":")[0] for reason in rationale.reasons}

@@ -1,5 +1,7 @@
-"""What a teacher is asked. The instructions come first and never change, so a server that caches
-prefixes reads them once."""
+"""Prompts for a teacher on a server.
+
+The instructions come first and are the same for every item, so that prefix caching applies.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,7 @@ import json
 from conf.schema import TeacherConfig
 from data.records import SelectionItem
 from teacher.predicates import Predicates
-from teacher.validation.validator import SECTIONS
+from teacher.sections import SECTIONS
 
 PROMPT_VERSION = "3"
 
@@ -47,10 +49,10 @@ coordinates, in figures or in words. Do not write "one", "two", "first", "second
 - Use plain text without markup. Write between {low} and {high} words in all."""
 
 
-def messages(
+def build_messages(
     predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
 ) -> list[dict[str, str]]:
-    """The chat that asks for an item's rationale; the shared instructions stand first."""
+    """The chat messages that request an item's rationale."""
     system = SYSTEM.format(sections=", ".join(SECTIONS), low=cfg.min_words, high=cfg.max_words)
     facts = json.dumps(predicates.to_dict(), separators=(",", ":"))
     user = f"Question: {item.question}\nFacts: {facts}\nAnswer to reach: {item.letter}"

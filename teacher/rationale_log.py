@@ -1,4 +1,4 @@
-"""The append-only file of a teacher's answers, one JSON line each, safe against a kill."""
+"""Files of a teacher's responses: an append-only journal and a table of accepted rationales."""
 
 from __future__ import annotations
 
@@ -9,36 +9,38 @@ import os
 from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from conf.errors import UserError
 from conf.runs import wait_for_lock
 from data.records import Rationale
 from data.store import write_atomically
-from teacher.validation.validator import SECTIONS
-
-if TYPE_CHECKING:
-    import pyarrow as pa
+from teacher.sections import SECTIONS
 
 DIGEST = "sha256"
-UNREADABLE = (ValueError, TypeError, KeyError, AttributeError)
+"""Key of a line's checksum."""
+LINE_ERRORS = (ValueError, TypeError, KeyError, AttributeError)
+"""Errors of a line that is no intact rationale."""
 
 
 class Journal:
-    """An open rationales.jsonl; `rationales` are the answers that it held when it was opened.
+    """An open rationales.jsonl with one response per line, safe against kills.
 
-    While another process writes it, opening waits. A torn last line, left by a kill, is ended or
-    taken back; the answer it lost is asked for again.
+    Opening waits while another process has the file open. A last line that a kill has cut off is
+    completed by its line break if it is whole, else removed, and its response is requested again.
+
+    Attributes:
+        rationales: The responses in the file when it was opened.
 
     Raises:
-        UserError: a line before the last cannot be read.
+        UserError: A line before the last is damaged.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.file = open(path, "ab+")  # noqa: SIM115  closed by __exit__
-        wait_for_lock(self.file.fileno(), f"{path} is being written by another process")
-        self._end_torn_line()
+        wait_for_lock(self.file.fileno(), f"another process is writing {path}")
+        self._repair_last_line()
         self.rationales = read_rationales(path)
 
     def __enter__(self) -> Journal:
@@ -48,38 +50,37 @@ class Journal:
         self.file.close()
 
     def append(self, rationales: Iterable[Rationale]) -> None:
-        """Write answers and wait until they are on the disk."""
-        self.file.write(b"".join(_line(r) for r in rationales))
+        """Write responses, and wait until they are on the disk."""
+        self.file.write(b"".join(map(_encode_line, rationales)))
         self.file.flush()
         os.fsync(self.file.fileno())
 
-    def _end_torn_line(self) -> None:
+    def _repair_last_line(self) -> None:
         self.file.seek(0)
         content = self.file.read()
-        whole = content.rfind(b"\n") + 1
-        torn = content[whole:]
-        if not torn:
+        intact = content.rfind(b"\n") + 1
+        if intact == len(content):
             return
         try:
-            _read(torn)
-        except UNREADABLE:
-            self.file.truncate(whole)
+            _decode_line(content[intact:])
+        except LINE_ERRORS:
+            self.file.truncate(intact)
         else:
             self.file.write(b"\n")
         self.file.flush()
 
 
-def _line(rationale: Rationale) -> bytes:
-    # A teacher may answer with half of a surrogate pair, which UTF-8 cannot hold.
-    whole = json.dumps(rationale.to_row(), ensure_ascii=False).encode("utf-8", "replace")
-    row = json.loads(whole)
+def _encode_line(rationale: Rationale) -> bytes:
+    # A model may generate half of a surrogate pair, which UTF-8 cannot encode.
+    text = json.dumps(rationale.to_row(), ensure_ascii=False).encode("utf-8", "replace")
+    row = json.loads(text)
     return json.dumps({**row, DIGEST: _digest(row)}, ensure_ascii=False).encode() + b"\n"
 
 
-def _read(line: bytes) -> Rationale:
+def _decode_line(line: bytes) -> Rationale:
     row = json.loads(line)
     if row.pop(DIGEST) != _digest(row):
-        raise ValueError("it was changed after it was written")
+        raise ValueError("its checksum is wrong")
     return Rationale.from_row(row)
 
 
@@ -88,44 +89,37 @@ def _digest(row: dict[str, Any]) -> str:
 
 
 def read_rationales(path: Path) -> list[Rationale]:
-    """Every answer in a rationales.jsonl.
+    """Every response in a rationales.jsonl.
 
     Raises:
-        UserError: a line cannot be read or was changed; names the file and the line.
+        UserError: A line is damaged or was edited; the message names the file and the line.
     """
     rationales = []
     for number, line in enumerate(path.read_bytes().splitlines(), start=1):
         try:
-            rationales.append(_read(line))
-        except UNREADABLE as error:
+            rationales.append(_decode_line(line))
+        except LINE_ERRORS as error:
             raise UserError(
-                f"{path}, line {number}: not a rationale ({error}); delete the line, and its "
-                "answer is asked for again"
+                f"{path}, line {number}: not an intact rationale ({error}). Delete the line; its "
+                "response is then requested again",
+                code="damaged-file",
             ) from error
     return rationales
 
 
 def save_accepted(rationales: list[Rationale], path: Path) -> None:
-    """Put accepted rationales into a parquet file, whole or not at all."""
+    """Write accepted rationales to a parquet file, atomically."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    sink = io.BytesIO()
-    schema = _schema()
-    columns = {name: [getattr(r, name) for r in rationales] for name in schema.names}
-    table = pa.Table.from_pydict(columns, schema=schema)
-    pq.write_table(table, sink, compression="zstd")
-    write_atomically(path, sink.getvalue())
-
-
-def _schema() -> pa.Schema:
-    """Of every field but the claims' counts, for some are null in all rows."""
-    import pyarrow as pa
-
-    types = {"accepted": pa.bool_(), "fallback": pa.bool_(), "finished": pa.float64()}
+    # All columns are text but these. The counts of claims are left out: some kinds occur in no row.
+    types = dict.fromkeys(("attempt", "seed", "prompt_tokens", "completion_tokens"), pa.int64())
+    types |= {"accepted": pa.bool_(), "fallback": pa.bool_(), "finished": pa.float64()}
     types["reasons"] = pa.list_(pa.string())
     types["sections"] = pa.struct([(name, pa.string()) for name in SECTIONS])
-    whole = ("attempt", "seed", "prompt_tokens", "completion_tokens")
-    types |= dict.fromkeys(whole, pa.int64())
     names = [f.name for f in fields(Rationale) if f.name != "claims"]
-    return pa.schema([(name, types.get(name, pa.string())) for name in names])
+    columns = {name: [getattr(r, name) for r in rationales] for name in names}
+    schema = pa.schema([(name, types.get(name, pa.string())) for name in names])
+    buffer = io.BytesIO()
+    pq.write_table(pa.Table.from_pydict(columns, schema=schema), buffer, compression="zstd")
+    write_atomically(path, buffer.getvalue())

@@ -1,4 +1,4 @@
-"""Keeps a teacher's servers full until every item has a rationale or is set aside."""
+"""Narration by a model on servers."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
+from teacher.grammar import build_grammar
 from teacher.predicates import Predicates, extract_predicates
 from teacher.progress import Progress
-from teacher.prompts import messages
+from teacher.prompts import build_messages
 from teacher.servers.concurrency import run_limited
 from teacher.servers.pool import NoResponseError, ServerPool
 from teacher.servers.responses import Response
@@ -23,79 +24,77 @@ if TYPE_CHECKING:
 
 Job = tuple[SelectionItem, int]
 """An item and the number of its next attempt."""
-Keep = Callable[[list[Rationale]], None]
+SaveResponses = Callable[[list[Rationale]], None]
 
 
 class ServerNarrator:
-    """One run over items: `jobs` are those that are open, `keep` puts answers on the disk."""
+    """Requests rationales until every item has one or is set aside; `save` writes responses."""
 
     def __init__(
         self,
         store: Store,
         cfg: TeacherConfig,
-        judge: RationaleGrader,
-        keep: Keep,
+        grader: RationaleGrader,
+        save: SaveResponses,
         progress: Progress,
     ) -> None:
-        self.store, self.cfg, self.judge = store, cfg, judge
-        self.keep, self.progress = keep, progress
+        self.store, self.cfg, self.grader = store, cfg, grader
+        self.save, self.progress = save, progress
         self.too_short = 0
 
     async def run(self, jobs: list[Job]) -> int:
-        """Keep `cfg.concurrency` requests in flight; gives the count of too short prefixes."""
-        # One thread judges and waits for the disk, so that answers are written one after another
-        # while the loop goes on asking.
-        with ThreadPoolExecutor(1) as self.desk:
-            async with ServerPool(self.cfg, request_fields(self.cfg)) as self.client:
-                await run_limited(jobs, self.cfg.concurrency, self._ask)
+        """Keep `cfg.concurrency` requests in flight; returns the number of too short prefixes."""
+        # One thread grades and waits for the disk, so that responses are written one after another
+        # while the event loop sends requests.
+        with ThreadPoolExecutor(1) as self.writer:
+            async with ServerPool(self.cfg, request_fields(self.cfg)) as self.servers:
+                await run_limited(jobs, self.cfg.concurrency, self._narrate)
         return self.too_short
 
-    async def _ask(self, job: Job) -> None:
-        item, first = job
+    async def _narrate(self, job: Job) -> None:
+        item, attempt = job
         predicates = extract_predicates(item, self.store.scene(item.scene_id), self.store.scene)
         if predicates is None:
             self.too_short += 1
         else:
-            await self._settle(item, predicates, first)
-        self.progress.settle()
+            await self._request(item, predicates, attempt)
+        self.progress.finish_item()
 
-    async def _settle(self, item: SelectionItem, predicates: Predicates, attempt: int) -> None:
-        """Ask for an item until an answer is accepted or no attempt is left."""
-        chat = messages(predicates, item, self.cfg)
+    async def _request(self, item: SelectionItem, predicates: Predicates, attempt: int) -> None:
+        """Send requests until a response is accepted or no attempt is left."""
+        messages = build_messages(predicates, item, self.cfg)
         while attempt < self.cfg.attempts:
-            # Most items are accepted at once: more than one answer is worth it after a failure.
+            # Most first responses are accepted; only after a rejection several at once pay off.
             n = min(self.cfg.samples, self.cfg.attempts - attempt) if attempt else 1
             try:
-                replies = await self.client.complete(chat, n)
-            except NoResponseError as fault:
-                replies = [Response("", f"unanswered: {fault}")]
-            answers = await asyncio.get_running_loop().run_in_executor(
-                self.desk, self._take, replies, predicates, item, attempt
+                responses = await self.servers.complete(messages, n)
+            except NoResponseError as error:
+                responses = [Response("", f"unanswered: {error}")]
+            rationales = await asyncio.get_running_loop().run_in_executor(
+                self.writer, self._grade, responses, predicates, item, attempt
             )
-            self.progress.add(answers)
-            if any(r.accepted for r in answers):
+            self.progress.add_responses(rationales)
+            if any(r.accepted for r in rationales):
                 return
-            attempt += len(answers)
+            attempt += len(rationales)
 
-    def _take(
-        self, replies: list[Response], predicates: Predicates, item: SelectionItem, attempt: int
+    def _grade(
+        self, responses: list[Response], predicates: Predicates, item: SelectionItem, attempt: int
     ) -> list[Rationale]:
-        answers = [
-            self.judge.judge(reply, predicates, item, attempt + k)
-            for k, reply in enumerate(replies)
+        rationales = [
+            self.grader.grade(response, predicates, item, attempt + k)
+            for k, response in enumerate(responses)
         ]
-        self.keep(answers)
-        return answers
+        self.save(rationales)
+        return rationales
 
 
 def request_fields(cfg: TeacherConfig) -> RequestFields:
-    """What goes with every chat with a teacher."""
-    # No seed: one a request crashed vLLM on a CPU at 32 in flight.
+    """Fields of every request for a rationale."""
+    # No seed: a seed per request crashed vLLM on a CPU with 32 requests in flight.
     extra = {"top_k": cfg.top_k, "chat_template_kwargs": {"enable_thinking": False}}
     if cfg.grammar:
-        from teacher.grammar import grammar
-
-        extra["structured_outputs"] = {"grammar": grammar(cfg)}
+        extra["structured_outputs"] = {"grammar": build_grammar(cfg)}
     return {
         "temperature": cfg.temperature,
         "top_p": cfg.top_p,

@@ -93,7 +93,7 @@ class ImageServer(Server):
 
     cfg: ImageServerConfig
 
-    async def _responses(self, chat: Messages, n: int, request: RequestFields) -> list[Response]:
+    async def _send(self, chat: Messages, n: int, request: RequestFields) -> list[Response]:
         drawn = await self.client.images.generate(
             model=self.cfg.model,
             prompt=chat[0]["content"],
@@ -111,7 +111,7 @@ class ImageServer(Server):
             raise ValueError("it gives no image")
         return replies
 
-    async def _unknown_model(self) -> UserError:
+    async def _unknown_model_error(self) -> UserError:
         return UserError(
             f"{self.url} draws nothing as images.model={self.cfg.model}: it has no such model, or "
             "is no server of images (/v1/images/generations); vLLM-Omni is one that is"

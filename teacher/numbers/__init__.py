@@ -1,4 +1,4 @@
-"""Every number that prose states: `find_numbers`."""
+"""Detection of numbers in prose."""
 
 from __future__ import annotations
 

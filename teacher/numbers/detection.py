@@ -1,11 +1,11 @@
-"""Finds every number that prose states, in digits, in words or in disguise.
+"""Finds every number in prose: digits, number words, and disguised spellings of both.
 
-The policy: counts, ordinals that count, fractions, multiples, quantities and measured time are
-numbers. "First," opening a sentence, "both", "pair", "one another", "the other one", "once
-struck", "no one" and "one side" are not.
+Policy: counts, counting ordinals, fractions, multiples, quantities and measured time are numbers.
+"First," at the start of a sentence, "both", "pair", "one another", "the other one", "once struck",
+"no one" and "one side" are not.
 
-A text is folded (see `folding`) and cut into words. Most words mean nothing here; each other word
-has a rule, which looks at the words about it and names the span of words that states a number.
+The text is normalized (see `normalization`) and split into words. Most words are never numbers; for
+each other word, a rule looks at its neighbors and returns the span of words that state a number.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from functools import lru_cache
 from itertools import accumulate
 
 from teacher.numbers import lexicon
-from teacher.numbers.normalization import FOLDS, Spans, fold, fold_word
+from teacher.numbers.normalization import FOLDS, Spans, normalize, normalize_word
 
 Rule = Callable[["Prose", int], "tuple[int, int] | None"]
 
@@ -24,9 +24,12 @@ _any = "|".join
 ENGLISH = {
     *("one", "first", *lexicon.CARDINALS, *lexicon.ORDINALS, *lexicon.QUANTITIES, *lexicon.TIMES)
 }
-WORDS = {fold_word(w) for w in (*ENGLISH, *lexicon.MISSPELT, *lexicon.FOREIGN)} - {"one", "first"}
+WORDS = {normalize_word(w) for w in (*ENGLISH, *lexicon.MISSPELT, *lexicon.FOREIGN)} - {
+    "one",
+    "first",
+}
 PIECED = {w for w in ENGLISH if len(w) > 2}
-"""Words that are looked for in spaced, split and stretched spellings."""
+"""Words that are also detected when spaced, split or stretched."""
 PREFIXES = {word[:k] for word in PIECED for k in range(1, len(word) + 1)}
 _scene = _any(sorted(lexicon.SCENE, key=len, reverse=True))
 _count = _any(sorted((*lexicon.CARDINALS, *lexicon.ORDINALS), key=len, reverse=True))
@@ -38,29 +41,29 @@ GLUED = re.compile(
     rf"|(?:{_any(lexicon.SCALES)})s?fold|half(?:ed|th|s)"
 )
 ARABIC = re.compile(
-    fold_word(lexicon.ARABIC_PREFIXES) + rf"(?:{_any(w for w in WORDS if '؀' <= w[0] <= 'ۿ')})"
+    normalize_word(lexicon.ARABIC_PREFIXES) + rf"(?:{_any(w for w in WORDS if '؀' <= w[0] <= 'ۿ')})"
 )
-UNSPACED = re.compile(_any(map(fold_word, lexicon.UNSPACED)))
-LONGEST = 60
-"""Letters of a word that are looked at."""
+UNSPACED = re.compile(_any(map(normalize_word, lexicon.UNSPACED)))
+MAX_LETTERS = 60
+"""Letters of a word that are examined."""
 ASCII_WORD = re.compile(r"([A-Za-z]+)")
-# Indic vowel signs are no letters to `re`, but belong to their words.
+# To `re`, Indic vowel signs are not letters, although they are parts of words.
 WORD = re.compile(r"((?:[^\W\d_]+|[\u0900-\u0dff]+)+)")
 FIGURES = re.compile(r"[0-9%‰‱]+(?:[.,:/][0-9]+)*(?:st|nd|rd|th)?")
 CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 STRETCH = re.compile(r"(.)\1+")
 UPPER_ROMAN = re.compile(r"M{0,3}(?:CM|CD|D?C{0,3})(?:XC|XL|L?X{0,3})(?:IX|IV|V?I{0,3})")
 CLAUSE = re.compile(r"[.!?:;\n•–—*#>(\"“]|\s-\s")
-"""What in a gap ends a clause, so that the next word opens another."""
+"""Marks between two words that end a clause."""
 COUNTABLE = lexicon.NOUNS | lexicon.EVENTS | lexicon.UNITS
-"""What "one" counts even after "the" or an adjective."""
+"""Nouns that "one" counts even after "the" or an adjective."""
 ADJECTIVAL = ("er", "est", "ing", "ed", "most")
 JOINS = frozenset(" -")
 CLOSERS = frozenset(".,;:!?)…—–")
 
 
 class Prose:
-    """Text cut into words and the gaps about them: word k lies between gaps k and k + 1."""
+    """Text split into words and gaps: word k is between gaps k and k + 1."""
 
     def __init__(self, text: str) -> None:
         pieces = (ASCII_WORD if text.isascii() else WORD).split(text)
@@ -73,22 +76,20 @@ class Prose:
         return self.lower[index] if 0 <= index < len(self.lower) else ""
 
     def before(self, index: int, by: int = 1) -> str:
-        """The word `by` words before, in lower case; "" unless space or hyphens part them all."""
-        while index > 0 and _joins(self.gaps[index]):
-            index -= 1
-            by -= 1
-            if not by:
-                return self.lower[index]
-        return ""
+        """The word `by` words before, in lower case; "" across other marks than hyphens."""
+        return self._neighbor(index, -1, by)
 
     def after(self, index: int, by: int = 1) -> str:
-        """The word `by` words after, in lower case; "" unless space or hyphens part them all."""
-        while index + 1 < len(self.words) and _joins(self.gaps[index + 1]):
-            index += 1
-            by -= 1
-            if not by:
-                return self.lower[index]
-        return ""
+        """The word `by` words after, in lower case; "" across other marks than hyphens."""
+        return self._neighbor(index, 1, by)
+
+    def _neighbor(self, index: int, step: int, by: int) -> str:
+        for _ in range(by):
+            gap = max(index, index + step)
+            if not 0 < gap < len(self.words) or not _joins(self.gaps[gap]):
+                return ""
+            index += step
+        return self.lower[index]
 
     def opens_clause(self, index: int) -> bool:
         return index == 0 or bool(CLAUSE.search(self.gaps[index][-8:]))
@@ -106,14 +107,14 @@ class Prose:
 
 
 def _joins(gap: str) -> bool:
-    # The usual gaps first, for this is asked of most words that have a rule.
+    # The most frequent gaps first, because this runs for most words with a rule.
     return gap in JOINS or gap.isspace()
 
 
 def find_numbers(text: str) -> list[tuple[int, int]]:
-    """Spans of `text` that state a number, in order and without overlap; never raises."""
+    """Spans (start, stop) of `text` that state a number, in order and disjoint; never raises."""
     spans: Spans = []
-    for reading in fold(text):
+    for reading in normalize(text):
         spans += reading.original(_scan(reading.text))
     return _merged(spans, text) if spans else []
 
@@ -123,7 +124,7 @@ def _merged(spans: Spans, text: str) -> Spans:
     merged: Spans = []
     first, last = spans[0]
     for start, stop in spans:
-        # Marks that fold to nothing belong to the character that they stand on.
+        # Combining marks normalize to nothing and belong to the character before them.
         while stop < len(text) and text[stop] > "\x7f" and not FOLDS[text[stop]]:
             stop += 1
         if start <= last or (start == last + 1 and text[last] in "- "):
@@ -140,8 +141,8 @@ def _scan(text: str) -> Spans:
         spans += [m.span() for m in UNSPACED.finditer(text)]
     prose = Prose(text)
     words = prose.words
-    if max(map(len, words), default=0) > LONGEST:
-        words = [word[:LONGEST] for word in words]
+    if max(map(len, words), default=0) > MAX_LETTERS:
+        words = [word[:MAX_LETTERS] for word in words]
     for index, rule in enumerate(map(rule_of, words)):
         if rule is not None:
             stated = rule(prose, index)
@@ -152,14 +153,14 @@ def _scan(text: str) -> Spans:
 
 @lru_cache(maxsize=1 << 16)
 def rule_of(token: str) -> Rule | None:
-    """The rule for a word as it is written; None for the words that mean nothing here."""
+    """The rule for a word in its original case; None for words that are never numbers."""
     word = token.casefold()
     if word in RULES:
         return RULES[word]
     if token.istitle() and word in lexicon.NAMES:
         return None
     if _is_number(word) or _is_roman(token, word) or _is_camel(token):
-        return _itself
+        return _always
     return _assembled if word in PREFIXES else None
 
 
@@ -193,7 +194,7 @@ def _is_camel(token: str) -> bool:
     return any(part.casefold() in PIECED for part in CAMEL.findall(token))
 
 
-def _itself(prose: Prose, index: int) -> tuple[int, int] | None:
+def _always(prose: Prose, index: int) -> tuple[int, int] | None:
     return index, index
 
 
@@ -220,7 +221,7 @@ def _is_split(prose: Prose, first: int, last: int) -> bool:
         return not set(gaps) & set(',;:()"“”')
     if not all(len(gap) <= 2 and gap.isspace() for gap in gaps):
         return False
-    # What follows an apostrophe is the end of a word.
+    # The letters after an apostrophe are the ending of a word.
     possessive = prose.gaps[first][-1:] in ("'", "’")
     return not possessive and not all(piece in lexicon.PIECES for piece in pieces)
 
@@ -230,7 +231,7 @@ def _one(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _is_pronoun(prose: Prose, index: int) -> bool:
-    """Whether "one" stands for a thing, and so counts nothing."""
+    """Whether "one" is a pronoun and counts nothing."""
     if prose.gaps[index + 1] in ("'", "’") and prose.word(index + 1) == "s":
         return True
     pronoun = _is_pronoun_between(prose.before(index), prose.after(index))
@@ -241,10 +242,10 @@ def _is_pronoun(prose: Prose, index: int) -> bool:
 
 @lru_cache(maxsize=1 << 12)
 def _is_pronoun_between(previous: str, following: str) -> bool | None:
-    """None where an article before the word before would make it one: "the opaque one"."""
+    """None if it depends on an article before the previous word, as in "the opaque one"."""
     if following in ("another", "side", "sided") or previous == "no":
         return True
-    if following in COUNTABLE or rule_of(previous[:LONGEST]) is _itself:
+    if following in COUNTABLE or rule_of(previous[:MAX_LETTERS]) is _always:
         return False
     if following in lexicon.MODALS or _describes(previous):
         return True
@@ -260,7 +261,7 @@ def _describes(word: str) -> bool:
 
 
 def _first(prose: Prose, index: int) -> tuple[int, int] | None:
-    """No number where it opens a sentence before a comma, or in "at first" and "first of all"."""
+    """Not a number in "First, ...", "at first" and "first of all"."""
     if prose.before(index) == "at":
         return None
     aside = prose.gaps[index + 1].lstrip()[:1] in (",", ":", "—", "–")
@@ -270,7 +271,7 @@ def _first(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _once(prose: Prose, index: int) -> tuple[int, int] | None:
-    """A number where it counts events; none in "once struck", where it is a conjunction."""
+    """A number if it counts events, but not as a conjunction, as in "once struck"."""
     previous, following = prose.before(index), prose.after(index)
     if previous == "at" or following in ("more", "again"):
         return None
@@ -287,7 +288,7 @@ def _once(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _starts_number(prose: Prose, index: int) -> bool:
-    rule = rule_of(prose.words[index][:LONGEST])
+    rule = rule_of(prose.words[index][:MAX_LETTERS])
     return rule is _once or (rule is not None and rule(prose, index) is not None)
 
 
@@ -312,7 +313,7 @@ def _unit(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _minute(prose: Prose, index: int) -> tuple[int, int] | None:
-    """A number where it measures time; none where it means tiny."""
+    """A number if it measures time, but not in the sense of "tiny"."""
     previous, following = prose.before(index), prose.after(index)
     if previous in lexicon.BEFORE_MINUTE:
         return index - 1, index
@@ -330,7 +331,7 @@ def _score(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _secondary(prose: Prose, index: int) -> tuple[int, int] | None:
-    """A number where it is an event's place in a series."""
+    """A number before an event, whose place in a series it gives."""
     return (index, index + 1) if prose.after(index) in lexicon.EVENTS else None
 
 
@@ -362,7 +363,7 @@ def _secondo(prose: Prose, index: int) -> tuple[int, int] | None:
 
 def _ek(prose: Prose, index: int) -> tuple[int, int] | None:
     """The Hindi "one", or half of "each other"."""
-    return None if prose.after(index) == fold_word("दूसरे") else (index, index)
+    return None if prose.after(index) == normalize_word("दूसरे") else (index, index)
 
 
 RULES: dict[str, Rule] = {
@@ -373,9 +374,9 @@ RULES: dict[str, Rule] = {
     "minute": _minute,
     "score": _score,
     "secondary": _secondary,
-    **dict.fromkeys(map(fold_word, lexicon.FOREIGN_FIRSTS), _first),
+    **dict.fromkeys(map(normalize_word, lexicon.FOREIGN_FIRSTS), _first),
     **dict.fromkeys(("due", "meta"), _italian),
     "secondo": _secondo,
-    fold_word("एक"): _ek,
+    normalize_word("एक"): _ek,
     **dict.fromkeys("ivx", _letter),
 }

@@ -1,4 +1,4 @@
-"""The closed lists that `numbers` looks words up in, before folding (see `folding.fold`)."""
+"""Word lists of the number detection, not yet normalized (see `normalization.normalize_word`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNITS_AND_TEENS = _words(
 TENS = _words("twenty thirty forty fourty fifty sixty seventy eighty ninety ninty")
 SCALES = _words("hundred thousand million billion trillion zillion gazillion bazillion googol")
 CARDINALS = (*UNITS_AND_TEENS, *TENS, *SCALES)
-"""Every English cardinal but "one", which has rules of its own."""
+"""English cardinals except "one", which has its own rule."""
 
 ORDINALS = _words(
     "second third fourth fifth sixth seventh eighth eigth ninth nineth tenth eleventh twelfth "
@@ -27,7 +27,7 @@ ORDINALS = _words(
     "thousandth millionth billionth trillionth umpteenth nth kth ith jth zeroth tertiary secondly "
     "thirdly fourthly fifthly"
 )
-"""Every English ordinal but "first", which has rules of its own."""
+"""English ordinals except "first", which has its own rule."""
 
 QUANTITIES = _words(
     "half halves halved halving halfway quarter quarters quartered thirds fourths fifths sixths "
@@ -43,7 +43,7 @@ TIMES = _words(
     "seconds millisecond milliseconds microsecond microseconds nanosecond nanoseconds sec secs "
     "msec msecs fps minutes mins hour hours hrs"
 )
-"""Words that measure time, and so state a number, wherever they stand."""
+"""Words that measure time and therefore always state a number."""
 
 MISSPELT = _words(
     "tre thre threee fower fiv sevn sevin seaven eigth eihgt nien tweleve eleve twelv thirten "
@@ -90,26 +90,26 @@ ichi roku hachi juu futatsu mittsu yottsu
 하나 둘 셋 넷 다섯 여섯 일곱 여덟 아홉 열 두개 세개 두 세 번째 절반
 שתיים שניים שני שתי שלוש שלושה ארבע ארבעה חמש חמישה שבע שמונה תשע עשר
 """)
-"""Numbers in other languages, where they are no English word."""
+"""Numbers in other languages that are not English words."""
 FOREIGN_FIRSTS = _words(
     "primera primero primeras primeros premier première primeiro primeira primo erste ersten "
     "erster erstes erstem eerste первый первая первое первого первому первым первом первую"
 )
-"""Words that have the rules of "first"."""
+"""Words that share the rule of "first"."""
 NAMES = _set("otto dix tio tre bir mille mila lima")
-"""Foreign numbers that are names when they are capitalised."""
+"""Foreign numbers that are names when capitalized."""
 ARABIC_PREFIXES = "(?:[وفبلك]|ال|لل)+"
-"""Articles and prepositions that Arabic writes as part of the next word."""
+"""Articles and prepositions that Arabic joins to the next word."""
 IDIOMS = _words("""
 两者 雙方 双方 一起 一样 一樣 一致 一直 一旦 一边 一邊 一方 一定 一般 一些 一緒 一瞬 一同 統一
 统一 万一 十分 半径 半徑 三角 六面
 """)
-"""Words of ideographs that count nothing, though a numeral is part of them."""
+"""Ideographic words that contain a numeral but count nothing."""
 UNSPACED = _words("ひとつ ふたつ みっつ よっつ いつつ むっつ ななつ やっつ ここのつ สอง สาม")
-"""Numbers of scripts that part no words, which are found within others."""
+"""Numbers in scripts without spaces, detected inside longer text."""
 
 IDEOGRAPHS = set("两兩半倍双雙")
-"""Ideographs that count without being numerals; numerals have a numeric value in Unicode."""
+"""Ideographs that count although Unicode gives them no numeric value."""
 PICTOGRAPHS = {
     *(chr(c) for c in range(0x1F550, 0x1F568)),  # clock faces
     *(chr(c) for c in range(0x2680, 0x2686)),  # dice
@@ -121,7 +121,7 @@ SUFFIXES = _words(
     "x s fold some ish way ways pack time times th ths sided dimensional ball balls sphere "
     "spheres cube cubes cylinder cylinders object objects frame frames second pair body"
 )
-"""What a number word may be glued to and still state a number ("threefold", "tenx")."""
+"""Suffixes with which a number word still states a number ("threefold", "tenx")."""
 
 ROMAN = _set(
     "ii iii iv vi vii viii ix xi xii xiii xiv xv xvi xvii xviii xix xx xxi xxii xxiii xxiv xxv "
@@ -138,7 +138,7 @@ ENUMERATED = _set(
     "scene section stage step type volume candidate sphere cube cylinder ball collision fig nr "
     "vol ch"
 )
-"""Nouns after which a lone I, V or X is a numeral. Candidates go by A to D, so they count here."""
+"""Nouns after which a single I, V or X is a numeral; candidates have the letters A to D only."""
 
 UNITS = _set(
     "frame step timestep tick pixel px unit millimeter millimetre centimeter centimetre meter "
@@ -150,7 +150,7 @@ PLURAL_UNITS = _set(
     "meters metres kilometers kilometres inches feet miles degrees radians moments instants beats "
     "times diameters radii widths lengths days weeks months years"
 )
-"""What is counted as soon as a vague quantity such as "a few" stands before it."""
+"""Units that a vague quantity such as "a few" counts."""
 LENGTHS = _set(
     "pixel millimeter millimetre centimeter centimetre meter metre kilometer kilometre inch mile"
 )
@@ -162,7 +162,7 @@ FILLERS = _set(
     "of more the further additional short brief video extra tiny full whole remaining next last "
     "following body ball sphere cube cylinder object image"
 )
-"""What may stand between a vague quantity and its unit."""
+"""Words between a vague quantity and its unit."""
 
 NOUNS = _set(
     "sphere spheres cube cubes cylinder cylinders ball balls block object objects thing collision "
@@ -179,7 +179,7 @@ ADJECTIVES = _set(
     "still stationary visible hidden nearby distant lone remaining new old good likely rear front "
     "back matte shiny dark bright mobile free different similar"
 )
-"""Words after which "one" is a pronoun; so is it after words in -er, -est, -ed and -ing."""
+"""Words after which "one" is a pronoun, besides words in -er, -est, -ed and -ing."""
 MODALS = _set("would can could might may should must will expects sees wonders")
 NOT_ADJECTIVES = _set(
     "almost after under over either during being cylinder corner center together however whether "
@@ -191,7 +191,7 @@ CLAUSE_OPENERS = _set(
     "gray grey red blue green brown cyan purple yellow we you i fully completely finally entirely "
     "already under behind hidden"
 )
-"""Words before which "once" is a conjunction, as it is before those in -ed and -ing."""
+"""Words before which "once" is a conjunction, besides words in -ed and -ing."""
 EXACTLY = _set("only just exactly than least most but even")
 """Words after which "once" counts."""
 EVENTS = _set(
@@ -203,22 +203,22 @@ BEFORE_MINUTE = _set("per each every next last final full whole another")
 AFTER_MINUTE = _set(
     "later earlier ago or of after before passes passed pass elapses elapsed goes went has long"
 )
-"""Words before which it is."""
+"""Words before which "minute" is a time."""
 TIME_PREPOSITIONS = _set(
     "in within after for about per than under over by every takes lasts took lasted around "
     "roughly almost nearly until before"
 )
-"""Words after which "a minute" is, unless it describes the next word."""
+"""Words after which "a minute" is a time, unless it describes the next word."""
 SCENE = (
     *_words("spheres cubes cylinders balls blocks objects candidates regions frames steps"),
     *_words("sphere cube cylinder ball block object candidate region frame step collision"),
     *_words("collisions bounce bounces contact contacts hit hits impact impacts scene shapes"),
     *_words("metal rubber gray grey red blue green brown cyan purple yellow moving body pair"),
 )
-"""Words that a number may be run together with ("tworedspheres")."""
+"""Words that a number may be joined with ("tworedspheres")."""
 NOT_ROMAN = _set("mix div dix di mi ci li cv cli dvi mlx xml")
 PIECES = _set(
     "a i for do on no to so he mill trip sing coup thou sand red led let tri sec sect min ion and "
     "per cent way me ho fort fin sex sept oct cub dec ad half minute hour th ten d c b s o"
 )
-"""Words and letters that prose may put side by side though together they spell a number."""
+"""Ordinary words and letters that spell a number when joined."""

@@ -1,7 +1,7 @@
-"""Undoes the disguises of prose: entities, markup, styled and look-alike letters.
+"""Normalizes disguised text: HTML entities, markup, styled letters and look-alike letters.
 
-A reading is a folded text with the span of the original that each of its characters came from.
-In a reading, every numeral of any script is an ASCII digit.
+A reading is a normalized text with, for each character, the span of the original that it comes
+from. In a reading, numerals of every script are ASCII digits.
 """
 
 from __future__ import annotations
@@ -32,34 +32,34 @@ LOOKALIKES = {
         for i in range(26)
     },
 }
-LONGEST_FOLD = 6
-"""A character that reads as more letters than this is a phrase in itself (U+FDFA), and left so."""
+MAX_FOLD = 6
+"""Characters that expand to more letters than this, such as the phrase U+FDFA, stay as they are."""
 ENTITY = re.compile(r"&(?:#\d{1,7}|#[xX][0-9a-fA-F]{1,6}|[A-Za-z]\w{1,31});?")
 DISGUISE = re.compile(r"[&*`~_<$|@]|[A-Za-z]![A-Za-z]")
 TAG = r"</?[A-Za-z][^<>]{0,60}>"
 IDIOM = re.compile("|".join(IDIOMS))
 SEAM = re.compile(rf"[*`~\u200b]+|{TAG}")
-"""What may stand within a word unseen: emphasis, zero-width characters (all folded to U+200B)."""
-PARTED = str.maketrans("*`~\u200b_", "     ")
+"""Invisible parts of a word: markup and zero-width characters (all normalized to U+200B)."""
+SEAMS_TO_SPACES = str.maketrans("*`~\u200b_", "     ")
 LEET = re.compile(r"(?<=[A-Za-z])[!|@](?=[A-Za-z])|\$(?=[A-Za-z])")
 LEET_LETTERS = {"!": "i", "|": "i", "@": "a", "$": "s"}
 
 
 @dataclass(frozen=True)
 class Reading:
-    """Folded text; its character k came from the original's [starts[k], stops[k])."""
+    """Normalized text; character k comes from the original's [starts[k], stops[k])."""
 
     text: str
     starts: Sequence[int]
     stops: Sequence[int]
 
     def original(self, spans: Spans) -> Spans:
-        """Where spans of the reading lie in the original."""
+        """The spans of the original that correspond to spans of the reading."""
         return [(self.starts[start], self.stops[stop - 1]) for start, stop in spans]
 
 
 class _Folds(dict[str, str]):
-    """What each character reads as; filled as characters are met, emptied when it grows large."""
+    """A bounded cache of the normalized form of each character."""
 
     def __missing__(self, c: str) -> str:
         if len(self) >= 1 << 16:
@@ -72,7 +72,7 @@ def _fold_character(c: str) -> str:
     plain = unicodedata.normalize("NFKC", c)
     if c in IDEOGRAPHS or c in PICTOGRAPHS or any(map(_is_numeral, (c, *plain))):
         digits = "".join(p for p in plain if p in "0123456789")
-        return digits[:LONGEST_FOLD] or "1"
+        return digits[:MAX_FOLD] or "1"
     letters = []
     for part in unicodedata.normalize("NFKD", plain):
         category = unicodedata.category(part)
@@ -80,7 +80,7 @@ def _fold_character(c: str) -> str:
             letters.append("\u200b")
         elif category not in ("Mn", "Me"):
             letters.append(LOOKALIKES.get(part, part))
-    return c if len(letters) > LONGEST_FOLD else "".join(letters)
+    return c if len(letters) > MAX_FOLD else "".join(letters)
 
 
 def _is_numeral(c: str) -> bool:
@@ -90,20 +90,22 @@ def _is_numeral(c: str) -> bool:
 FOLDS = _Folds()
 
 
-def fold_word(word: str) -> str:
-    """A lexicon entry as it looks in folded text."""
+def normalize_word(word: str) -> str:
+    """A lexicon entry in its normalized form."""
     return "".join(map(FOLDS.__getitem__, word)).casefold()
 
 
-def fold(text: str) -> list[Reading]:
-    """The readings of a text. There are two where markup or an unseen character stands between
-    letters, for it may join a word or part two."""
+def normalize(text: str) -> list[Reading]:
+    """The readings of a text: two if markup or an invisible character separates letters, which may
+    be of one word or of two."""
     reading = Reading(text, range(len(text)), range(1, len(text) + 1))
     if text.isascii() and not DISGUISE.search(text):
         return [reading]
-    reading = _folded(_unescaped(_unescaped(reading)))  # for an entity may itself be escaped
+    reading = _folded(
+        _unescaped(_unescaped(reading))
+    )  # Twice, since an entity may itself be escaped.
     joined = _without_seams(reading)
-    parted = Reading(reading.text.translate(PARTED), reading.starts, reading.stops)
+    parted = Reading(reading.text.translate(SEAMS_TO_SPACES), reading.starts, reading.stops)
     return [
         Reading(LEET.sub(lambda m: LEET_LETTERS[m[0]], r.text), r.starts, r.stops)
         for r in ([parted, joined] if joined else [parted])
@@ -134,7 +136,7 @@ def _unescaped(reading: Reading) -> Reading:
 
 @lru_cache(maxsize=4096)
 def _meaning(entity: str) -> str:
-    # What stands for no character is read as it is written.
+    # An entity of no character stays as it is.
     return html.unescape(entity) or entity
 
 
@@ -154,7 +156,7 @@ def _folded(reading: Reading) -> Reading:
 
 
 def _without_seams(reading: Reading) -> Reading | None:
-    """The reading with nothing between the letters that seams part; None if it has no seams."""
+    """The reading without seams; None if it has none."""
     keeps = bytearray(b"\1") * len(reading.text)
     for match in SEAM.finditer(reading.text):
         keeps[match.start() : match.end()] = bytes(match.end() - match.start())

@@ -1,4 +1,4 @@
-"""The report as a page: its figures, and random rationales beside their frames for reading."""
+"""The report as an HTML page: its figures, and random rationales beside their frames."""
 
 from __future__ import annotations
 
@@ -32,54 +32,61 @@ PAGE = """<!doctype html>
 </style>
 <h1>Rationales of {teacher}</h1>
 <pre>{figures}</pre>
-<p>{shown} of {accepted:,} accepted rationales for benchmark {benchmark}, chosen at random. Left of
-the line is what is observed, right of it the candidates; the answer is framed in green.</p>
-{body}
+<p>{count} of {accepted:,} accepted rationales for the benchmark {benchmark}, a random sample. The
+frames of the prefix are left of the line and the candidates right of it; the answer has a green
+frame.</p>
+{articles}
 </html>
 """
 
 
 def write_page(
-    store: Store, accepted: Sequence[Rationale], figures: str, shown: int, seed: int, folder: Path
+    store: Store, accepted: Sequence[Rationale], figures: str, count: int, seed: int, folder: Path
 ) -> Path:
-    """Write report.html and its pictures: `figures` as they are, and `shown` of the rationales as
-    `seed` chooses them."""
-    chosen = np.random.default_rng(seed).permutation(len(accepted))[:shown]
+    """Write report.html and its images.
+
+    Args:
+        store: The benchmark.
+        accepted: The accepted rationales.
+        figures: The text of the report's figures.
+        count: Number of rationales on the page.
+        seed: Seed of their random choice.
+        folder: Folder of the report.
+    """
+    chosen = np.random.default_rng(seed).permutation(len(accepted))[:count]
     items = {item.item_id: item for item in store.selection("train")}
-    look = ExampleRows(store)
-    body = []
+    rows = ExampleRows(store)
+    articles = []
     for k in sorted(chosen.tolist()):
         rationale = accepted[k]
         item = items[rationale.item_id]
-        write_atomically(folder / "shown" / f"{item.item_id}.png", draw_sheet([look.item(item)]))
+        write_atomically(folder / "images" / f"{item.item_id}.png", draw_sheet([rows.item(item)]))
         predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
         facts = json.dumps(predicates.to_dict() if predicates else None, indent=1)
-        body.append(_article(rationale, facts))
-    page = folder / "report.html"
-    told = PAGE.format(
-        teacher=escape(accepted[0].teacher if accepted else "nobody"),
-        shown=len(body),
+        articles.append(_format_article(rationale, facts))
+    page = PAGE.format(
+        teacher=escape(accepted[0].teacher if accepted else "an unnamed teacher"),
+        count=len(articles),
         accepted=len(accepted),
         benchmark=escape(store.name),
         figures=escape(figures),
-        body="\n".join(body),
+        articles="\n".join(articles),
     )
-    write_text(page, told)
-    return page
+    write_text(folder / "report.html", page)
+    return folder / "report.html"
 
 
-def _article(rationale: Rationale, facts: str) -> str:
+def _format_article(rationale: Rationale, facts: str) -> str:
     name = escape(rationale.item_id)
-    parts = [f"<p><b>{escape(k)}.</b> {escape(v)}</p>" for k, v in rationale.sections.items()]
-    source = "the built-in narrator instead" if rationale.fallback else rationale.teacher
-    told = f"{source}, attempt {rationale.attempt + 1}"
+    source = "built-in narrator (fallback)" if rationale.fallback else rationale.teacher
+    source = escape(f"{source}, attempt {rationale.attempt + 1}")
     return "\n".join(
         [
             f'<article id="{name}">',
-            f'<img src="shown/{name}.png" alt="{name}" loading="lazy">',
-            *parts,
-            f"<p><b>Answer: {escape(str(rationale.answer))}</b> <small>{escape(told)}</small></p>",
-            f"<details><summary>What it was told</summary><pre>{escape(facts)}</pre></details>",
+            f'<img src="images/{name}.png" alt="{name}" loading="lazy">',
+            *(f"<p><b>{escape(k)}.</b> {escape(v)}</p>" for k, v in rationale.sections.items()),
+            f"<p><b>Answer: {escape(str(rationale.answer))}</b> <small>{source}</small></p>",
+            f"<details><summary>Predicates</summary><pre>{escape(facts)}</pre></details>",
             "</article>",
         ]
     )

@@ -1,4 +1,4 @@
-"""Does many jobs at once, and no more of them than there are lanes."""
+"""Bounded concurrency for asyncio."""
 
 from __future__ import annotations
 
@@ -10,20 +10,23 @@ Job = TypeVar("Job")
 
 
 async def run_limited(
-    jobs: Sequence[Job], lanes: int, do: Callable[[Job], Awaitable[None]]
+    jobs: Sequence[Job], limit: int, run: Callable[[Job], Awaitable[None]]
 ) -> None:
-    """Await `do` of each job, in order of their start; where one fails, none is begun after it and
-    those under way are given up."""
+    """Await `run(job)` for every job, with at most `limit` jobs in progress at a time.
+
+    Jobs start in order. If one raises, no further job starts, the jobs in progress are cancelled,
+    and the error is raised.
+    """
     waiting = iter(jobs)
 
-    async def lane() -> None:
+    async def work() -> None:
         for job in waiting:
-            await do(job)
+            await run(job)
 
-    tasks = [asyncio.create_task(lane()) for _ in range(min(lanes, len(jobs)))]
+    workers = [asyncio.create_task(work()) for _ in range(min(limit, len(jobs)))]
     try:
-        await asyncio.gather(*tasks)
+        await asyncio.gather(*workers)
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        for worker in workers:
+            worker.cancel()
+        await asyncio.gather(*workers, return_exceptions=True)

@@ -1,4 +1,4 @@
-"""Whether a server is up."""
+"""Health check of an OpenAI-compatible server."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ import urllib.error
 import urllib.parse
 import urllib.request
 
-LOOK_TIMEOUT = 10.0
-"""Seconds that a server's health page may take."""
+HEALTH_TIMEOUT = 10.0
+"""Seconds to wait for the health page."""
 
 
-def health_problem(url: str) -> str | None:
-    """What is wrong with the server at a URL that ends in /v1, None if it is up. One without a
-    health page is up."""
+def check_health(url: str) -> str | None:
+    """Returns why the server at a URL that ends in /v1 is down, or None if it is up.
+
+    A server without a health page counts as up.
+    """
     page = f"{url.rstrip('/').removesuffix('/v1')}/health"
-    # A proxy knows nothing of this machine's own addresses.
-    own = urllib.parse.urlsplit(url).hostname in ("localhost", "127.0.0.1", "::1")
-    proxies = [urllib.request.ProxyHandler({})] if own else []
+    # A configured proxy cannot reach this machine's loopback addresses.
+    local = urllib.parse.urlsplit(url).hostname in ("localhost", "127.0.0.1", "::1")
+    proxies = [urllib.request.ProxyHandler({})] if local else []
     try:
-        with urllib.request.build_opener(*proxies).open(page, timeout=LOOK_TIMEOUT):
+        with urllib.request.build_opener(*proxies).open(page, timeout=HEALTH_TIMEOUT):
             return None
     except urllib.error.HTTPError as error:
         return f"HTTP {error.code}" if error.code >= 500 else None

@@ -1,4 +1,7 @@
-"""Asks a set of servers. One that is down, restarting or busy costs time, not attempts."""
+"""Load balancing over several servers, with recovery from outages.
+
+A server that is down, restarting or busy costs time but none of an item's attempts.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import time
 
 from conf.errors import UserError
 from conf.schema import ServersConfig
+from teacher.servers.responses import Response
 from teacher.servers.server import (
     MalformedReplyError,
     Messages,
@@ -17,201 +21,224 @@ from teacher.servers.server import (
     RefusedError,
     RequestError,
     RequestFields,
-    Response,
     Server,
 )
 
 log = logging.getLogger(__name__)
 
 PAUSE, LONGEST_PAUSE = 0.5, 10.0
-"""Seconds of the first pause before something is tried again at most, doubled up to the longest."""
-FAULTS = 4
-"""Requests for one item that may fail in a row at servers that are up."""
+"""Upper bounds (seconds) of the first pause before a retry, and of any pause."""
+MAX_FAILURES = 4
+"""Failures in a row, at servers that are up, after which a request is tested against CANARY."""
 CANARY: Messages = [{"role": "user", "content": "Say hello."}]
-"""What any server can answer: it tells whether a server is broken or an item is."""
+"""A prompt that any working server answers: it distinguishes a broken server from a prompt that
+cannot be answered."""
 
 
 class NoResponseError(Exception):
-    """Servers that answer other requests have no answer to this one."""
+    """Servers that answer other requests do not answer this one."""
 
 
-class Place:
-    """A server in use."""
+class ServerState:
+    """A server of the pool and its condition.
+
+    Attributes:
+        problem: Why the server is out of use; None while it is in use.
+        available_at: Earliest time of the next request, on the clock of time.monotonic().
+        rate_limits: Rate-limited responses in a row.
+        checked_at: Time of the last health check.
+        recovery: The task that waits until the server is up again.
+    """
 
     def __init__(self, server: Server) -> None:
         self.server = server
         self.in_flight = 0
         self.problem: str | None = None
-        """Why it is not asked."""
-        self.free_at = -math.inf
-        """When it may be asked again, in time.monotonic()'s seconds."""
-        self.limited = 0
-        """Times in a row that it wanted to be left alone."""
-        self.looking = asyncio.Lock()
-        self.looked_at = -math.inf
-        self.watch: asyncio.Task[None] | None = None
+        self.available_at = -math.inf
+        self.rate_limits = 0
+        self.health_lock = asyncio.Lock()
+        self.checked_at = -math.inf
+        self.recovery: asyncio.Task[None] | None = None
 
     @property
-    def ready(self) -> bool:
-        return self.problem is None and self.free_at <= time.monotonic()
+    def is_ready(self) -> bool:
+        return self.problem is None and self.available_at <= time.monotonic()
 
-    def rest(self, limit: RateLimitedError) -> None:
-        """Leave it alone for as long as it says."""
+    def back_off(self, limit: RateLimitedError) -> None:
+        """Send nothing for as long as the server asks."""
         now = time.monotonic()
-        # Those that were in flight together are refused together.
-        self.limited += self.free_at <= now
-        seconds = limit.seconds if limit.seconds is not None else jitter(self.limited)
-        self.free_at = max(self.free_at, now + seconds)
+        # Requests that were in flight together are limited together and count once.
+        self.rate_limits += self.available_at <= now
+        seconds = limit.seconds if limit.seconds is not None else random_pause(self.rate_limits)
+        self.available_at = max(self.available_at, now + seconds)
 
 
 class ServerPool:
-    """Asks `cfg.model` at `cfg.urls`, each time at the least busy server that is up.
+    """Sends requests to `cfg.model` at `cfg.urls`, each to the least busy server that is up.
 
-    `request` goes with every chat. `canary` is what any server can answer that serves such chats,
-    `kind` what they are asked as. Use it inside one event loop, as a context.
+    Use it as a context manager inside one event loop.
+
+    Args:
+        cfg: The servers.
+        fields: Fields of every request.
+        canary: A prompt that any working server of this kind answers.
+        kind: The client class of one server.
     """
 
     def __init__(
         self,
         cfg: ServersConfig,
-        request: RequestFields,
+        fields: RequestFields,
         canary: Messages = CANARY,
         kind: type[Server] = Server,
     ) -> None:
-        self.cfg, self.request, self.canary = cfg, request, canary
-        self.places = [Place(kind(url, cfg)) for url in dict.fromkeys(cfg.urls)]
+        self.cfg, self.fields, self.canary = cfg, fields, canary
+        self.states = [ServerState(kind(url, cfg)) for url in dict.fromkeys(cfg.urls)]
         self.stuck_since: float | None = None
-        """When no server could be asked, with no answer since."""
+        """Since when no server has been ready, with no response in between."""
 
     async def __aenter__(self) -> ServerPool:
-        await asyncio.gather(*(self._look(place) for place in self.places))
+        await asyncio.gather(*(self._is_up(state) for state in self.states))
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        watches = [place.watch for place in self.places if place.watch]
-        for watch in watches:
-            watch.cancel()
-        await asyncio.gather(*watches, return_exceptions=True)
-        await asyncio.gather(*(place.server.close() for place in self.places))
+        recoveries = [state.recovery for state in self.states if state.recovery]
+        for recovery in recoveries:
+            recovery.cancel()
+        await asyncio.gather(*recoveries, return_exceptions=True)
+        await asyncio.gather(*(state.server.close() for state in self.states))
 
-    async def complete(self, chat: Messages, n: int = 1, **own: object) -> list[Response]:
-        """Up to `n` answers to a chat, however often servers have to be waited for; `own` are
-        fields of this request alone.
+    async def complete(self, messages: Messages, n: int = 1, **fields: object) -> list[Response]:
+        """Up to `n` responses to a prompt, however long servers have to be waited for.
+
+        Args:
+            messages: The prompt.
+            n: Number of responses.
+            fields: Fields of this request only.
 
         Raises:
-            UnansweredError: servers that are up fail at this chat again and again, or refuse it.
-            UserError: no server can be asked for longer than `cfg.patience`, or one does not know
-                the model, refuses any request, or is of another kind.
+            NoResponseError: Servers that are up refuse this prompt or fail at it repeatedly.
+            UserError: No server was ready for `cfg.patience` seconds, or a server does not serve
+                the model, refuses every request, or does not follow OpenAI's API.
         """
-        faults = 0
+        failures = 0
         while True:
-            place = await self._free_place()
+            state = await self._wait_for_server()
             try:
-                return await self._ask(place, chat, n, self.request | own)
+                return await self._send(state, messages, n, self.fields | fields)
             except RateLimitedError as limit:
-                place.rest(limit)
+                state.back_off(limit)
                 continue
-            except RequestError as fault:
-                if not await self._look(place):
+            except RequestError as error:
+                if not await self._is_up(state):
                     continue
-                faults += 1
-                if faults == FAULTS or isinstance(fault, RefusedError):
-                    if await self._sings(place):
-                        raise NoResponseError(str(fault)) from fault
-                    faults = 0
-            await asyncio.sleep(jitter(faults))
+                failures += 1
+                if failures == MAX_FAILURES or isinstance(error, RefusedError):
+                    if await self._answers_canary(state):
+                        raise NoResponseError(str(error)) from error
+                    failures = 0
+            await asyncio.sleep(random_pause(failures))
 
-    async def _ask(
-        self, place: Place, chat: Messages, n: int, request: RequestFields
+    async def _send(
+        self, state: ServerState, messages: Messages, n: int, fields: RequestFields
     ) -> list[Response]:
-        place.in_flight += 1
+        state.in_flight += 1
         try:
-            replies = await place.server.complete(chat, n, request)
+            responses = await state.server.complete(messages, n, fields)
         finally:
-            place.in_flight -= 1
-        place.limited, self.stuck_since = 0, None
-        return replies
+            state.in_flight -= 1
+        state.rate_limits, self.stuck_since = 0, None
+        return responses
 
-    async def _free_place(self) -> Place:
-        """The least busy server that may be asked now. Raises UserError without patience left."""
-        while not (ready := [place for place in self.places if place.ready]):
+    async def _wait_for_server(self) -> ServerState:
+        """The least busy server that is ready. Raises UserError when patience runs out."""
+        while not (ready := [state for state in self.states if state.is_ready]):
             self.stuck_since = self.stuck_since or time.monotonic()
             if time.monotonic() - self.stuck_since > self.cfg.patience:
-                raise self._gone()
-            # Those that wait do not come back all at once.
+                raise self._no_server_error()
+            # Random, so that waiting requests do not resume all at once.
             await asyncio.sleep(random.uniform(0, PAUSE))
-        return min(ready, key=lambda place: place.in_flight)
+        return min(ready, key=lambda state: state.in_flight)
 
-    async def _look(self, place: Place) -> bool:
-        """Whether a server is up. One that is not is watched until it is."""
+    async def _is_up(self, state: ServerState) -> bool:
+        """Check a server's health, and start its recovery if it is down."""
         failed_at = time.monotonic()
-        # One look does for every request that failed before it.
-        async with place.looking:
-            if place.problem is None and place.looked_at < failed_at:
-                problem = await place.server.health()
-                place.looked_at = time.monotonic()
+        # One check serves all requests that failed before it.
+        async with state.health_lock:
+            if state.problem is None and state.checked_at < failed_at:
+                problem = await state.server.check_health()
+                state.checked_at = time.monotonic()
                 if problem is not None:
-                    self._set_aside(place, problem)
-        return place.problem is None
+                    self._take_out_of_use(state, problem)
+        return state.problem is None
 
-    def _set_aside(self, place: Place, problem: str, broken: bool = False) -> None:
-        log.info(f"{place.server.url} is not up ({problem}): waiting for it")
-        place.problem = problem
-        place.watch = asyncio.create_task(self._until_up(place, broken))
+    def _take_out_of_use(self, state: ServerState, problem: str, healthy: bool = False) -> None:
+        """`healthy`: the health page reports no problem, so only the canary shows a recovery."""
+        log.info(f"{state.server.url} is down ({problem}); waiting for it")
+        state.problem = problem
+        state.recovery = asyncio.create_task(self._recover(state, healthy))
 
-    async def _until_up(self, place: Place, broken: bool) -> None:
-        looks = 0
-        while place.problem is not None:
-            looks += 1
-            await asyncio.sleep(jitter(looks))
-            problem = await place.server.health()
-            # Broken is a server whose health page does not show it.
-            if problem is None and broken:
+    async def _recover(self, state: ServerState, healthy: bool) -> None:
+        checks = 0
+        while state.problem is not None:
+            checks += 1
+            await asyncio.sleep(random_pause(checks))
+            problem = await state.server.check_health()
+            if problem is None and healthy:
                 try:
-                    problem = await self._canary(place)
+                    problem = await self._send_canary(state)
                 except (RequestError, UserError) as error:
                     problem = str(error)
-            place.problem = problem
-        log.info(f"{place.server.url} is up again")
+            state.problem = problem
+        log.info(f"{state.server.url} is up again")
 
-    async def _sings(self, place: Place) -> bool:
-        """Whether a server answers what any server can. Raises UserError for one that refuses it or
-        is of another kind."""
+    async def _answers_canary(self, state: ServerState) -> bool:
+        """Send the canary, and take the server out of use if it fails.
+
+        Raises:
+            UserError: The server refuses the canary or does not follow OpenAI's API.
+        """
         try:
-            problem = await self._canary(place)
-        except RefusedError as fault:
-            raise UserError(f"{place.server.url} refuses any request: {fault}") from fault
-        except MalformedReplyError as fault:
+            problem = await self._send_canary(state)
+        except RefusedError as error:
             raise UserError(
-                f"{place.server.url} does not answer as an OpenAI-compatible server does "
-                f"({fault}); such a URL ends in /v1"
-            ) from fault
-        if problem is not None and place.problem is None:
-            self._set_aside(place, problem, broken=True)
+                f"{state.server.url} refuses every request ({error}): check the server's log and "
+                f"the settings {self.cfg.GROUP}.*",
+                code="server-refuses",
+            ) from error
+        except MalformedReplyError as error:
+            raise UserError(
+                f"{state.server.url} does not answer like an OpenAI-compatible server ({error}): "
+                "check the URL, which ends in /v1",
+                code="incompatible-server",
+            ) from error
+        if problem is not None and state.problem is None:
+            self._take_out_of_use(state, problem, healthy=True)
         return problem is None
 
-    async def _canary(self, place: Place) -> str | None:
-        """What is wrong with a server's answer to any chat, None for an answer."""
+    async def _send_canary(self, state: ServerState) -> str | None:
+        """Why the canary got no response, or None. Raises RefusedError and MalformedReplyError."""
         try:
-            await self._ask(place, self.canary, 1, self.request | {"max_tokens": 1})
+            await self._send(state, self.canary, 1, self.fields | {"max_tokens": 1})
         except (MalformedReplyError, RefusedError):
             raise
-        except RequestError as fault:
-            return str(fault)
+        except RequestError as error:
+            return str(error)
         return None
 
-    def _gone(self) -> UserError:
+    def _no_server_error(self) -> UserError:
         problems = "; ".join(
-            f"{place.server.url}: {place.problem or 'it wants to be left alone (HTTP 429)'}"
-            for place in self.places
+            f"{state.server.url}: {state.problem or 'rate-limited (HTTP 429)'}"
+            for state in self.states
         )
+        group, patience = self.cfg.GROUP, self.cfg.patience
         return UserError(
-            f"no server of {self.cfg.GROUP}.url could be asked for {self.cfg.GROUP}.patience="
-            f"{self.cfg.patience:g} seconds ({problems}); start one and run this again, it goes on "
-            "with what is answered"
+            f"no server of {group}.url was ready for {group}.patience={patience:g} seconds "
+            f"({problems}): start one and run the same command again, which resumes",
+            code="no-server",
         )
 
 
-def jitter(times: int) -> float:
-    """Seconds to pause after something has failed so many times: exponential, with full jitter."""
-    return random.uniform(0, min(LONGEST_PAUSE, PAUSE * 2**times))
+def random_pause(failures: int) -> float:
+    """Seconds to wait after a number of failures: exponential backoff with full jitter."""
+    return random.uniform(0, min(LONGEST_PAUSE, PAUSE * 2**failures))

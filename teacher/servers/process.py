@@ -1,4 +1,4 @@
-"""A server's process: started in a group of its own, awaited, and ended whole."""
+"""The server's process: start, wait until it is healthy, and stop with all its children."""
 
 from __future__ import annotations
 
@@ -15,39 +15,41 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from conf.errors import UserError
-from teacher.servers.health import health_problem
+from teacher.servers.health import check_health
 
 log = logging.getLogger(__name__)
 
-LOOK, SAY = 0.5, 10.0
-"""Seconds between two looks at the server, and between two lines about one that starts."""
-GRACE = 30.0
-"""Seconds that a server has to end by itself."""
-TAIL = 15
-"""Lines of a dead server's log that are shown."""
+CHECK_INTERVAL, LOG_INTERVAL = 0.5, 10.0
+"""Seconds between two checks of the server, and between two log lines while it starts."""
+GRACE_PERIOD = 30.0
+"""Seconds between SIGTERM and SIGKILL."""
+LOG_TAIL = 15
+"""Lines of a dead server's log that are repeated."""
 
 PR_SET_PDEATHSIG = 1
-"""Of Linux's prctl: the signal that a process gets when its parent dies."""
+"""Option of Linux's prctl: the signal that a process gets when its parent dies."""
 
 
-def clean_environment() -> dict[str, str]:
-    """This process's variables without those that would lead to its own packages."""
+def get_clean_environment() -> dict[str, str]:
+    """This process's environment without the variables that point at its own packages."""
     hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
     return {key: value for key, value in os.environ.items() if key not in hidden}
 
 
-def end_with_parent() -> None:
-    """Have the kernel end this process when its parent is killed, which then cannot."""
+def stop_with_parent() -> None:
+    """Let the kernel stop this process when its parent is killed, which cannot do so then."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 @contextmanager
-def running(python: Path, arguments: list[str], path: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """vLLM in a process group of its own, which is gone when this ends."""
-    environment = clean_environment() | {"PYTHONUNBUFFERED": "1"}
+def run_server(
+    python: Path, arguments: list[str], log_path: Path
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run vLLM in a new process group, and stop the whole group on exit."""
+    environment = get_clean_environment() | {"PYTHONUNBUFFERED": "1"}
     if Path(arguments[arguments.index("--model") + 1]).is_dir():
         environment["HF_HUB_OFFLINE"] = "1"
-    with open(path, "wb") as output:
+    with open(log_path, "wb") as output:
         server = subprocess.Popen(
             [python, *arguments],
             stdin=subprocess.DEVNULL,
@@ -55,61 +57,67 @@ def running(python: Path, arguments: list[str], path: Path) -> Iterator[subproce
             stderr=subprocess.STDOUT,
             env=environment,
             start_new_session=True,
-            preexec_fn=end_with_parent if sys.platform == "linux" else None,
+            preexec_fn=stop_with_parent if sys.platform == "linux" else None,
         )
     try:
         yield server
     finally:
-        end_group(server)
+        stop_group(server)
 
 
-def await_health(
-    server: subprocess.Popen[bytes], url: str, path: Path, stop: threading.Event
+def wait_until_healthy(
+    server: subprocess.Popen[bytes], url: str, log_path: Path, stop: threading.Event
 ) -> bool:
-    """Whether the server came up; False when it was told to stop before that. Raises UserError
-    where it ended by itself."""
-    since = said = time.monotonic()
+    """Wait until the server is up (True) or `stop` is set (False).
+
+    Raises:
+        UserError: The server exited.
+    """
+    started = logged = time.monotonic()
     while not stop.is_set():
-        check_alive(server, path)
-        if health_problem(url) is None:
+        check_running(server, log_path)
+        if check_health(url) is None:
             return True
-        if time.monotonic() - said >= SAY:
-            said = time.monotonic()
-            log.info(f"starting for {said - since:.0f} s: {last_line(path)}")
-        stop.wait(LOOK)
+        if time.monotonic() - logged >= LOG_INTERVAL:
+            logged = time.monotonic()
+            log.info(f"starting for {logged - started:.0f} s: {read_last_line(log_path)}")
+        stop.wait(CHECK_INTERVAL)
     return False
 
 
-def stay(server: subprocess.Popen[bytes], path: Path, stop: threading.Event) -> None:
-    """Return when it is told to stop. Raises UserError where the server ended by itself."""
-    while not stop.wait(LOOK):
-        check_alive(server, path)
+def wait_for_stop(server: subprocess.Popen[bytes], log_path: Path, stop: threading.Event) -> None:
+    """Wait until `stop` is set. Raises UserError if the server exits before."""
+    while not stop.wait(CHECK_INTERVAL):
+        check_running(server, log_path)
 
 
-def check_alive(server: subprocess.Popen[bytes], path: Path) -> None:
+def check_running(server: subprocess.Popen[bytes], log_path: Path) -> None:
+    """Raises UserError if the server has exited, and logs the end of its log."""
     if (status := server.poll()) is None:
         return
-    for line in path.read_text(errors="replace").splitlines()[-TAIL:]:
+    for line in log_path.read_text(errors="replace").splitlines()[-LOG_TAIL:]:
         log.info(f"  {line}")
-    how = f"signal {-status}" if status < 0 else f"status {status}"
-    raise UserError(f"the server ended by itself with {how}; {path} ends as shown above")
+    cause = f"signal {-status}" if status < 0 else f"status {status}"
+    raise UserError(
+        f"the server exited with {cause}; the end of {log_path} is above", code="server-exited"
+    )
 
 
-def last_line(path: Path) -> str:
-    lines = path.read_text(errors="replace").splitlines()
-    return lines[-1].strip()[:120] if lines else "no word from it yet"
+def read_last_line(log_path: Path) -> str:
+    lines = log_path.read_text(errors="replace").splitlines()
+    return lines[-1].strip()[:120] if lines else "no output yet"
 
 
-def end_group(server: subprocess.Popen[bytes]) -> None:
-    """Ask a process and what it started to end, and kill what does not."""
-    send(server, signal.SIGTERM)
+def stop_group(server: subprocess.Popen[bytes]) -> None:
+    """Send SIGTERM to a process group, and SIGKILL to what is left after GRACE_PERIOD."""
+    signal_group(server, signal.SIGTERM)
     with suppress(subprocess.TimeoutExpired):
-        server.wait(GRACE)
-    send(server, signal.SIGKILL)
+        server.wait(GRACE_PERIOD)
+    signal_group(server, signal.SIGKILL)
     server.wait()
 
 
-def send(server: subprocess.Popen[bytes], number: int) -> None:
-    # Nothing may be left of the group.
+def signal_group(server: subprocess.Popen[bytes], number: int) -> None:
+    # The group may be gone already.
     with suppress(ProcessLookupError):
         os.killpg(server.pid, number)

@@ -1,4 +1,4 @@
-"""What a server's reply amounts to."""
+"""Responses of a chat server."""
 
 from __future__ import annotations
 
@@ -7,13 +7,21 @@ from dataclasses import dataclass
 from typing import Any
 
 TRUNCATED = "cut off"
-"""The flaw of an answer that has as many tokens as it may have."""
+"""The flaw of a response that reached the token limit."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """A server's answer. `flaw` says why its text is none, whatever it reads; `thought` is what a
-    server's reasoning parser has taken out of the text."""
+    """One response to a prompt.
+
+    Attributes:
+        text: The response without surrounding white space.
+        flaw: Why the response is unusable, whatever its text; None if it is usable.
+        prompt_tokens: Tokens of the prompt; 0 for all but the first response to one request.
+        completion_tokens: Tokens of the response, as an equal share of its request's total.
+        finished: Time of arrival, in seconds since 1970.
+        reasoning: What the server's reasoning parser removed from the text.
+    """
 
     text: str
     flaw: str | None = None
@@ -23,40 +31,43 @@ class Response:
     reasoning: str = ""
 
 
-def replies(completion: Any, n: int) -> list[Response]:
-    """The first `n` choices of a chat completion. Raises ValueError where there is none."""
-    choices = completion.choices[:n]
+def parse_completion(completion: Any, n: int) -> list[Response]:
+    """The first `n` choices of an openai chat completion.
+
+    Raises:
+        ValueError: The completion has no choices.
+    """
+    choices, usage = completion.choices[:n], completion.usage
     if not choices:
         raise ValueError("it has no choices")
-    read, written = _usage(completion)
-    given = []
+    responses = []
     for k, choice in enumerate(choices):
-        share = None if written is None else (written + k) // len(choices)
-        prompt = None if read is None else read * (k == 0)
-        text, thought = _clean(choice.message.content), _clean(_thought(choice))
-        flaw = _flaw(text, thought, choice)
-        given.append(Response(text, flaw, prompt, share, time.time(), thought))
-    return given
-
-
-def _usage(completion: Any) -> tuple[int | None, int | None]:
-    usage = completion.usage
-    return (usage.prompt_tokens, usage.completion_tokens) if usage else (None, None)
-
-
-def _thought(choice: Any) -> str | None:
-    message = choice.message
-    return getattr(message, "reasoning_content", None) or getattr(message, "reasoning", None)
+        message = choice.message
+        text = _clean(message.content)
+        reasoning = _clean(
+            getattr(message, "reasoning_content", None) or getattr(message, "reasoning", None)
+        )
+        responses.append(
+            Response(
+                text=text,
+                flaw=_find_flaw(text, reasoning, choice.finish_reason),
+                prompt_tokens=usage and usage.prompt_tokens * (k == 0),
+                completion_tokens=usage and (usage.completion_tokens + k) // len(choices),
+                finished=time.time(),
+                reasoning=reasoning,
+            )
+        )
+    return responses
 
 
 def _clean(text: str | None) -> str:
-    # A model may answer with half of a surrogate pair, which no file can hold.
+    # A model may generate half of a surrogate pair, which UTF-8 cannot encode.
     return (text or "").encode("utf-8", "replace").decode().strip()
 
 
-def _flaw(text: str, thought: str, choice: Any) -> str | None:
-    if choice.finish_reason == "length":
+def _find_flaw(text: str, reasoning: str, finish_reason: str) -> str | None:
+    if finish_reason == "length":
         return TRUNCATED
-    if thought or "<think>" in text or "</think>" in text:
+    if reasoning or "<think>" in text or "</think>" in text:
         return "thinking"
     return None if text else "empty"

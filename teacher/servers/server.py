@@ -1,4 +1,4 @@
-"""One OpenAI-compatible server: how it is asked, and what can come back."""
+"""Client of one OpenAI-compatible server."""
 
 from __future__ import annotations
 
@@ -12,51 +12,55 @@ import openai
 
 from conf.errors import UserError
 from conf.schema import ServersConfig
-from teacher.servers.health import health_problem
-from teacher.servers.responses import Response, replies
+from teacher.servers.health import check_health
+from teacher.servers.responses import Response, parse_completion
 
 Messages = list[dict[str, Any]]
+"""A prompt in the chat format."""
 RequestFields = dict[str, Any]
-"""Fields of a chat completion's request, those outside the API's own in `extra_body`."""
+"""Fields of a chat completion request; those outside OpenAI's API are in `extra_body`."""
 
 MALFORMED_RESPONSE_ERRORS = (AttributeError, IndexError, TypeError, ValueError)
-"""What the client raises at a reply that is not of the API's form."""
-
-
-BUSY = (408, 409)
-"""Statuses below 500 that another try may change: a timeout on the way, a conflict."""
-KEY = "OPENAI_API_KEY"
-"""The variable that holds the key of servers that want one: no setting, for those are written
-down."""
+"""Errors that the openai client raises for a body that does not follow the API."""
+RETRYABLE_STATUSES = (408, 409)
+"""Client errors that a retry may resolve: request timeout and conflict."""
+API_KEY_VARIABLE = "OPENAI_API_KEY"
+"""An environment variable and not a setting, because settings are saved with the run."""
 
 
 def get_api_key() -> str:
-    """The key; a server that wants none is content with any word, and the client wants one."""
-    return os.environ.get(KEY) or "none"
+    """The API key from the environment; a placeholder if unset, since the client requires one."""
+    return os.environ.get(API_KEY_VARIABLE) or "none"
 
 
 def authentication_error(url: str, error: openai.APIStatusError) -> UserError:
-    """What to tell a user whom a server does not let in."""
+    """The error for a server that rejects the API key."""
     return UserError(
-        f"{url} does not accept the key that it was given ({error.message}): put that server's key "
-        f"into the environment variable {KEY}"
+        f"{url} rejects the API key ({error.message}): set the environment variable "
+        f"{API_KEY_VARIABLE} to a key of that server",
+        code="invalid-api-key",
     )
 
 
 class RequestError(Exception):
-    """A request without an answer."""
+    """A request that got no response."""
 
 
 class MalformedReplyError(RequestError):
-    """A reply that is not of the API's form."""
+    """A body that does not follow the API."""
 
 
 class RefusedError(RequestError):
-    """The server will not answer this request, however often it is sent."""
+    """The server refuses this request; a retry gets the same result."""
 
 
 class RateLimitedError(RequestError):
-    """The server wants to be left alone, for `seconds` where it says so."""
+    """The server limits the request rate.
+
+    Args:
+        problem: The HTTP status.
+        seconds: How long the server asks clients to wait; None if it does not say.
+    """
 
     def __init__(self, problem: str, seconds: float | None) -> None:
         super().__init__(problem)
@@ -64,7 +68,7 @@ class RateLimitedError(RequestError):
 
 
 class Server:
-    """Asks `cfg.model` at `url`. Use it inside one event loop."""
+    """Sends requests to `cfg.model` at `url`. Use it inside one event loop."""
 
     def __init__(self, url: str, cfg: ServersConfig) -> None:
         self.url = url
@@ -73,66 +77,65 @@ class Server:
             base_url=url, api_key=get_api_key(), max_retries=0, timeout=cfg.timeout
         )
 
-    async def complete(self, chat: Messages, n: int, request: RequestFields) -> list[Response]:
-        """`n` answers to a chat.
+    async def complete(self, messages: Messages, n: int, fields: RequestFields) -> list[Response]:
+        """Up to `n` responses to a prompt.
 
         Raises:
-            RequestError: there is no answer, this time.
-            UserError: the server does not know the model, or the key.
+            RequestError: No response this time.
+            UserError: The server does not serve the model, or rejects the API key.
         """
         cfg = self.cfg
         try:
-            # The client's own timeout starts again with every byte that comes.
+            # The openai client's own timeout restarts with every byte that arrives.
             async with asyncio.timeout(cfg.timeout):
-                return await self._responses(chat, n, request)
+                return await self._send(messages, n, fields)
         except openai.NotFoundError as error:
-            raise await self._unknown_model() from error
+            raise await self._unknown_model_error() from error
         except openai.AuthenticationError as error:
             raise authentication_error(self.url, error) from error
         except openai.RateLimitError as error:
             raise RateLimitedError("HTTP 429", _retry_after(error)) from error
-        except openai.InternalServerError as error:
-            raise RequestError(f"HTTP {error.status_code}") from error
         except openai.APIStatusError as error:
-            if error.status_code in BUSY:
+            if error.status_code >= 500 or error.status_code in RETRYABLE_STATUSES:
                 raise RequestError(f"HTTP {error.status_code}") from error
             raise RefusedError(error.message) from error
         except (openai.APITimeoutError, TimeoutError) as error:
             raise RequestError(
-                f"no answer within {cfg.GROUP}.timeout={cfg.timeout:g} seconds"
+                f"no response within {cfg.GROUP}.timeout={cfg.timeout:g} seconds"
             ) from error
         except openai.APIConnectionError as error:
             raise RequestError(str(error.__cause__ or error)) from error
         except (openai.APIResponseValidationError, *MALFORMED_RESPONSE_ERRORS) as error:
             raise MalformedReplyError(f"{type(error).__name__}: {error}") from error
 
-    async def _responses(self, chat: Messages, n: int, request: RequestFields) -> list[Response]:
-        """Errors are the client's own, and those of `NO_REPLY`."""
+    async def _send(self, messages: Messages, n: int, fields: RequestFields) -> list[Response]:
+        """Raises errors of the openai client and MALFORMED_RESPONSE_ERRORS."""
         completion = await self.client.chat.completions.create(
-            model=self.cfg.model, messages=chat, n=n, **request
+            model=self.cfg.model, messages=messages, n=n, **fields
         )
-        return replies(completion, n)
+        return parse_completion(completion, n)
 
-    async def health(self) -> str | None:
-        """What is wrong with the server, None if it is up."""
-        return await asyncio.to_thread(health_problem, self.url)
+    async def check_health(self) -> str | None:
+        """Why the server is down, or None if it is up."""
+        return await asyncio.to_thread(check_health, self.url)
 
     async def close(self) -> None:
         await self.client.close()
 
-    async def _unknown_model(self) -> UserError:
+    async def _unknown_model_error(self) -> UserError:
         try:
             served = ", ".join([m.id async for m in self.client.models.list()])
         except (openai.OpenAIError, *MALFORMED_RESPONSE_ERRORS):
-            served = "an unknown set"
+            served = "an unknown set of models"
         return UserError(
-            f"{self.url} does not serve {self.cfg.GROUP}.model={self.cfg.model}; it has {served}. "
-            "Is that the URL of an OpenAI-compatible server, ending in /v1?"
+            f"{self.url} does not serve {self.cfg.GROUP}.model={self.cfg.model}; it serves "
+            f"{served}. Check that the URL is that of an OpenAI-compatible server and ends in /v1",
+            code="unknown-model",
         )
 
 
 def _retry_after(error: openai.APIStatusError) -> float | None:
-    """Seconds of a Retry-After header, which may also be a date."""
+    """Seconds to wait by the Retry-After header, which holds a number or a date."""
     header = error.response.headers.get("retry-after", "")
     try:
         return max(0.0, float(header))

@@ -1,7 +1,7 @@
-"""Reads what a rationale claims of the scene and of the candidates, by closed vocabulary.
+"""Extracts the claims of a rationale with a closed vocabulary, and checks them.
 
-Each claim is held against the predicates. What the words leave open is not guessed at: a claim is
-contradicted only where the predicates say otherwise in any reading.
+Ambiguous wording is never guessed: a claim is contradicted only if the predicates contradict every
+reading of it.
 """
 
 from __future__ import annotations
@@ -19,45 +19,46 @@ MOMENTS = {
     "Prediction": TARGET,
     "Outcome": TARGET,
 }
-"""What the present tense of a section speaks of."""
+"""The moment that a section's present tense refers to."""
 
 MAX_SENTENCE_TAGS = 250
-"""Tags of a sentence, beyond which it is cut."""
+"""Tags after which a sentence is split."""
 
 
 def extract_claims(text: str, predicates: Predicates) -> tuple[Claim, ...]:
     """The claims of a rationale in order, each with its verdict; never raises."""
     ground = Ground(predicates)
-    found: list[Claim] = []
+    claims: list[Claim] = []
     for name, start, stop in split_sections(text):
         if name == "Answer":
-            found += _answer(text, start, stop)
+            claims += _extract_answer(text, start, stop)
             continue
         scene = SceneReader(text, ground, MOMENTS.get(name, EITHER))
         candidates = CandidateReader(text, ground, lasting=name == "Candidate analysis")
-        for sentence in _sentences(tags(text, start, stop)):
+        for sentence in _split_sentences(tags(text, start, stop)):
             if name == "Candidate analysis" or (
                 name == "Outcome" and any(t.tag == "candidate" for t in sentence)
             ):
-                found += candidates.read(sentence)
+                claims += candidates.read(sentence)
             else:
-                found += scene.read(sentence)
-    found.sort(key=lambda claim: claim.span)
-    return tuple(claim._replace(verdict=ground.verdict(claim)) for claim in found)
+                claims += scene.read(sentence)
+    claims.sort(key=lambda claim: claim.span)
+    return tuple(claim._replace(verdict=ground.verdict(claim)) for claim in claims)
 
 
-def _answer(text: str, start: int, stop: int) -> list[Claim]:
+def _extract_answer(text: str, start: int, stop: int) -> list[Claim]:
     letter = text[start:stop].strip()
     if len(letter) != 1:
         return []
-    at = text.index(letter, start)
-    return [Claim("agrees", (), "", True, TARGET, letter, (at, at + 1))]
+    position = text.index(letter, start)
+    return [Claim("agrees", (), "", True, TARGET, letter, (position, position + 1))]
 
 
-def _sentences(found: list[Tag]) -> list[list[Tag]]:
-    """Sentences, the longest parted: the readers look ahead, and their time is to stay linear."""
+def _split_sentences(section: list[Tag]) -> list[list[Tag]]:
+    """Sentences, the longest of them split: the readers look ahead, so that their time is linear
+    only in sentences of bounded length."""
     sentences: list[list[Tag]] = [[]]
-    for tag in found:
+    for tag in section:
         sentences[-1].append(tag)
         if tag.tag == "stop" or len(sentences[-1]) >= MAX_SENTENCE_TAGS:
             sentences.append([])

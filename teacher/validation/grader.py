@@ -1,4 +1,4 @@
-"""What becomes of an answer: validated, and stamped with everything that shaped it."""
+"""Grades responses: validates them and records all that shaped them."""
 
 from __future__ import annotations
 
@@ -8,86 +8,77 @@ from collections.abc import Iterable
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
+from teacher.grammar import GRAMMAR_VERSION
 from teacher.narrator import NARRATOR_VERSION
 from teacher.predicates import Predicates
 from teacher.prompts import PROMPT_VERSION
 from teacher.reading.grounding import VERDICTS, Claim
 from teacher.servers.responses import Response
-from teacher.validation.validator import VALIDATOR_VERSION, validate_rationale
+from teacher.validation.validator import VALIDATOR_VERSION, Verdict, validate_rationale
 
-LONGEST = 20_000
-"""Characters of an answer that are read and kept; no rationale has as many."""
-
-Signature = tuple[str, str, str, str, int]
+MAX_CHARACTERS = 20_000
+"""Characters of a response that are validated and recorded; no valid rationale is as long."""
 
 
 class RationaleGrader:
-    """Judges answers under one configuration."""
+    """Turns responses into `Rationale` records under one configuration."""
 
     def __init__(self, cfg: TeacherConfig) -> None:
         self.cfg = cfg
-        self.grammar = _grammar_version() if cfg.grammar else None
-        self.version = NARRATOR_VERSION if cfg.url is None else PROMPT_VERSION
-        self.settings = self._settings()
+        self.grammar_version = GRAMMAR_VERSION if cfg.grammar else None
+        self.prompt_version = NARRATOR_VERSION if cfg.url is None else PROMPT_VERSION
+        self.settings = self._hash_settings()
 
-    @property
-    def signature(self) -> Signature:
-        """What two answers that may stand for one another have in common."""
-        return (self.cfg.name, self.version, VALIDATOR_VERSION, self.settings, self.cfg.seed)
-
-    def judge(
-        self, reply: Response, predicates: Predicates, item: SelectionItem, attempt: int
+    def grade(
+        self, response: Response, predicates: Predicates, item: SelectionItem, attempt: int
     ) -> Rationale:
-        reasons, sections, answer, claims = (reply.flaw,), {}, None, ()
-        if len(reply.text) > LONGEST:
-            reasons = ("too long",)
-        elif reply.flaw is None:
-            verdict = validate_rationale(reply.text, predicates, item, self.cfg)
-            reasons, sections, answer = verdict.reasons, verdict.sections, verdict.answer
-            claims = verdict.claims
+        """Validate a response; it is accepted if there is no reason to reject it."""
+        if len(response.text) > MAX_CHARACTERS:
+            verdict = Verdict(("too long",))
+        elif response.flaw is not None:
+            verdict = Verdict((response.flaw,))
+        else:
+            verdict = validate_rationale(response.text, predicates, item, self.cfg)
         return Rationale(
             item_id=item.item_id,
             attempt=attempt,
-            accepted=not reasons,
-            text=reply.text[:LONGEST],
-            answer=answer,
+            accepted=verdict.accepted,
+            text=response.text[:MAX_CHARACTERS],
+            answer=verdict.answer,
             teacher=self.cfg.name,
-            prompt_version=self.version,
+            prompt_version=self.prompt_version,
             validator_version=VALIDATOR_VERSION,
             settings=self.settings,
             seed=self.cfg.seed,
-            reasons=reasons,
-            sections=sections,
-            prompt_tokens=reply.prompt_tokens,
-            completion_tokens=reply.completion_tokens,
-            grammar=self.grammar,
-            finished=reply.finished,
-            claims=tally(claims),
+            reasons=verdict.reasons,
+            sections=verdict.sections,
+            prompt_tokens=response.prompt_tokens,
+            completion_tokens=response.completion_tokens,
+            grammar=self.grammar_version,
+            finished=response.finished,
+            claims=count_verdicts(verdict.claims),
         )
 
-    def _settings(self) -> str:
+    def is_current(self, r: Rationale) -> bool:
+        """Whether a recorded rationale is of this teacher, these versions and these settings."""
+        recorded = (r.teacher, r.prompt_version, r.validator_version, r.settings, r.seed)
+        versions = (self.prompt_version, VALIDATOR_VERSION, self.settings)
+        return recorded == (self.cfg.name, *versions, self.cfg.seed)
+
+    def _hash_settings(self) -> str:
+        """A short hash of the settings that shape a response or its verdict."""
         cfg = self.cfg
-        shaping = [cfg.min_words, cfg.max_words]
+        settings = [cfg.min_words, cfg.max_words]
         if cfg.url is not None:
-            shaping += [cfg.model, cfg.temperature, cfg.top_p, cfg.top_k, cfg.max_tokens]
-        if self.grammar is not None:
-            shaping.append(self.grammar)
-        return hashlib.sha256(json.dumps(shaping).encode()).hexdigest()[:8]
+            settings += [cfg.model, cfg.temperature, cfg.top_p, cfg.top_k, cfg.max_tokens]
+        if self.grammar_version is not None:
+            settings.append(self.grammar_version)
+        return hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:8]
 
 
-def tally(claims: Iterable[Claim]) -> dict[str, list[int]]:
-    """How many claims are supported, contradicted and unknown, by kind."""
+def count_verdicts(claims: Iterable[Claim]) -> dict[str, list[int]]:
+    """Numbers of supported, contradicted and unknown claims, by kind."""
     counts: dict[str, list[int]] = {}
     for claim in claims:
         counts.setdefault(claim.kind, [0] * len(VERDICTS))[VERDICTS.index(claim.verdict)] += 1
     return dict(sorted(counts.items()))
-
-
-def signature(r: Rationale) -> Signature:
-    return (r.teacher, r.prompt_version, r.validator_version, r.settings, r.seed)
-
-
-def _grammar_version() -> str:
-    from teacher.grammar import GRAMMAR_VERSION
-
-    return GRAMMAR_VERSION

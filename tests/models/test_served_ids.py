@@ -15,7 +15,7 @@ from data.records import FPS
 from models.loading import pin_sizes
 from models.student.collator import Encoded, encode
 from models.student.prompts import Sample, selection_sample
-from tests.teacher.serving import ENVIRONMENT
+from tests.teacher.vllm_server import ENVIRONMENT
 
 LENGTH = 1500
 

@@ -1,4 +1,4 @@
-"""What several of the teacher's tests stand on."""
+"""Fixtures of the teacher's tests."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ from pathlib import Path
 
 import pytest
 
-from tests.teacher.made import MadeStore, made_store
-from tests.teacher.odd import OddServer
+from tests.teacher.faulty_server import FaultyServer
+from tests.teacher.memory_store import MemoryStore, make_store
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> MadeStore:
-    return made_store(tmp_path, 14)
+def store(tmp_path: Path) -> MemoryStore:
+    return make_store(tmp_path, 14)
 
 
 @pytest.fixture
-def odd(store: MadeStore, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., OddServer]]:
-    """Starts servers with the faults that they begin with; pauses are short."""
+def start_server(
+    store: MemoryStore, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., FaultyServer]]:
+    """Starts servers with the faults of their first responses; the pool's pauses are short."""
     monkeypatch.setattr("teacher.servers.pool.PAUSE", 0.01)
     monkeypatch.setattr("teacher.servers.pool.LONGEST_PAUSE", 0.05)
     servers = []
 
-    def start(*faults: object) -> OddServer:
-        servers.append(OddServer(store, faults))
+    def start(*faults: object) -> FaultyServer:
+        servers.append(FaultyServer(store, faults))
         return servers[-1]
 
     yield start

@@ -1,4 +1,4 @@
-"""Letters of candidates: which they are, and rationales for another order."""
+"""Candidates' letters: detection, and relabelling for another order."""
 
 from itertools import permutations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from conf.schema import TeacherConfig
-from teacher.candidate_letters import letters, relabel_text, reorder_candidates
+from teacher.candidate_letters import find_letters, relabel_text, reorder_candidates
 from teacher.narrator import write_rationale
 from teacher.predicates import extract_predicates
 from teacher.validation.validator import validate_rationale
@@ -30,11 +30,11 @@ ORDERS = list(permutations(range(4)))
         ("A bounces less than B; A has it near the top - A metal sphere has it not.", "ABA"),
     ],
 )
-def test_letters_are_told_from_the_article(text, named):
-    assert "".join(text[start:stop] for start, stop in letters(text)) == named
+def test_letters_are_distinguished_from_the_article(text, named):
+    assert "".join(text[start:stop] for start, stop in find_letters(text)) == named
 
 
-def test_the_same_order_changes_nothing_and_orders_compose():
+def test_relabelling_composes():
     text = "Candidate A lacks the cube. B and C differ. A contact follows. Answer: D"
     assert relabel_text(text, range(4)) == text
     for first in ORDERS:
@@ -45,14 +45,13 @@ def test_the_same_order_changes_nothing_and_orders_compose():
             assert relabel_text(relabel_text(text, first), second) == relabel_text(text, both)
 
 
-def test_no_order_is_refused():
-    with pytest.raises(ValueError, match=r"\[0, 1, 1, 3\] is no order"):
+def test_invalid_permutation_is_refused():
+    with pytest.raises(ValueError, match=r"\[0, 1, 1, 3\]"):
         relabel_text("Answer: A", [0, 1, 1, 3])
 
 
-def test_a_relabelled_rationale_is_as_right_for_the_reordered_item(micro_store):
-    """It is what the validator, with predicates of the other order, finds nothing wrong with."""
-    cfg, rng, told = TeacherConfig(name="template"), np.random.default_rng(0), 0
+def test_relabelled_rationale_is_valid_for_the_reordered_item(micro_store):
+    cfg, rng, moved = TeacherConfig(name="template"), np.random.default_rng(0), 0
     for item in micro_store.selection():
         scene = micro_store.scene(item.scene_id)
         predicates = extract_predicates(item, scene, micro_store.scene)
@@ -67,5 +66,5 @@ def test_a_relabelled_rationale_is_as_right_for_the_reordered_item(micro_store):
         verdict = validate_rationale(relabel_text(text, order), facts, other, cfg)
         assert verdict.accepted, verdict.reasons
         assert verdict.answer == other.letter
-        told += other.letter != item.letter
-    assert told > 20
+        moved += other.letter != item.letter
+    assert moved > 20

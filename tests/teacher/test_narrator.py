@@ -1,4 +1,4 @@
-"""The built-in narrator passes the validator, and the validator catches what is broken."""
+"""The built-in narrator passes the validator, and the validator rejects broken rationales."""
 
 import re
 import subprocess
@@ -11,27 +11,26 @@ from conf.schema import TeacherConfig
 from teacher.narrator import write_description, write_rationale
 from teacher.numbers import find_numbers
 from teacher.predicates import extract_predicates
-from teacher.validation.validator import WORD, validate_rationale, word_count
+from teacher.validation.validator import WORD, count_words, validate_rationale
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import cases
 
 CFG = TeacherConfig(name="template")
 
 
-def test_every_narration_is_accepted():
-    words, vocabulary, lengths = 0, set(), []
+def test_every_rationale_is_accepted():
+    vocabulary, lengths = set(), []
     for item, predicates in cases(250):
         text = write_rationale(predicates, item, seed=3)
         assert validate_rationale(text, predicates, item, CFG).reasons == ()
-        lengths.append(word_count(text))
+        lengths.append(count_words(text))
         vocabulary |= {w.lower() for w in WORD.findall(text)}
-        words += 1
-    assert words > 200
+    assert len(lengths) > 200
     assert 100 <= np.median(lengths) <= 180
     assert len(vocabulary) <= 250
 
 
-def test_sparse_scenes_are_long_enough_and_crowded_ones_short_enough():
+def test_length_is_valid_for_sparse_and_crowded_scenes():
     still = synthetic.scene([(0, 0)], [(0, 0)])
     grid = [(x, y) for x in (-0.6, 0.0, 0.6) for y in (-0.25, 0.25)]
     crowded = synthetic.scene(grid, [(0.3 * -x, -y) for x, y in grid])
@@ -45,7 +44,7 @@ def test_sparse_scenes_are_long_enough_and_crowded_ones_short_enough():
             assert validate_rationale(text, predicates, item, CFG).reasons == ()
 
 
-def test_seeds_vary_and_repeat():
+def test_text_varies_with_the_seed_and_is_reproducible():
     item, predicates = next(cases(9))
     texts = {write_rationale(predicates, item, seed) for seed in range(8)}
     assert len(texts) > 4
@@ -53,14 +52,18 @@ def test_seeds_vary_and_repeat():
     assert len({write_rationale(predicates, item, 0, attempt) for attempt in range(4)}) > 1
 
 
-def test_another_process_narrates_alike():
+def test_text_is_the_same_in_another_process():
     code = (
-        "from tests.teacher.test_predicates import cases; from teacher.narrator import narrate;"
-        "i, p = next(cases(9)); print(narrate(p, i, 5))"
+        "from tests.teacher.test_predicates import cases\n"
+        "from teacher.narrator import write_rationale\n"
+        "item, predicates = next(cases(9))\n"
+        "print(write_rationale(predicates, item, 5))"
     )
     item, predicates = next(cases(9))
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == write_rationale(predicates, item, 5)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == write_rationale(predicates, item, 5)
 
 
 def test_descriptions_have_no_candidates_and_no_numbers():
@@ -73,18 +76,18 @@ def test_descriptions_have_no_candidates_and_no_numbers():
     assert text == write_description(scene, 0, 20, 70, 0)
 
 
-def other_letter(text, item):
+def change_letter(text, item):
     return text[:-1] + "ABCD"[(item.answer + 1) % 4]
 
 
-def without(section):
+def drop_section(section):
     def drop(text, item):
         return "\n".join(line for line in text.splitlines() if not line.startswith(section))
 
     return drop
 
 
-def swap(text, item):
+def swap_sections(text, item):
     lines = text.splitlines()
     return "\n".join([lines[1], lines[0], *lines[2:]])
 
@@ -94,32 +97,32 @@ def swap(text, item):
     [
         (lambda t, i: t.replace("The ", "The two ", 1), "number: 'two'"),
         (lambda t, i: t.replace(" near", " 3 px near", 1), "number: '3'"),
-        (without("Prediction"), "missing section: Prediction"),
-        (without("Outcome"), "missing section: Outcome"),
-        (without("Answer"), "no answer"),
+        (drop_section("Prediction"), "missing section: Prediction"),
+        (drop_section("Outcome"), "missing section: Outcome"),
+        (drop_section("Answer"), "no answer"),
         (lambda t, i: t.replace("Answer: ", "Answer:"), "unclear answer"),
         (lambda t, i: t.replace("Answer: ", "Answer:\n\n"), "unclear answer"),
         (
             lambda t, i: re.sub(r"[Cc]andidate A[^.]*\.", "A wrong layout is seen.", t),
             "candidate not analysed: A",
         ),
-        (other_letter, "wrong answer"),
+        (change_letter, "wrong answer"),
         (lambda t, i: t[: len(t) // 2], "no answer"),
         (lambda t, i: t[:-1] + "none", "unclear answer"),
         (lambda t, i: t.replace("Outcome: ", "Outcome: " + "still " * 200), "too long"),
         (lambda t, i: "Answer: " + i.letter, "too short"),
         (lambda t, i: "Sure! " + t.replace("Scene", "\nScene", 1), "text before the sections"),
         (lambda t, i: t + "\n" + t.splitlines()[-1], "repeated section"),
-        (swap, "sections out of order"),
+        (swap_sections, "sections out of order"),
         (lambda t, i: "", "missing section: Scene parse"),
-        (lambda t, i: "No heading stands anywhere in this.", "missing section: Outcome"),
+        (lambda t, i: "This text has no heading.", "missing section: Outcome"),
         (
             lambda t, i: t.replace("Candidate D", "It").replace("candidate D", "it"),
             "candidate not analysed: D",
         ),
     ],
 )
-def test_a_broken_rationale_is_rejected(mutate, reason):
+def test_broken_rationale_is_rejected(mutate, reason):
     for item, predicates in cases(6):
         text = write_rationale(predicates, item, 0)
         verdict = validate_rationale(mutate(text, item), predicates, item, CFG)

@@ -1,4 +1,4 @@
-"""The finder of numbers against labelled sentences, insertions and hostile text."""
+"""Detection of numbers: labelled sentences, insertions into prose, and adversarial text."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from teacher.narrator import write_description, write_rationale
 from teacher.numbers import find_numbers
 from tests.teacher import synthetic
-from tests.teacher.hostile_text import PIECES, hostile
+from tests.teacher.adversarial_text import PIECES, repeat_piece
 from tests.teacher.test_predicates import cases
 
 FOLDER = Path(__file__).parent / "sentences"
@@ -39,31 +39,31 @@ a [trio]|a [single] cube|[percent]|for some [seconds]|a [minute] later|a [few fr
 [tw\u043e]|[\uff54\uff57\uff4f]|[\u24e3\u24e6\u24de]|[TWO]|[twoSpheres]|[twospheres]|[e!ght]
 [dos]|[deux]|[zwei]|[cinque]|[três]|[twee]|[два]|[пять]|[τρία]|[दो]|[ثلاثة]|[셋]
 """.strip().replace("\n", "|")
-"""What states a number, the part that must be found in brackets."""
+"""Phrases that state a number; the part to be detected is in brackets."""
 
 
 @cache
-def told(count: int) -> list[str]:
-    """Rationales of the built-in narrator."""
+def narrator_texts(count: int) -> list[str]:
+    """Rationales by the built-in narrator."""
     return [write_rationale(predicates, item, seed=5) for item, predicates in cases(count)]
 
 
-def free() -> list[str]:
+def free_texts() -> list[str]:
     """Rationales in free prose."""
     return (FOLDER / "rationales.txt").read_text().strip().split("\n\n")
 
 
 def spots(text: str) -> Iterator[int]:
-    """Every white space and the end of every sentence: where a phrase may be put in."""
+    """Positions where a phrase can be inserted: white space and the ends of sentences."""
     yield from (m.start() for m in re.finditer(r"\s|(?<=\.)(?=\s)|\Z", text))
 
 
-def found(text: str) -> list[str]:
+def detect(text: str) -> list[str]:
     return [text[start:stop] for start, stop in find_numbers(text)]
 
 
-def assert_lawful(text: str) -> None:
-    """Spans are ordered, disjoint and inside the text, and each states a number by itself."""
+def assert_spans_are_valid(text: str) -> None:
+    """Spans are ordered, disjoint and inside the text, and each is a number on its own."""
     last = 0
     for start, stop in find_numbers(text):
         assert last <= start < stop <= len(text)
@@ -72,24 +72,24 @@ def assert_lawful(text: str) -> None:
         last = stop
 
 
-def test_of_sentences_that_the_rules_never_saw_nearly_all_are_judged_rightly() -> None:
-    """Written by another hand to the same policy, and read only after the rules were done."""
+def test_recall_and_precision_on_unseen_sentences() -> None:
+    """Independently written by the same policy, and not used for the rules."""
     positive, negative = sentences("unseen_positive"), sentences("unseen_negative")
-    right = sum(bool(find_numbers(sentence)) for sentence in positive)
-    wrong = sum(bool(find_numbers(sentence)) for sentence in negative)
+    detected = sum(bool(find_numbers(sentence)) for sentence in positive)
+    false_alarms = sum(bool(find_numbers(sentence)) for sentence in negative)
     assert min(len(positive), len(negative)) >= 150
-    assert right / len(positive) >= 0.99
-    assert right / (right + wrong) >= 0.99
+    assert detected / len(positive) >= 0.99
+    assert detected / (detected + false_alarms) >= 0.99
 
 
-def test_every_positive_is_found():
+def test_every_positive_sentence_is_detected():
     assert len(POSITIVE) >= 150
     assert [text for text in POSITIVE if not find_numbers(text)] == []
 
 
-def test_every_negative_passes():
+def test_no_negative_sentence_is_detected():
     assert len(NEGATIVE) >= 150
-    assert [(text, found(text)) for text in NEGATIVE if find_numbers(text)] == []
+    assert [(text, detect(text)) for text in NEGATIVE if find_numbers(text)] == []
 
 
 def test_sentences_are_distinct():
@@ -115,12 +115,12 @@ def test_spans_index_the_original(text, stated):
 
 
 @pytest.mark.parametrize("phrase", PHRASES.split("|"))
-def test_a_number_put_anywhere_is_found(phrase):
+def test_inserted_number_is_detected(phrase):
     plain = phrase.replace("[", "").replace("]", "")
     parts = [m.span(1) for m in re.finditer(r"\[(.*?)\]", phrase)]
-    # A bracket before a part shifts it by one, and so does each of the brackets of earlier parts.
+    # Each bracket before a part shifts it by one.
     parts = [(start - 2 * k - 1, stop - 2 * k - 1) for k, (start, stop) in enumerate(parts)]
-    for text in (told(2)[-1], random.Random(phrase).choice(free())):
+    for text in (narrator_texts(2)[-1], random.Random(phrase).choice(free_texts())):
         for spot in spots(text):
             whole = f"{text[:spot]} {plain}{text[spot:]}"
             spans = find_numbers(whole)
@@ -129,18 +129,18 @@ def test_a_number_put_anywhere_is_found(phrase):
                 assert any(a <= first and last <= b for a, b in spans), ascii(whole[spot:][:60])
 
 
-def test_clean_prose_has_none():
+def test_prose_without_numbers():
     described = write_description(synthetic.scene([(0, 0), (1, 1)], [(1, 0), (0, 0)]), 0, 20, 70, 0)
-    for text in (*told(40), *free(), described):
-        assert found(text) == []
+    for text in (*narrator_texts(40), *free_texts(), described):
+        assert detect(text) == []
 
 
-def test_spans_of_sentences_are_lawful():
+def test_spans_of_sentences_are_valid():
     for text in (*POSITIVE, *NEGATIVE, " ".join(POSITIVE), "".join(POSITIVE), "\n".join(POSITIVE)):
-        assert_lawful(text)
+        assert_spans_are_valid(text)
 
 
-def test_spans_of_any_text_are_lawful():
+def test_spans_of_random_text_are_valid():
     rng = random.Random(0)
     words = " ".join((*POSITIVE, *NEGATIVE)).split(" ")
     letters = [*"aonetwIVXi <>&;#*_`~|!@$-.,'()\n0123", "\u200b", "\u0301", "\ud800", "\U0001f1e6"]
@@ -149,8 +149,8 @@ def test_spans_of_any_text_are_lawful():
             rng.choice((rng.choice(letters), rng.choice(words), chr(rng.randrange(0x110000)), " "))
             for _ in range(rng.randrange(60))
         ]
-        assert_lawful("".join(pieces))
-        assert_lawful(" ".join(rng.choices(words, k=20)))
+        assert_spans_are_valid("".join(pieces))
+        assert_spans_are_valid(" ".join(rng.choices(words, k=20)))
 
 
 def test_mutated_sentences_do_not_raise():
@@ -170,8 +170,8 @@ def test_no_character_raises():
 
 
 @pytest.mark.parametrize("piece", PIECES, ids=ascii)
-def test_hostile_text_ends(piece):
-    # A search that is not linear takes minutes over so much.
-    text = hostile(piece, 100_000)
+def test_time_is_linear_in_adversarial_text(piece):
+    # A search of quadratic time takes minutes for this length.
+    text = repeat_piece(piece, 100_000)
     spans = find_numbers(text)
     assert all(0 <= start < stop <= len(text) for start, stop in spans)

@@ -11,10 +11,10 @@ import pytest
 from teacher.numbers import find_numbers
 from teacher.predicates import (
     REGIONS,
-    compass,
-    courses,
+    compass_direction,
     extract_facts,
     extract_predicates,
+    find_collision_courses,
     find_cut,
 )
 from tests.teacher import synthetic
@@ -38,7 +38,7 @@ def toward(start, pixel, frames):
     ],
 )
 def test_compass(delta, word):
-    assert compass(np.array(delta, dtype=float)) == word
+    assert compass_direction(np.array(delta, dtype=float)) == word
 
 
 def test_rolling_southwest():
@@ -53,7 +53,7 @@ def test_rolling_southwest():
 def test_a_pair_on_a_course_meets():
     scene = synthetic.scene([(-1.5, 0), (1.5, 0.1)], [(1, 0), (-1, 0)])
     (contact,) = scene.collisions
-    assert courses(scene, 10) == [(0, 1)]
+    assert find_collision_courses(scene, 10) == [(0, 1)]
     names = tuple(o.phrase for o in scene.objects)
     # They close at two units a second and meet after about 32 frames; the cut is 6, then 20.
     for stop, when in ((6, "soon"), (20, "imminent")):
@@ -67,22 +67,22 @@ def test_a_pair_on_a_course_meets():
 def test_a_pair_that_has_just_met_is_on_no_course():
     scene = synthetic.scene([(-1.5, 0), (1.5, 0)], [(1, 0), (-1, 0)])
     contact = scene.collisions[0].frame
-    assert courses(scene, contact - 1) == [(0, 1)]
+    assert find_collision_courses(scene, contact - 1) == [(0, 1)]
     for cut in range(contact, contact + 4):
-        assert courses(scene, cut) == []
+        assert find_collision_courses(scene, cut) == []
 
 
 def test_what_the_clip_does_not_show_is_not_foretold():
     """A pair that would meet after the last frame neither will nor will not meet."""
     scene = synthetic.scene([(-1.5, 0), (1.5, 0)], [(0.4, 0), (-0.4, 0)], frames=60)
     assert not scene.collisions
-    assert courses(scene, 50) == [(0, 1)]
+    assert find_collision_courses(scene, 50) == [(0, 1)]
     assert extract_facts(scene, 20, 50, 55).courses[0].when == "unseen"
 
 
 def test_parallel_and_parting_pairs_are_on_no_course():
     scene = synthetic.scene([(0, 0), (0, 1), (-1, -1)], [(0.5, 0), (0.5, 0), (-0.5, -0.5)])
-    assert courses(scene, 10) == []
+    assert find_collision_courses(scene, 10) == []
 
 
 def test_time_to_event_is_counted_from_the_cut():
@@ -127,7 +127,7 @@ def speed_in_words(velocity):
 
 
 def agrees(word, way):
-    """Whether a compass word points along an image-plane displacement, to within its eighth."""
+    """Whether a compass word is the nearest to the direction of a displacement."""
     way = np.asarray(way, dtype=float)
     cosine = way @ DIRECTIONS[word] / np.linalg.norm(way) / np.linalg.norm(DIRECTIONS[word])
     return cosine > math.cos(math.pi / 8) - 1e-9

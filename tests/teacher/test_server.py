@@ -1,4 +1,4 @@
-"""The client against real servers that are down, busy, slow, or several."""
+"""The server pool with local servers that are down, busy, slow or rate-limited."""
 
 import asyncio
 import json
@@ -8,15 +8,14 @@ from email.utils import formatdate
 
 import pytest
 
-from conf.errors import UserError
 from conf.schema import TeacherConfig
-from teacher.grammar import grammar
 from teacher.narrate import narrate_store
 from teacher.server_narrator import request_fields
-from teacher.servers.pool import ServerPool, jitter
-from tests.teacher.odd import OddServer, completion
+from teacher.servers.pool import ServerPool, random_pause
+from tests.teacher.faulty_server import FaultyServer, completion
+from tests.user_errors import raises_user_error
 
-CHAT = [{"role": "user", "content": "Are you there?"}]
+MESSAGES = [{"role": "user", "content": "Are you there?"}]
 
 
 def config(*servers, **changes):
@@ -25,151 +24,136 @@ def config(*servers, **changes):
     return TeacherConfig(name="served", url=url, model="tiny", **settings)
 
 
-def ask(cfg, times=1, **own):
+def complete(cfg, times=1, n=1, **fields):
     async def main():
-        async with ServerPool(cfg, request_fields(cfg)) as client:
-            return await asyncio.gather(*(client.complete(CHAT, **own) for _ in range(times)))
+        async with ServerPool(cfg, request_fields(cfg)) as pool:
+            requests = (pool.complete(MESSAGES, n, **fields) for _ in range(times))
+            return await asyncio.gather(*requests)
 
     return asyncio.run(main())
 
 
-def test_pauses_grow_to_the_longest_and_are_anything_below():
-    for times, most in ((1, 1.0), (2, 2.0), (3, 4.0), (5, 10.0), (50, 10.0)):
-        pauses = [jitter(times) for _ in range(1000)]
+def test_pauses_double_up_to_the_longest():
+    for failures, most in ((1, 1.0), (2, 2.0), (3, 4.0), (5, 10.0), (50, 10.0)):
+        pauses = [random_pause(failures) for _ in range(1000)]
         assert 0 <= min(pauses) < 0.1 * most
         assert 0.9 * most < max(pauses) <= most
 
 
-def test_no_more_requests_are_in_flight_than_asked_for(store, odd):
-    server = odd()
+def test_concurrency_limits_requests_in_flight(store, start_server):
+    server = start_server()
     server.delay = 0.05
     narrate_store(store, config(server, concurrency=3))
     assert server.most == 3
 
 
-def test_a_constraint_is_sent_as_vllm_takes_it(odd):
-    server = odd()
-    ask(config(server, grammar=True))
-    assert server.asked[0]["structured_outputs"] == {"grammar": grammar(config(server))}
+def test_fields_of_one_request_override_the_pools(start_server):
+    server = start_server()
+    complete(config(server, temperature=0.3), seed=7, temperature=0.6)
+    request = server.requests[0]
+    assert (request["seed"], request["temperature"], request["top_p"]) == (7, 0.6, 0.8)
 
 
-def test_a_request_may_have_fields_of_its_own(odd):
-    server = odd()
-    ask(config(server, temperature=0.3), seed=7, temperature=0.6)
-    asked = server.asked[0]
-    assert (asked["seed"], asked["temperature"], asked["top_p"]) == (7, 0.6, 0.8)
+def test_fewer_responses_than_requested_are_accepted(start_server):
+    server = start_server(json.dumps(completion("Hello.", "stop", 2)).encode())
+    assert len(complete(config(server), n=4)[0]) == 2
+    assert server.requests[0]["n"] == 4
 
 
-def test_fewer_answers_than_asked_for_are_taken(odd):
-    server = odd(json.dumps(completion("Hello.", "stop", 2)).encode())
-
-    async def main():
-        async with ServerPool(config(server), {}) as client:
-            return await client.complete(CHAT, 4)
-
-    assert len(asyncio.run(main())) == 2
-    assert server.asked[0]["n"] == 4
-
-
-def test_a_rate_limit_is_waited_for_and_costs_no_attempt(odd):
-    server = odd({"Retry-After": "0.5"})
-    assert ask(config(server))[0][0].text == "Hello."
-    assert len(server.asked) == 2
+def test_rate_limit_delays_the_next_request(start_server):
+    server = start_server({"Retry-After": "0.5"})
+    assert complete(config(server))[0][0].text == "Hello."
+    assert len(server.requests) == 2
     assert server.times[1] - server.times[0] >= 0.5
 
 
 @pytest.mark.slow
-def test_a_rate_limit_may_be_a_date(odd):
+def test_rate_limit_may_be_a_date(start_server):
     # A date has whole seconds.
     until = int(time.time()) + 2
-    server = odd({"Retry-After": formatdate(until, usegmt=True)})
-    ask(config(server))
-    assert len(server.asked) == 2
+    server = start_server({"Retry-After": formatdate(until, usegmt=True)})
+    complete(config(server))
+    assert len(server.requests) == 2
     assert time.time() >= until
 
 
-def test_a_rate_limit_without_a_time_is_tried_again(odd):
-    server = odd({}, {}, {"Retry-After": "soon"})
-    assert ask(config(server))[0][0].text == "Hello."
-    assert len(server.asked) == 4
+def test_rate_limit_without_a_time_is_retried(start_server):
+    server = start_server({}, {}, {"Retry-After": "soon"})
+    assert complete(config(server))[0][0].text == "Hello."
+    assert len(server.requests) == 4
 
 
-def test_another_server_answers_while_one_wants_to_be_left_alone(odd):
-    limited, other = odd(), odd()
+def test_other_server_answers_while_one_is_rate_limited(start_server):
+    limited, other = start_server(), start_server()
     limited.always["*"] = {"Retry-After": "60"}
-    assert len(ask(config(limited, other, concurrency=8), times=8)) == 8
-    assert len(other.asked) == 8
+    assert len(complete(config(limited, other, concurrency=8), times=8)) == 8
+    assert len(other.requests) == 8
 
 
-def test_a_limit_without_end_ends_with_patience(odd):
-    server = odd()
+def test_lasting_rate_limit_ends_with_patience(start_server):
+    server = start_server()
     server.always["*"] = {"Retry-After": "60"}
-    with pytest.raises(UserError, match=f"{server.url}: it wants to be left alone"):
-        ask(config(server, patience=0.2))
+    with raises_user_error("no-server", contains=(server.url, "429")):
+        complete(config(server, patience=0.2))
 
 
-def test_servers_share_the_work_by_how_busy_they_are(odd):
-    slow, fast = odd(), odd()
+def test_least_busy_server_gets_the_next_request(start_server):
+    slow, fast = start_server(), start_server()
     slow.delay, fast.delay = 0.1, 0.005
 
     async def main():
-        async with ServerPool(config(slow, fast), {}) as client:
+        async with ServerPool(config(slow, fast), {}) as pool:
 
-            async def lane():
+            async def send_ten():
                 for _ in range(10):
-                    await client.complete(CHAT)
+                    await pool.complete(MESSAGES)
 
-            await asyncio.gather(*(lane() for _ in range(4)))
+            await asyncio.gather(*(send_ten() for _ in range(4)))
 
     asyncio.run(main())
-    assert len(slow.asked) + len(fast.asked) == 40
-    assert 1 <= len(slow.asked) < len(fast.asked)
+    assert len(slow.requests) + len(fast.requests) == 40
+    assert 1 <= len(slow.requests) < len(fast.requests)
 
 
-def test_a_server_that_is_down_does_not_stop_the_others(store, odd):
-    down, up = odd(), odd()
-    down.stop()
-    narration = narrate_store(store, config(down, up))
-    assert len(narration.rationales) == 12
-    assert narration.summary.rejected == {}
-
-
-def test_a_server_that_goes_down_midway_does_not_stop_the_others(store, odd):
-    up, broken = odd(), odd()
+@pytest.mark.parametrize("state", ["stopped", "failing"])
+def test_broken_server_does_not_affect_the_others(store, start_server, state):
+    broken, up = start_server(), start_server()
     broken.always["*"] = 500
-    narration = narrate_store(store, config(up, broken))
+    if state == "stopped":
+        broken.stop()
+    narration = narrate_store(store, config(broken, up))
     assert len(narration.rationales) == 12
     assert narration.summary.rejected == {}
 
 
-def test_a_restarting_server_is_waited_for_without_attempts(store, odd):
-    server = odd()
+def test_restart_of_a_server_costs_no_attempt(store, start_server):
+    server = start_server()
     port = server.server_port
     server.delay = 0.05
-    back = []
+    restarted = []
 
     def restart():
-        while len(server.asked) < 5:
+        while len(server.requests) < 5:
             time.sleep(0.01)
         server.stop()
         time.sleep(0.5)
-        back.append(OddServer(store, port=port))
+        restarted.append(FaultyServer(store, port=port))
 
     thread = threading.Thread(target=restart)
     thread.start()
     narration = narrate_store(store, config(server))
     thread.join()
-    back[0].stop()
+    restarted[0].stop()
     assert len(narration.rationales) == 12
     assert narration.summary.rejected == {}
-    assert back[0].asked
+    assert restarted[0].requests
 
 
-def test_each_url_is_asked_once_for_its_name(odd):
-    server = odd()
+def test_repeated_url_counts_once(start_server):
+    server = start_server()
 
     async def main():
-        async with ServerPool(config(server, server), {}) as client:
-            return len(client.places)
+        async with ServerPool(config(server, server), {}) as pool:
+            return len(pool.states)
 
     assert asyncio.run(main()) == 1

@@ -22,7 +22,7 @@ from evaluation.generators.response_schema import schema
 from models import loading
 from models.student.answer_parser import Reason, parse_choice
 from models.student.collator import Collator, encode
-from tests.teacher.serving import Serving
+from tests.teacher.vllm_server import VllmServer
 from train.student import dataset
 
 pytestmark = pytest.mark.slow
@@ -80,7 +80,7 @@ def merged(cfg, adapters, tmp_path_factory):
 @pytest.fixture(scope="module")
 def server(base, adapters, tmp_path_factory):
     folder = tmp_path_factory.mktemp("serve")
-    serving = Serving(base, folder, "frames=true", "dtype=float32", f"adapter={adapters}")
+    serving = VllmServer(base, folder, "frames=true", "dtype=float32", f"adapter={adapters}")
     serving.start()
     yield serving
     serving.stop()
@@ -88,7 +88,7 @@ def server(base, adapters, tmp_path_factory):
 
 @pytest.fixture
 def server_of_merged(merged, tmp_path):
-    serving = Serving(merged, tmp_path, "frames=true", "dtype=float32")
+    serving = VllmServer(merged, tmp_path, "frames=true", "dtype=float32")
     serving.start()
     yield serving
     serving.stop()

@@ -1,16 +1,16 @@
-"""Narrates a benchmark in memory: `python narrate_made.py FOLDER COUNT URL`, to be killed."""
+"""Narrates a benchmark in memory: the arguments are a folder, a number of items and a URL."""
 
 import sys
 from pathlib import Path
 
 from conf.schema import TeacherConfig
 from teacher.narrate import narrate_store
-from tests.teacher.made import made_store
+from tests.teacher.memory_store import make_store
 
 if __name__ == "__main__":
     folder, count, url = sys.argv[1:]
-    # A random model's answers are all rejected, so that one attempt is an item's whole story.
+    # A random model's responses are all rejected, so that one attempt settles an item.
     cfg = TeacherConfig(
         name="tiny", url=url, model="tiny", attempts=1, max_tokens=16, concurrency=32
     )
-    narrate_store(made_store(Path(folder), int(count)), cfg)
+    narrate_store(make_store(Path(folder), int(count)), cfg)

@@ -1,4 +1,4 @@
-"""A benchmark in memory: as many scenes and items as a test asks for, in no time."""
+"""A benchmark in memory with any number of scenes and items."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from conf.schema import TeacherConfig
 from data.records import Scene, SelectionItem
 from teacher.narrator import write_rationale
 from teacher.predicates import extract_predicates
-from teacher.prompts import messages
+from teacher.prompts import build_messages
 from tests.teacher import synthetic
 
 
 @dataclass
-class MadeStore:
+class MemoryStore:
     folder: Path
     scenes: dict[str, Scene]
     items: list[SelectionItem]
@@ -28,8 +28,8 @@ class MadeStore:
         return [i for i in self.items if split in (None, i.split)]
 
 
-def made_store(folder: Path, count: int) -> MadeStore:
-    """`count` items of scenes of their own; the sixth has too short a prefix, the last is a test
+def make_store(folder: Path, count: int) -> MemoryStore:
+    """`count` items, each with its own scene; item-5 has too short a prefix, the last is a test
     item."""
     rng = np.random.default_rng(4)
     scenes, items = {}, []
@@ -50,16 +50,16 @@ def made_store(folder: Path, count: int) -> MadeStore:
                 split="test" if k == count - 1 else "train",
             )
         )
-    return MadeStore(folder, scenes, items)
+    return MemoryStore(folder, scenes, items)
 
 
-def corpus(store: MadeStore) -> list[str]:
-    """Prompts and rationales, to train a tokenizer on."""
-    cfg = TeacherConfig(name="template")
+def prompts_and_rationales(store: MemoryStore) -> list[tuple[str, str, str]]:
+    """System prompt, user prompt and rationale of each item that has predicates."""
     texts = []
-    for item in store.items:
+    for item in store.selection():
         predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
         if predicates:
-            chat = messages(predicates, item, cfg)
-            texts += [*(part["content"] for part in chat), write_rationale(predicates, item, 0)]
+            system, user = build_messages(predicates, item, TeacherConfig(name="template"))
+            rationale = write_rationale(predicates, item, 0)
+            texts.append((system["content"], user["content"], rationale))
     return texts

@@ -1,0 +1,113 @@
+"""A local chat server that answers with the built-in narrator's rationales, or with a fault."""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Iterable
+from socket import SO_LINGER, SOL_SOCKET
+from typing import Any
+
+from tests.local import JsonHandler, LocalServer
+from tests.teacher.memory_store import MemoryStore, prompts_and_rationales
+
+Fault = int | bytes | str | dict[str, str]
+"""A status, the bytes of a body, the headers of a rate limit (429), or a word of `spoil_text`,
+"hang" or "reset"."""
+
+
+def spoil_text(fault: str, text: str) -> tuple[str, str]:
+    """A text with a fault, and its finish_reason."""
+    return {
+        "cut": (text[:200], "length"),
+        "number": (text.replace("The ", "The two ", 1), "stop"),
+        "empty": ("", "stop"),
+        "thinking": (f"<think>\nLet me see.\n</think>\n\n{text}", "stop"),
+        "long": ("The ball rolls east. " * 500_000, "stop"),
+        "surrogate": (text.replace("The ", "\ud800 ", 1), "stop"),
+    }[fault]
+
+
+class FaultyServer(LocalServer):
+    """A server whose first responses have `faults`.
+
+    Attributes:
+        always: Fault of every response to a prompt; "*" stands for every prompt.
+        requests: The requests so far.
+        times: When they came.
+        delay: Seconds before a response.
+        most: Most requests that were in flight at once.
+        texts: The rationale for each prompt.
+    """
+
+    def __init__(self, store: MemoryStore, faults: Iterable[Fault] = (), port: int = 0) -> None:
+        self.faults, self.always = list(faults), {}
+        self.requests: list[dict[str, Any]] = []
+        self.times: list[float] = []
+        self.lock = threading.Lock()
+        self.in_flight = self.most = 0
+        self.delay = 0.0
+        self.texts = {prompt: text for _, prompt, text in prompts_and_rationales(store)}
+        super().__init__(Handler, port)
+
+
+class Handler(JsonHandler):
+    server: FaultyServer
+
+    def get(self) -> None:
+        if self.path == "/health":
+            self.say(200, {})
+        else:
+            self.say(200, {"object": "list", "data": [{"id": "other", "object": "model"}]})
+
+    def post(self, request: dict[str, Any]) -> None:
+        server, prompt = self.server, request["messages"][-1]["content"]
+        with server.lock:
+            server.requests.append(request)
+            server.times.append(time.monotonic())
+            server.in_flight += 1
+            server.most = max(server.most, server.in_flight)
+            fault = server.always.get(prompt) or server.always.get("*")
+            if fault is None and server.faults:
+                fault = server.faults.pop(0)
+        time.sleep(server.delay)
+        try:
+            self.respond(request, server.texts.get(prompt, "Hello."), fault)
+        finally:
+            with server.lock:
+                server.in_flight -= 1
+
+    def respond(self, request: dict[str, Any], text: str, fault: Fault | None) -> None:
+        if isinstance(fault, int):
+            self.say(fault, {"error": {"message": "fault", "type": "t", "code": fault}})
+        elif isinstance(fault, dict):
+            self.say(429, {"error": {"message": "slow down"}}, fault)
+        elif isinstance(fault, bytes):
+            self.send_response(200)
+            kind = "application/json" if fault[:1] in b"{[" else "text/html"
+            self.send_header("Content-Type", kind)
+            self.end_headers()
+            self.wfile.write(fault)
+        elif fault == "hang":
+            time.sleep(3)
+        elif fault == "reset":
+            # Half of a response, then a reset of the connection.
+            self.send_response(200)
+            self.send_header("Content-Type", "application/json")
+            self.send_header("Content-Length", "1000")
+            self.end_headers()
+            self.wfile.write(b'{"choices": [')
+            self.connection.setsockopt(SOL_SOCKET, SO_LINGER, struct.pack("ii", 1, 0))
+            self.connection.close()
+        else:
+            text, finish_reason = spoil_text(fault, text) if fault else (text, "stop")
+            self.say(200, completion(text, finish_reason, request.get("n") or 1))
+
+
+def completion(text: str, finish_reason: str, n: int) -> dict[str, Any]:
+    message = {"role": "assistant", "content": text}
+    choices = [{"index": k, "finish_reason": finish_reason, "message": message} for k in range(n)]
+    usage = {"prompt_tokens": 1000, "completion_tokens": 101 * n, "total_tokens": 1}
+    head = {"id": "x", "object": "chat.completion", "created": 0, "model": "tiny"}
+    return {**head, "choices": choices, "usage": usage}
