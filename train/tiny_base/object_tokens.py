@@ -1,8 +1,8 @@
-"""Teach a base to see, token by token: at the place of a visual token that shows an object, the
-model names the object and, in a candidate, the candidate's letter; in a clip, the way it moves.
+"""Auxiliary loss on visual tokens: each token at an object's place predicts the object's words.
 
-What a sample's answer says of its pictures is a weak sign of what they show: a model that writes it
-well may hardly look. The words of the object at each visual token are a strong one, beside it.
+The answers of the questions are a weak signal of what is visible: a model can learn to phrase them
+well with hardly a look at the pictures. The words of the object at each visual token are a strong
+signal. In candidates, a token also predicts the candidate's letter; in clips, the object's heading.
 """
 
 from __future__ import annotations
@@ -23,21 +23,19 @@ from teacher.predicates import COMPASS
 from train.student.trainer import StudentTrainer
 
 WEIGHT = 6.0
-"""A named object weighs as much as this many supervised tokens."""
+"""Weight of an object at a visual token, in supervised tokens of the response."""
 PLACES = ("top", "left", "right", "center", "bottom")
-"""First words of the places that an object is near."""
+"""Words with which regions begin, after "near the"."""
 MOTION = ("moves", "does")
-"""What tells that an object moves from that it does not."""
+"""Words with which motion and rest begin ("moves slowly", "does not move")."""
 WORDS = 4
-"""Words at most that a visual token is told: an object's colour, material and shape, and a
-candidate's letter or, in a clip, the way that the object moves."""
+"""Most words per visual token: color, material, shape, and a candidate's letter or a heading."""
 NONE = -1
-"""Stands where a token is told fewer words."""
+"""Padding for tokens with fewer words."""
 
 
 def scene_word_tokens(processor: ProcessorMixin) -> dict[str, list[int]]:
-    """The words of objects, of their places and of their motion, by kind, each by its first
-    token."""
+    """The first token of each word for objects, places and motion, by kind of word."""
     kinds = {"color": COLORS, "material": MATERIALS, "shape": SHAPES, "place": PLACES}
     kinds |= {"motion": MOTION, "heading": COMPASS}
     return {kind: [first_token(processor, w) for w in words] for kind, words in kinds.items()}
@@ -48,8 +46,10 @@ def first_token(processor: ProcessorMixin, word: str) -> int:
 
 
 class ObjectTokenCollator(Collator):
-    """Batches that also hold `sights` (N, 2 + WORDS): row and position of a visual token, and the
-    first tokens of the words that it is told, filled up with NONE. All positions keep their logits.
+    """Adds `sights` (N, 2 + WORDS) to batches, and keeps the logits of all positions.
+
+    A row of `sights` has the row and position of a visual token, and the first tokens of its
+    words, padded with NONE.
     """
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
@@ -64,27 +64,27 @@ class ObjectTokenCollator(Collator):
                 row
                 for k, s in enumerate(samples)
                 if s.supervised
-                for row in self._of(s, k, batch["input_ids"][k])
+                for row in self._encode_sights(s, k, batch["input_ids"][k])
             ]
         ).reshape(-1, 2 + WORDS)
         return batch
 
-    def _of(self, sample: Sample, row: int, ids: torch.Tensor) -> list[list[int]]:
+    def _encode_sights(self, sample: Sample, row: int, ids: torch.Tensor) -> list[list[int]]:
         visual = torch.tensor([self._processor.image_token_id, self._processor.video_token_id])
         positions = torch.isin(ids, visual).nonzero()[:, 0].tolist()
         each = len(positions) // max(1, sample.pictures)
         grid = math.isqrt(each)
-        found = []
+        rows = []
         for sight in sample.sights:
             column, line = (min(int(share * grid), grid - 1) for share in sight.place)
             position = positions[sight.picture * each + line * grid + column]
             words = [first_token(self._processor, word) for word in sight.words]
-            found.append([row, position, *words, *[NONE] * (WORDS - len(words))])
-        return found
+            rows.append([row, position, *words, *[NONE] * (WORDS - len(words))])
+        return rows
 
 
 class ObjectTokenTrainer(StudentTrainer):
-    """A trainer whose loss also counts how well visual tokens name what they show."""
+    """A trainer that adds the object token loss to the training loss."""
 
     def compute_loss(
         self,
@@ -98,25 +98,29 @@ class ObjectTokenTrainer(StudentTrainer):
             model, inputs, True, num_items_in_batch=num_items_in_batch
         )
         if model.training and len(sights):
-            # The mean over ranks, by which gradients are shared, is undone as in the tokens' loss.
-            ranks = self.accelerator.num_processes
+            # Gradients are averaged over ranks; this factor undoes that, as in the language loss.
+            world_size = self.accelerator.num_processes
             loss = (
                 loss
-                + ranks * WEIGHT * object_token_loss(outputs.logits, sights) / num_items_in_batch
+                + world_size
+                * WEIGHT
+                * object_token_loss(outputs.logits, sights)
+                / num_items_in_batch
             )
         return (loss, outputs) if return_outputs else loss
 
 
 def object_token_loss(logits: torch.Tensor, sights: torch.Tensor) -> torch.Tensor:
-    """Cross entropy between what visual tokens say and the words for what they show, each word as
-    likely as the other; a sum over sights.
+    """Cross entropy of visual tokens with the words of their objects, summed over `sights`.
+
+    The words of an object are equally likely targets.
 
     Args:
         logits: (B, L, V).
-        sights: (N, 2 + WORDS) as `SightCollator` gives them.
+        sights: (N, 2 + WORDS), see `ObjectTokenCollator`.
     """
     row, position, words = sights[:, 0], sights[:, 1], sights[:, 2:]
-    told = logits[row, position].float().log_softmax(dim=-1)
-    given = words != NONE
-    each = told.gather(1, words.clamp(min=0)).masked_fill(~given, 0.0)
-    return -(each.sum(dim=1) / given.sum(dim=1)).sum()
+    log_probabilities = logits[row, position].float().log_softmax(dim=-1)
+    is_word = words != NONE
+    each = log_probabilities.gather(1, words.clamp(min=0)).masked_fill(~is_word, 0.0)
+    return -(each.sum(dim=1) / is_word.sum(dim=1)).sum()

@@ -1,12 +1,9 @@
-"""What the tiny base learns from: questions whose answers the oracle holds, so that it can see and
-write before it is ever asked to choose.
+"""Questions about frames and clips that teach the tiny base to see before it selects.
 
-A frame is described by its objects and their places, alone and among four candidates, one after the
-other; an object is looked for in each of four candidates; an object of a clip is told by how it
-moves; a clip is told by the built-in narrator, with the frame that comes of it shown or not; after
-a clip and what is told of it, its item's candidates are compared with that by where they show an
-object; of several frames the one is named that is the later, or that fits a description. None of it
-is the selection task itself.
+The oracle answers them. They are about a single frame and about four candidates (the objects and
+their places), about the motion of an object in a clip, about a clip and its outcome in the words of
+the built-in narrator, about candidates compared with such a description, about which of two frames
+is the later one, and about which candidate fits a description. None is the selection task.
 """
 
 from __future__ import annotations
@@ -45,321 +42,329 @@ MATCH = (
     "Which candidate shows {}? Say of each candidate, in a line of its own, whether it matches and "
     'why. End with a line "Answer:" and the letter.'
 )
-ASKED = (FRAME, CANDIDATES, WHERE, COMPARE, MOVES, CLIP, LATER, MATCH)
+QUESTIONS = (FRAME, CANDIDATES, WHERE, COMPARE, MOVES, CLIP, LATER, MATCH)
 FRAMES = 2
-"""Frames described for each item in an epoch."""
+"""Frames that are described, per item and epoch."""
 SETS = 2
-"""Sets of candidates for each item in an epoch, of those described and of those looked through."""
+"""Sets of candidates that are described, and sets that are searched, per item and epoch."""
 MOVING = 6
-"""Objects of a clip whose motion is told, for each item in an epoch: a few pixels between frames,
-which nothing else of a clip makes a model look for."""
+"""Questions about an object's motion, per item and epoch. Motion is a few pixels per frame, and no
+other question about a clip requires it."""
 CLIPS = 2
-"""Times that a clip is told in an epoch."""
+"""Descriptions of a clip, per item and epoch."""
 COMPARED = 3
-"""Objects to compare by after a clip, for each item in an epoch."""
+"""Comparisons of candidates with a clip's description, per item and epoch."""
 MOVED = 0.08
-"""Share of the view's width by which an object has moved in the later of two frames, at least."""
+"""Least displacement of an object in the later of two frames, as a share of the image's width."""
 CLEAR = 0.3
-"""Share of an object's pixels over which a visual token is to name it."""
+"""Visible fraction above which a visual token should name an object."""
 HIDDEN = 0.05
-"""Share of an object's pixels under which it is not said to be seen."""
+"""Visible fraction at or below which an object is not described."""
 NAMED = 4
-"""Objects at most that a description to be matched names."""
+"""Most objects that a description names."""
 
 
 def build_questions(
     store: Store, items: list[SelectionItem], cfg: StudentConfig, frames: FrameReader, seed: int
 ) -> dict[str, list[LazySample]]:
-    """Samples of each kind from some items. Which frame is described or is the later, among which
-    others, and in which order, is another in each epoch."""
-    make = _Maker(store, cfg, frames, seed)
+    """Samples by kind of question. Frames, candidates and their order are random in each epoch."""
+    make = _SampleBuilder(store, cfg, frames, seed, items)
     return {
         "frame": [make.frame(item, k) for item in items for k in range(FRAMES)],
-        "candidates": [make.candidates(item, items, k) for item in items for k in range(SETS)],
-        "where": [make.where(item, items, k) for item in items for k in range(SETS)],
-        "moves": [one for item in items for one in make.moves(item)],
-        "clip": [clip for item in items for clip in make.clip(item)],
-        "compared": [
-            one for item in items for k in range(COMPARED) for one in make.compared(item, k)
-        ],
-        "later": [later for item in items for later in make.later(item)],
-        "match": [match for item in items for match in make.matched(item)],
+        "candidates": [make.candidates(item, k) for item in items for k in range(SETS)],
+        "where": [make.where(item, k) for item in items for k in range(SETS)],
+        "moves": [sample for item in items for sample in make.moves(item)],
+        "clip": [sample for item in items for sample in make.clip(item)],
+        "compared": [sample for item in items for sample in make.compared(item)],
+        "later": [sample for item in items for sample in make.later(item)],
+        "match": [sample for item in items for sample in make.match(item)],
     }
 
 
 Picture = tuple[str, int, str]
-"""A scene's frame, and the letter under which it is a candidate, empty where it is none."""
+"""Scene id, frame, and the candidate's letter; empty if the frame is not a candidate."""
 
 
-def lettered(frames: list[tuple[str, int]]) -> list[Picture]:
-    """Frames as candidates in their order."""
-    return [(*frame, letter) for frame, letter in zip(frames, LETTERS, strict=False)]
+class _SampleBuilder:
+    """Builds the samples of items; seed, epoch and item determine the random choices.
 
+    For each kind of question, one method estimates a sample's length and another one builds it.
+    """
 
-class _Maker:
-    """Makes samples of items; what is left to chance follows from seed, epoch and item."""
-
-    def __init__(self, store: Store, cfg: StudentConfig, frames: FrameReader, seed: int) -> None:
+    def __init__(
+        self,
+        store: Store,
+        cfg: StudentConfig,
+        frames: FrameReader,
+        seed: int,
+        items: list[SelectionItem],
+    ) -> None:
         self.store, self.cfg, self.frames, self.seed = store, cfg, frames, seed
+        self.items = items
+        self.media = cfg.frames // 2
+        """Pairs of frames in a clip."""
 
     def frame(self, item: SelectionItem, k: int) -> LazySample:
-        return LazySample(
-            f"{FRAME} {account(self.store.scene(item.scene_id), item.prefix_stop)}",
-            1,
-            partial(self._frame, item, k),
-        )
+        """The objects of a frame and their places."""
+        text = f"{FRAME} {describe_frame(self.store.scene(item.scene_id), item.prefix_stop)}"
+        return LazySample(text, 1, partial(self._frame, item, k))
 
     def _frame(self, item: SelectionItem, k: int, epoch: int) -> Sample:
         rng = seeded_rng(self.seed, epoch, item.item_id, "frame", k)
-        scene_id, frame = self._any(item, rng)
+        scene_id, frame = self._random_frame(item, rng)
         pixels = self.frames.array(scene_id, frame)
-        told = account(self.store.scene(scene_id), frame)
-        sights = self._sights([(scene_id, frame, "")])
-        return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], told, None, sights)
+        answer = describe_frame(self.store.scene(scene_id), frame)
+        sights = self._find_sights([(scene_id, frame, "")])
+        return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], answer, None, sights)
 
-    def candidates(self, item: SelectionItem, others: list[SelectionItem], k: int) -> LazySample:
-        """Four frames: an item's candidates or, the easier to tell apart, of four items."""
-        told = account(self.store.scene(item.scene_id), item.prefix_stop)
-        text = f"{CANDIDATES} " + "\n".join(f"Candidate {letter}: {told}" for letter in LETTERS)
-        return LazySample(text, len(LETTERS), partial(self._candidates, item, others, k))
+    def candidates(self, item: SelectionItem, k: int) -> LazySample:
+        """The objects and places of four candidates."""
+        answer = describe_frame(self.store.scene(item.scene_id), item.prefix_stop)
+        lines = "\n".join(f"Candidate {letter}: {answer}" for letter in LETTERS)
+        text = f"{CANDIDATES} {lines}"
+        return LazySample(text, len(LETTERS), partial(self._candidates, item, k))
 
-    def _candidates(
-        self, item: SelectionItem, others: list[SelectionItem], k: int, epoch: int
-    ) -> Sample:
-        rng = seeded_rng(self.seed, epoch, item.item_id, "candidates", k)
-        shown = self._four(item, others, rng)
-        told = [
-            f"Candidate {letter}: {account(self.store.scene(scene_id), frame)}"
-            for scene_id, frame, letter in shown
+    def _candidates(self, item: SelectionItem, k: int, epoch: int) -> Sample:
+        pictures = self._random_four(
+            item, seeded_rng(self.seed, epoch, item.item_id, "candidates", k)
+        )
+        lines = [
+            f"Candidate {letter}: {describe_frame(self.store.scene(scene_id), frame)}"
+            for scene_id, frame, letter in pictures
         ]
         name = f"{item.item_id} (candidates {k})"
-        return self._of_four(name, shown, CANDIDATES, told)
+        return self._about_four(name, pictures, CANDIDATES, "\n".join(lines))
 
-    def where(self, item: SelectionItem, others: list[SelectionItem], k: int) -> LazySample:
-        """An object that one of four frames shows, looked for in all: so does a rationale compare
-        candidates."""
+    def where(self, item: SelectionItem, k: int) -> LazySample:
+        """The place of one object in four candidates, as a rationale compares them."""
         phrase = self.store.scene(item.scene_id).objects[0].phrase
-        text = f"{WHERE.format(phrase)} {self._everywhere(phrase)}"
-        return LazySample(text, len(LETTERS), partial(self._where, item, others, k))
+        text = f"{WHERE.format(phrase)} {_typical_places(phrase)}"
+        return LazySample(text, len(LETTERS), partial(self._where, item, k))
 
-    def _where(
-        self, item: SelectionItem, others: list[SelectionItem], k: int, epoch: int
-    ) -> Sample:
+    def _where(self, item: SelectionItem, k: int, epoch: int) -> Sample:
         rng = seeded_rng(self.seed, epoch, item.item_id, "where", k)
-        shown = self._four(item, others, rng)
-        seen = self._seen(shown)
-        phrase = self._telling(item, {p for objects in seen for p in objects}, seen, rng)
-        told = " ".join(
-            f"{_shows(letter, phrase, objects.get(phrase))}."
-            for (*_, letter), objects in zip(shown, seen, strict=True)
+        pictures = self._random_four(item, rng)
+        places = self._visible_regions(pictures)
+        phrase = self._choose_object(item, {p for objects in places for p in objects}, places, rng)
+        answer = " ".join(
+            f"{_format_place(letter, phrase, objects.get(phrase))}."
+            for (*_, letter), objects in zip(pictures, places, strict=True)
         )
-        return self._of_four(f"{item.item_id} (where {k})", shown, WHERE.format(phrase), [told])
-
-    def _seen(self, shown: list[Picture]) -> list[dict[str, str]]:
-        return [seen_in(self.store.scene(scene_id), frame) for scene_id, frame, _ in shown]
-
-    def _telling(
-        self,
-        item: SelectionItem,
-        there: Collection[str],
-        seen: list[dict[str, str]],
-        rng: np.random.Generator,
-    ) -> str:
-        """One of the objects that are there, by whose place candidates are told apart where there
-        is such."""
-        some = sorted(there) or [o.phrase for o in self.store.scene(item.scene_id).objects]
-        apart = [p for p in some if len({objects.get(p) for objects in seen}) > 1] or some
-        return apart[rng.integers(len(apart))]
-
-    @staticmethod
-    def _everywhere(phrase: str) -> str:
-        """As long as what is told of an object that is looked for."""
-        lines = [f"Candidate {letter} shows the {phrase} {REGIONS[0][0]}." for letter in LETTERS]
-        return " ".join(lines)
-
-    def _four(
-        self, item: SelectionItem, others: list[SelectionItem], rng: np.random.Generator
-    ) -> list[Picture]:
-        """An item's own candidates or, the easier to tell apart, a frame each of four items."""
-        if rng.random() < 0.5:
-            own = [(c.scene_id, c.frame) for c in item.candidates]
-            return lettered([own[place] for place in rng.permutation(len(own))])
-        drawn = [others[place] for place in rng.integers(len(others), size=len(LETTERS))]
-        return lettered([self._any(one, rng) for one in drawn])
-
-    def _of_four(self, name: str, shown: list[Picture], asked: str, told: list[str]) -> Sample:
-        parts = [*self._labelled(shown), f"\n{asked}"]
-        return conversation(name, parts, "\n".join(told), None, self._sights(shown))
-
-    def _labelled(self, shown: list[Picture]) -> Iterator[str | np.ndarray]:
-        for scene_id, frame, letter in shown:
-            yield f"\nCandidate {letter}: "
-            yield self.frames.array(scene_id, frame)
-
-    def _any(self, item: SelectionItem, rng: np.random.Generator) -> tuple[str, int]:
-        """Any of the frames that an item shows."""
-        shown = [(c.scene_id, c.frame) for c in item.candidates]
-        shown += [(item.scene_id, f) for f in self._prefix(item)]
-        return shown[rng.integers(len(shown))]
+        name = f"{item.item_id} (where {k})"
+        return self._about_four(name, pictures, WHERE.format(phrase), answer)
 
     def moves(self, item: SelectionItem) -> Iterator[LazySample]:
-        """How an object of the clip moves, as often one that rests as another."""
-        scene = self.store.scene(item.scene_id)
-        facts = extract_facts(scene, item.prefix_start, item.prefix_stop, item.target_frame)
-        seen = [o for o in facts.objects if o.sight == "shown"] if facts else []
-        if seen:
-            longest = max((_motion(facts.instant, o) for o in seen), key=len)
-            text = f"{MOVES.format(seen[0].object)} {longest}"
+        """The motion of an object in the clip; half of the objects are stationary."""
+        facts = extract_facts(
+            self.store.scene(item.scene_id), item.prefix_start, item.prefix_stop, item.target_frame
+        )
+        visible = [o for o in facts.objects if o.sight == "shown"] if facts else []
+        if visible:
+            longest = max((_describe_motion(facts.instant, o) for o in visible), key=len)
+            text = f"{MOVES.format(visible[0].object)} {longest}"
             for k in range(MOVING):
-                make = partial(self._moves, item, facts.instant, seen, k)
-                yield LazySample(text, self.cfg.frames // 2, make)
+                make = partial(self._moves, item, facts.instant, visible, k)
+                yield LazySample(text, self.media, make)
 
     def _moves(
-        self, item: SelectionItem, instant: str, seen: list[ObjectFacts], k: int, epoch: int
+        self, item: SelectionItem, instant: str, visible: list[ObjectFacts], k: int, epoch: int
     ) -> Sample:
         rng = seeded_rng(self.seed, epoch, item.item_id, "moves", k)
-        rests = rng.random() < 0.5
-        some = [o for o in seen if (o.speed == "stationary") == rests] or seen
-        told = some[rng.integers(len(some))]
-        return self._after_prefix(item, [MOVES.format(told.object)], _motion(instant, told), [])
+        stationary = rng.random() < 0.5
+        chosen = [o for o in visible if (o.speed == "stationary") == stationary] or visible
+        o = chosen[rng.integers(len(chosen))]
+        return self._after_clip(item, [MOVES.format(o.object)], _describe_motion(instant, o), [])
 
     def clip(self, item: SelectionItem) -> Iterator[LazySample]:
-        """The clip with the frame that comes of it, to be read off, or without, to be foreseen."""
-        if (text := self._told(item)) is not None:
-            media = self.cfg.frames // 2 + 1
+        """The clip and its outcome; in half of the samples the target frame is visible."""
+        if (text := self._describe_clip(item)) is not None:
             for k in range(CLIPS):
-                yield LazySample(f"{CLIP} {text}", media, partial(self._clip, item, text, k))
+                make = partial(self._clip, item, text, k)
+                yield LazySample(f"{CLIP} {text}", self.media + 1, make)
 
-    def _told(self, item: SelectionItem) -> str | None:
-        """The clip and what comes of it in the narrator's words, None where it is too short."""
+    def _clip(self, item: SelectionItem, text: str, k: int, epoch: int) -> Sample:
+        with_target = seeded_rng(self.seed, epoch, item.item_id, "clip", k).random() < 0.5
+        pixels = self.frames.array(item.scene_id, item.target_frame)
+        target = ["Later: ", pixels, "\n"] if with_target else []
+        pictures = [(item.scene_id, item.target_frame, "")] if with_target else []
+        return self._after_clip(item, [*target, CLIP], text, pictures)
+
+    def compared(self, item: SelectionItem) -> Iterator[LazySample]:
+        """An object's place in the item's candidates, compared with a description of the clip.
+
+        As in a rationale, the text has the predicted place before the visible places, and the model
+        must not confuse them. The description is part of the prompt: as part of the response it
+        would outweigh the few words about visible places in the loss.
+        """
+        if (text := self._describe_clip(item)) is not None:
+            phrase = self.store.scene(item.scene_id).objects[0].phrase
+            differences = f", not {REGIONS[0][0]}" * len(LETTERS)
+            longest = f"{text} {COMPARE.format(phrase)} {_typical_places(phrase)}{differences}"
+            for k in range(COMPARED):
+                make = partial(self._compared, item, text, k)
+                yield LazySample(longest, self.media + len(LETTERS), make)
+
+    def _compared(self, item: SelectionItem, text: str, k: int, epoch: int) -> Sample:
+        rng = seeded_rng(self.seed, epoch, item.item_id, "compared", k)
+        pictures = self._permuted_candidates(item, rng)
+        places = self._visible_regions(pictures)
+        expected = visible_regions(self.store.scene(item.scene_id), item.target_frame)
+        phrase = self._choose_object(item, expected, places, rng)
+        answer = " ".join(
+            _format_comparison(letter, phrase, objects.get(phrase), expected.get(phrase))
+            for (*_, letter), objects in zip(pictures, places, strict=True)
+        )
+        parts = [*self._label(pictures), f"\n{text}\n{COMPARE.format(phrase)}"]
+        return self._after_clip(item, parts, answer, pictures)
+
+    def later(self, item: SelectionItem) -> Iterator[LazySample]:
+        """Which of two distinguishable frames is later; only if something moves after the clip."""
+        frames = find_moved_frames(self.store.scene(item.scene_id), item.prefix_stop)
+        if frames:
+            text = f"{LATER} {answer_line(LETTERS[0])}"
+            yield LazySample(text, self.media + 2, partial(self._later, item, frames))
+
+    def _later(self, item: SelectionItem, frames: list[int], epoch: int) -> Sample:
+        rng = seeded_rng(self.seed, epoch, item.item_id, "later")
+        pair = item.prefix_stop, frames[rng.integers(len(frames))]
+        order = rng.permutation(2)
+        letter = LETTERS[order.tolist().index(1)]
+        pictures = _add_letters([(item.scene_id, pair[k]) for k in order])
+        parts = [*self._label(pictures), f"\n{LATER}"]
+        return self._after_clip(item, parts, answer_line(letter), pictures)
+
+    def match(self, item: SelectionItem) -> Iterator[LazySample]:
+        """The one candidate that fits a description, if regions distinguish it."""
+        predicates = extract_predicates(item, self.store.scene(item.scene_id), self.store.scene)
+        predicates = predicates and _keep_regional_differences(predicates)
+        if not predicates:
+            return
+        differing = {d.object for c in predicates.candidates for d in c.differences[:1]}
+        visible = [o for o in predicates.objects if o.target_sight == "shown"]
+        visible.sort(key=lambda o: o.object not in differing)
+        named = ", ".join(f"the {o.object} {o.target_region}" for o in visible[:NAMED])
+        question = MATCH.format(named)
+        answer = "\n".join([*write_match_lines(predicates, item), answer_line(item.letter)])
+        make = partial(self._match, item, question, answer)
+        yield LazySample(f"{question} {answer}", len(LETTERS), make)
+
+    def _match(self, item: SelectionItem, question: str, answer: str, epoch: int) -> Sample:
+        pictures = _add_letters([(c.scene_id, c.frame) for c in item.candidates])
+        return self._about_four(f"{item.item_id} (match)", pictures, question, answer)
+
+    def _describe_clip(self, item: SelectionItem) -> str | None:
+        """The clip and its outcome by the built-in narrator; None if the clip is too short."""
         scene = self.store.scene(item.scene_id)
         return write_description(
             scene, item.prefix_start, item.prefix_stop, item.target_frame, self.seed
         )
 
-    def _clip(self, item: SelectionItem, text: str, k: int, epoch: int) -> Sample:
-        shown = seeded_rng(self.seed, epoch, item.item_id, "clip", k).random() < 0.5
-        pixels = self.frames.array(item.scene_id, item.target_frame)
-        later = ["Later: ", pixels, "\n"] if shown else []
-        images = [(item.scene_id, item.target_frame, "")] if shown else []
-        return self._after_prefix(item, [*later, CLIP], text, images)
+    def _visible_regions(self, pictures: list[Picture]) -> list[dict[str, str]]:
+        return [visible_regions(self.store.scene(name), frame) for name, frame, _ in pictures]
 
-    def compared(self, item: SelectionItem, k: int) -> Iterator[LazySample]:
-        """A clip, what is told of it, and by an object's place whether its item's candidates agree
-        with that. As in a rationale, what is foreseen stands before what is to be seen, and must
-        not be taken for it; it is not learnt here, or the few words that are seen would weigh next
-        to nothing."""
-        if (text := self._told(item)) is not None:
-            phrase = self.store.scene(item.scene_id).objects[0].phrase
-            differs = f", not {REGIONS[0][0]}" * len(LETTERS)
-            long = f"{text} {COMPARE.format(phrase)} {self._everywhere(phrase)}{differs}"
-            media = self.cfg.frames // 2 + len(LETTERS)
-            yield LazySample(long, media, partial(self._compared, item, text, k))
+    def _choose_object(
+        self,
+        item: SelectionItem,
+        visible: Collection[str],
+        places: list[dict[str, str]],
+        rng: np.random.Generator,
+    ) -> str:
+        """A random visible object, if possible one whose place distinguishes candidates."""
+        names = sorted(visible) or [o.phrase for o in self.store.scene(item.scene_id).objects]
+        names = [p for p in names if len({objects.get(p) for objects in places}) > 1] or names
+        return names[rng.integers(len(names))]
 
-    def _compared(self, item: SelectionItem, text: str, k: int, epoch: int) -> Sample:
-        rng = seeded_rng(self.seed, epoch, item.item_id, "compared", k)
-        own = [(c.scene_id, c.frame) for c in item.candidates]
-        shown = lettered([own[place] for place in rng.permutation(len(own))])
-        seen = self._seen(shown)
-        expected = seen_in(self.store.scene(item.scene_id), item.target_frame)
-        phrase = self._telling(item, expected, seen, rng)
-        told = " ".join(
-            _compared(letter, phrase, objects.get(phrase), expected.get(phrase))
-            for (*_, letter), objects in zip(shown, seen, strict=True)
-        )
-        parts = [*self._labelled(shown), f"\n{text}\n{COMPARE.format(phrase)}"]
-        return self._after_prefix(item, parts, told, shown)
+    def _permuted_candidates(self, item: SelectionItem, rng: np.random.Generator) -> list[Picture]:
+        frames = [(c.scene_id, c.frame) for c in item.candidates]
+        return _add_letters([frames[place] for place in rng.permutation(len(frames))])
 
-    def later(self, item: SelectionItem) -> Iterator[LazySample]:
-        """Two frames that can be told apart, where something still moves after the prefix."""
-        after = moved(self.store.scene(item.scene_id), item.prefix_stop)
-        if after:
-            text = f"{LATER} {answer_line(LETTERS[0])}"
-            yield LazySample(text, self.cfg.frames // 2 + 2, partial(self._later, item, after))
+    def _random_four(self, item: SelectionItem, rng: np.random.Generator) -> list[Picture]:
+        """An item's own candidates or, easier to distinguish, frames of four random items."""
+        if rng.random() < 0.5:
+            return self._permuted_candidates(item, rng)
+        items = [self.items[k] for k in rng.integers(len(self.items), size=len(LETTERS))]
+        return _add_letters([self._random_frame(other, rng) for other in items])
 
-    def _later(self, item: SelectionItem, after: list[int], epoch: int) -> Sample:
-        rng = seeded_rng(self.seed, epoch, item.item_id, "later")
-        first, second = item.prefix_stop, after[rng.integers(len(after))]
-        order = rng.permutation(2)
-        right = LETTERS[order.tolist().index(1)]
-        shown = lettered([(item.scene_id, (first, second)[k]) for k in order])
-        parts = [*self._labelled(shown), f"\n{LATER}"]
-        return self._after_prefix(item, parts, answer_line(right), shown)
+    def _random_frame(self, item: SelectionItem, rng: np.random.Generator) -> tuple[str, int]:
+        """A frame of an item's candidates or prefix."""
+        frames = [(c.scene_id, c.frame) for c in item.candidates]
+        frames += [(item.scene_id, f) for f in self._prefix_frames(item)]
+        return frames[rng.integers(len(frames))]
 
-    def matched(self, item: SelectionItem) -> Iterator[LazySample]:
-        """A description that one candidate alone fits, where there is such."""
-        predicates = extract_predicates(item, self.store.scene(item.scene_id), self.store.scene)
-        plain = predicates and _plain(predicates)
-        if not plain:
-            return
-        differing = {d.object for c in plain.candidates for d in c.differences[:1]}
-        told = [o for o in plain.objects if o.target_sight == "shown"]
-        told.sort(key=lambda o: o.object not in differing)
-        what = ", ".join(f"the {o.object} {o.target_region}" for o in told[:NAMED])
-        asked = MATCH.format(what)
-        answer = "\n".join([*write_match_lines(plain, item), answer_line(item.letter)])
-        make = partial(self._match, item, asked, answer)
-        yield LazySample(f"{asked} {answer}", len(LETTERS), make)
+    def _prefix_frames(self, item: SelectionItem) -> list[int]:
+        return sample_prefix_frames(item.prefix_start, item.prefix_stop, self.cfg.frames)
 
-    def _match(self, item: SelectionItem, asked: str, answer: str, epoch: int) -> Sample:
-        shown = lettered([(c.scene_id, c.frame) for c in item.candidates])
-        return self._of_four(f"{item.item_id} (match)", shown, asked, [answer])
+    def _label(self, pictures: list[Picture]) -> Iterator[str | np.ndarray]:
+        for scene_id, frame, letter in pictures:
+            yield f"\nCandidate {letter}: "
+            yield self.frames.array(scene_id, frame)
 
-    def _after_prefix(
-        self, item: SelectionItem, parts: list[str | np.ndarray], told: str, images: list[Picture]
+    def _about_four(self, name: str, pictures: list[Picture], question: str, answer: str) -> Sample:
+        parts = [*self._label(pictures), f"\n{question}"]
+        return conversation(name, parts, answer, None, self._find_sights(pictures))
+
+    def _after_clip(
+        self,
+        item: SelectionItem,
+        parts: list[str | np.ndarray],
+        answer: str,
+        pictures: list[Picture],
     ) -> Sample:
-        shown = self._prefix(item)
-        clip = load_clip(item.scene_id, shown, self.frames)
+        frames = self._prefix_frames(item)
+        clip = load_clip(item.scene_id, frames, self.frames)
         scene = self.store.scene(item.scene_id)
-        # A visual token of a clip shows two frames; its object is where the first has it.
-        pairs = [(f, shown[min(k + 1, len(shown) - 1)]) for k, f in enumerate(shown)][::2]
-        watched = [
+        # A visual token of a clip covers two frames; objects are labelled as in the first.
+        pairs = [(f, frames[min(k + 1, len(frames) - 1)]) for k, f in enumerate(frames)][::2]
+        sights = [
             Sight(k, place, (*words, object_heading(scene, index, *pair) or "stationary"))
             for k, pair in enumerate(pairs)
-            for index, place, words in sights(scene, pair[0])
+            for index, place, words in visible_objects(scene, pair[0])
         ]
-        watched += self._sights(images, len(pairs))
-        return conversation(f"{item.item_id} (clip and frames)", parts, told, clip, watched)
+        sights += self._find_sights(pictures, len(pairs))
+        return conversation(f"{item.item_id} (clip and frames)", parts, answer, clip, sights)
 
-    def _sights(self, pictures: list[Picture], before: int = 0) -> list[Sight]:
-        """What a sample's pictures show, and of a candidate under which letter; so many pictures
-        stand `before` them."""
+    def _find_sights(self, pictures: list[Picture], before: int = 0) -> list[Sight]:
+        """The visible objects of pictures, which come after `before` others in the sample."""
         return [
             Sight(before + k, place, (*words, *letter))
             for k, (scene_id, frame, letter) in enumerate(pictures)
-            for _, place, words in sights(self.store.scene(scene_id), frame)
+            for _, place, words in visible_objects(self.store.scene(scene_id), frame)
         ]
 
-    def _prefix(self, item: SelectionItem) -> list[int]:
-        return sample_prefix_frames(item.prefix_start, item.prefix_stop, self.cfg.frames)
+
+def _add_letters(frames: list[tuple[str, int]]) -> list[Picture]:
+    return [(*frame, letter) for frame, letter in zip(frames, LETTERS, strict=False)]
 
 
-def _motion(instant: str, o: ObjectFacts) -> str:
-    """Where an object is at an instant and how it moves, in the words of a rationale."""
-    told = f"{instant}, the {o.object} is {o.region} and"
+def _describe_motion(instant: str, o: ObjectFacts) -> str:
+    """An object's place and motion at an instant, in the words of a rationale."""
+    text = f"{instant[0].upper()}{instant[1:]}, the {o.object} is {o.region} and"
     if o.speed == "stationary":
-        return f"{told[0].upper()}{told[1:]} does not move."
-    way = f" toward the {o.heading}" if o.heading else ""
-    return f"{told[0].upper()}{told[1:]} moves {o.speed}{way}."
+        return f"{text} does not move."
+    return f"{text} moves {o.speed}{f' toward the {o.heading}' if o.heading else ''}."
 
 
-def _shows(letter: str, phrase: str, place: str | None) -> str:
+def _typical_places(phrase: str) -> str:
+    """A text as long as the answer to WHERE, to estimate its length."""
+    return " ".join(f"{_format_place(letter, phrase, REGIONS[0][0])}." for letter in LETTERS)
+
+
+def _format_place(letter: str, phrase: str, place: str | None) -> str:
     if place is None:
         return f"Candidate {letter} lacks the {phrase}"
     return f"Candidate {letter} shows the {phrase} {place}"
 
 
-def _compared(letter: str, phrase: str, place: str | None, expected: str | None) -> str:
-    """Where a candidate shows an object, None where it does not, and whether that is where it was
-    to be."""
+def _format_comparison(letter: str, phrase: str, place: str | None, expected: str | None) -> str:
+    """An object's place in a candidate, and whether it is the expected one; None if not visible."""
     if place == expected:
-        return f"{_shows(letter, phrase, place)} and agrees."
-    differs = f", not {expected}" if place and expected else ""
-    return f"{_shows(letter, phrase, place)}{differs}."
+        return f"{_format_place(letter, phrase, place)} and agrees."
+    difference = f", not {expected}" if place and expected else ""
+    return f"{_format_place(letter, phrase, place)}{difference}."
 
 
-def seen_in(scene: Scene, frame: int) -> dict[str, str]:
-    """The places of the objects that a frame shows, by their phrases."""
+def visible_regions(scene: Scene, frame: int) -> dict[str, str]:
+    """The region of each visible object of a frame, by the object's phrase."""
     return {
         o.phrase: object_region(scene, frame, k)
         for k, o in enumerate(scene.objects)
@@ -367,38 +372,39 @@ def seen_in(scene: Scene, frame: int) -> dict[str, str]:
     }
 
 
-def account(scene: Scene, frame: int) -> str:
-    """The objects that a frame shows and where, from the top-left to the bottom-right."""
-    places = [region for row in REGIONS for region in row]
-    seen = [(places.index(place), phrase) for phrase, place in seen_in(scene, frame).items()]
-    told = [f"The {phrase} is {places[place]}." for place, phrase in sorted(seen)]
-    return " ".join(told) or "No object is in view."
+def describe_frame(scene: Scene, frame: int) -> str:
+    """The visible objects of a frame and their regions, from the top-left to the bottom-right."""
+    order = [region for row in REGIONS for region in row]
+    places = [(order.index(region), o) for o, region in visible_regions(scene, frame).items()]
+    sentences = [f"The {phrase} is {order[place]}." for place, phrase in sorted(places)]
+    return " ".join(sentences) or "No object is in view."
 
 
-def sights(scene: Scene, frame: int) -> Iterator[tuple[int, tuple[float, float], tuple[str, ...]]]:
-    """The objects that can be made out in a frame: the index of each, where it is, as shares of
-    width and height, and the words that name it."""
+def visible_objects(
+    scene: Scene, frame: int
+) -> Iterator[tuple[int, tuple[float, float], tuple[str, ...]]]:
+    """The clearly visible objects of a frame: index, place as shares of width and height, words."""
     places = scene.image_positions[frame] / np.asarray(scene.image_size)
-    seen = scene.in_view[frame] & (scene.visible_fraction[frame] > CLEAR)
-    for k in np.flatnonzero(seen):
+    visible = scene.in_view[frame] & (scene.visible_fraction[frame] > CLEAR)
+    for k in np.flatnonzero(visible):
         yield int(k), tuple(places[k].tolist()), tuple(scene.objects[k].phrase.split())
 
 
-def moved(scene: Scene, start: int) -> list[int]:
-    """The frames after `start` in which an object in view has moved by a good piece."""
-    way = scene.image_positions[start + 1 :] - scene.image_positions[start]
-    far = np.hypot(*np.moveaxis(way, -1, 0)) > MOVED * scene.image_size[0]
-    seen = scene.in_view[start + 1 :] & scene.in_view[start]
-    return (start + 1 + np.flatnonzero((far & seen).any(axis=1))).tolist()
+def find_moved_frames(scene: Scene, start: int) -> list[int]:
+    """The frames after `start` in which an object in view has moved by more than MOVED."""
+    displacement = scene.image_positions[start + 1 :] - scene.image_positions[start]
+    far = np.hypot(*np.moveaxis(displacement, -1, 0)) > MOVED * scene.image_size[0]
+    in_view = scene.in_view[start + 1 :] & scene.in_view[start]
+    return (start + 1 + np.flatnonzero((far & in_view).any(axis=1))).tolist()
 
 
-def _plain(predicates: Predicates) -> Predicates | None:
-    """Predicates with the differences that a description by regions tells; None where a candidate
-    has none of these."""
+def _keep_regional_differences(predicates: Predicates) -> Predicates | None:
+    """Predicates with only the differences in regions and missing objects; None if a wrong
+    candidate has no such difference."""
     candidates = []
     for c in predicates.candidates:
-        told = tuple(d for d in c.differences if d.kind in ("region", "missing"))
-        if not c.agrees and not told:
+        differences = tuple(d for d in c.differences if d.kind in ("region", "missing"))
+        if not c.agrees and not differences:
             return None
-        candidates.append(replace(c, differences=told))
+        candidates.append(replace(c, differences=differences))
     return replace(predicates, candidates=tuple(candidates))

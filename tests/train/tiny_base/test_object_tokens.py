@@ -1,4 +1,4 @@
-"""Visual tokens are told the words of what they show, and the loss of that is what it says."""
+"""Object tokens: the labels of visual tokens, and the loss on them."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ from train.tiny_base.object_tokens import (
 )
 
 
-def test_words_stand_at_the_tokens_that_show_them(
+def test_words_are_labels_of_the_tokens_at_their_objects(
     micro_store, frames, student_cfg, processor
 ) -> None:
-    """Each picture's, a clip's among them: an object's words in the object's cell."""
     items = micro_store.selection("train")
     kinds = questions.build_questions(micro_store, items, student_cfg, frames, 0)
     samples = [made[0].make(0) for made in kinds.values()]
@@ -33,7 +32,7 @@ def test_words_stand_at_the_tokens_that_show_them(
     assert torch.equal(batch["labels"][:, -kept:], plain["labels"])
     side = student_cfg.image_size // 32
     visual = (processor.image_token_id, processor.video_token_id)
-    wanted = []
+    expected = []
     for row, sample in enumerate(samples):
         at = [k for k, t in enumerate(batch["input_ids"][row].tolist()) if t in visual]
         cells = np.reshape(at, (sample.pictures, side, side))
@@ -41,26 +40,25 @@ def test_words_stand_at_the_tokens_that_show_them(
             x, y = (min(math.floor(share * side), side - 1) for share in sight.place)
             words = [first_token(processor, word) for word in sight.words]
             filled = [*words, *[NONE] * (WORDS - len(words))]
-            wanted.append([row, int(cells[sight.picture, y, x]), *filled])
+            expected.append([row, int(cells[sight.picture, y, x]), *filled])
             if len(words) == WORDS and sample.clip is None:
                 before = sample.content[2 * sight.picture]["text"]
                 assert before == f"\nCandidate {sight.words[-1]}: "
-    assert batch["sights"].tolist() == wanted
-    assert {row for row, *_ in wanted} == set(range(len(samples)))
+    assert batch["sights"].tolist() == expected
+    assert {row for row, *_ in expected} == set(range(len(samples)))
 
 
-def test_sights_are_of_what_a_frame_shows(micro_store) -> None:
+def test_visible_objects_are_described(micro_store) -> None:
     scene = micro_store.scene(micro_store.scene_ids("train")[0])
     for frame in (0, scene.frames - 1):
-        words = {words for _, _, words in questions.sights(scene, frame)}
-        account = questions.account(scene, frame)
+        words = {words for _, _, words in questions.visible_objects(scene, frame)}
+        description = questions.describe_frame(scene, frame)
         assert words
-        assert all(f"The {' '.join(w)} is near" in account for w in words)
+        assert all(f"The {' '.join(w)} is near" in description for w in words)
 
 
-def test_the_best_answer_names_each_word_as_often() -> None:
-    """No answer is below the entropy of three words, which the even one alone reaches; a word that
-    is not given counts for nothing."""
+def test_loss_is_minimal_for_equal_probabilities() -> None:
+    """The minimum is the entropy of three equally likely words; padding does not count."""
     sights = torch.tensor([[0, 1, 4, 5, 6, NONE]])
     even = torch.full((1, 3, 10), -torch.inf)
     even[0, 1, [4, 5, 6]] = 0.0
