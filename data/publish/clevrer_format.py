@@ -56,7 +56,7 @@ def export_clevrer(store: Store, folder: Path, workers: Workers) -> int:
 def _export_one(cache: FrameCache, scene_id: str, folder: Path, index: int) -> None:
     scene = load_scene(scene_path(cache.folder, scene_id))
     pixels = load_frames(cache.path(scene_id))
-    pixels |= cache.draw(scene_id, [f for f in range(scene.frames) if f not in pixels])
+    pixels |= cache.render(scene_id, [f for f in range(scene.frames) if f not in pixels])
     write_clevrer(scene, {f: Image.fromarray(p) for f, p in pixels.items()}, folder, index)
 
 

@@ -1,8 +1,8 @@
-"""What draws the frames of scenes, behind one interface.
+"""Renderers of scenes, with one interface.
 
-bullet draws everywhere and needs nothing, egl draws the same through a graphics driver, blender
-draws what CLEVRER's videos look like. Which one drew a benchmark is part of what it is: the same
-oracle has other pixels under another renderer.
+`bullet` runs on every machine, `egl` renders similar images with a graphics driver, and `blender`
+renders images in the style of CLEVRER's videos. The renderer is a part of a benchmark, because each
+one gives different pixels.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from data.render.appearance import STANDARD_VIEW, View
 
 
 class Renderer(Protocol):
-    """Draws frames of any scene from its oracle, all at one size."""
+    """Renders frames of any scene from its oracle, at one size."""
 
     version: str
-    """Changes whenever the same oracle would give other pixels."""
+    """Changes whenever the same oracle gives different pixels."""
 
     @staticmethod
     def check() -> None:
-        """Raises UserError where this machine lacks what the renderer needs."""
+        """Raises UserError where this machine lacks a requirement of the renderer."""
 
     def render(self, scene: Scene, frame: int) -> Image.Image:
-        """One frame as an RGB image of the renderer's size."""
+        """Render one frame as an RGB image."""
 
 
 RENDERERS: dict[str, type[Renderer]] = {
@@ -40,24 +40,24 @@ RENDERERS: dict[str, type[Renderer]] = {
 
 
 def renderer_version(name: str) -> str:
-    """A renderer's version, whether or not it can run here.
+    """A renderer's version, whether or not it can run on this machine.
 
     Raises:
-        UserError: there is no such renderer.
+        UserError: the name is unknown.
     """
     if name not in RENDERERS:
         raise UserError(
-            f"benchmark.renderer={name}: there is no such renderer, the options are "
-            f"{', '.join(RENDERERS)}"
+            f"benchmark.renderer={name}: unknown renderer, the options are {', '.join(RENDERERS)}",
+            code="unknown-option",
         )
     return RENDERERS[name].version
 
 
 def check_renderer(name: str) -> None:
-    """Find out whether a renderer can run here, before the work that leads up to it.
+    """Check that a renderer can run on this machine.
 
     Raises:
-        UserError: it cannot, for want of a driver or a package, or there is no such renderer.
+        UserError: a driver or a package is missing, or the name is unknown.
     """
     renderer_version(name)
     RENDERERS[name].check()
@@ -65,10 +65,10 @@ def check_renderer(name: str) -> None:
 
 @cache
 def get_renderer(name: str, width: int, height: int, view: View = STANDARD_VIEW) -> Renderer:
-    """This process's renderer of a name, a frame size (px) and a view.
+    """The renderer of this process for a frame size (px) and a view.
 
     Raises:
-        UserError: it cannot run here, or there is no such renderer.
+        UserError: it cannot run on this machine, or the name is unknown.
     """
     check_renderer(name)
     return RENDERERS[name](width, height, view)

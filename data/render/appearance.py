@@ -1,5 +1,4 @@
-"""How a scene is watched and lit, and what its objects look like: colours, meshes and the textures
-that stand for materials."""
+"""Appearance of scenes: camera, light and floor, and the objects' colours, meshes and textures."""
 
 from __future__ import annotations
 
@@ -14,14 +13,14 @@ from data.world.shapes import CUBE_HALF, RADIUS
 
 @dataclass(frozen=True)
 class View:
-    """How scenes are watched and lit."""
+    """The camera, floor colour and light of scenes."""
 
     camera: Camera = STANDARD_CAMERA
-    """Its eye stands in the plane of x and z."""
+    """Its eye must lie in the x-z plane."""
     floor: tuple[float, float, float] = (158.0, 156.0, 152.0)
-    """The floor's colour, RGB of 255, where its shade is 1."""
+    """RGB colour of the fully lit floor, 0 to 255."""
     light: tuple[float, float, float] = (3.0, 3.0, 6.0)
-    """Where the lamp stands."""
+    """Position of the lamp."""
 
 
 STANDARD_VIEW = View()
@@ -42,7 +41,7 @@ RGB = dict(
         strict=True,
     )
 )
-"""Colours as CLEVRER names them; green and brown a little darker so that small objects differ."""
+"""CLEVRER's colours; green and brown are darker so that small objects differ more."""
 
 SEGMENTS = 48
 
@@ -50,9 +49,9 @@ SEGMENTS = 48
 def mesh(shape: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (V, 3), normals (V, 3), texture coordinates (V, 2) and triangles (T, 3)."""
     if shape == "sphere":
-        return _turned(*_sphere_profile())
+        return _revolve(*_sphere_profile())
     if shape == "cylinder":
-        return _turned(*_cylinder_profile())
+        return _revolve(*_cylinder_profile())
     return _cube()
 
 
@@ -63,16 +62,16 @@ def _sphere_profile() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _cylinder_profile() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    # The rim stands twice, once with the cap's normal and once with the side's: a hard edge.
+    # The rim has two vertices, with the cap's normal and with the side's, for a hard edge.
     points = RADIUS * np.array([[0, 1], [1, 1], [1, 1], [1, -1], [1, -1], [0, -1]], dtype=float)
     normals = np.array([[0, 1], [0, 1], [1, 0], [1, 0], [0, -1], [0, -1]], dtype=float)
     return points, normals, np.array([0.05, 0.2, 0.25, 0.75, 0.8, 0.95])
 
 
-def _turned(
+def _revolve(
     points: np.ndarray, normals: np.ndarray, down: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A profile of (radius, height) turned about the z axis."""
+    """The surface of revolution of a profile of (radius, height) about the z axis."""
     turns = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
     around = np.stack([np.cos(turns), np.sin(turns)], axis=1)
 
@@ -112,11 +111,11 @@ def _cube() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def texture(material: str) -> np.ndarray:
-    """(64, 64, 3) uint8 that multiplies an object's colour: a mirrored sky above a dark horizon
-    for metal, plain for rubber."""
+    """(64, 64, 3) uint8 texture that multiplies an object's colour: a reflection of a bright sky
+    over a dark horizon for metal, uniform for rubber."""
     if material == "rubber":
         return np.full((64, 64, 3), 215, dtype=np.uint8)
     across, down = np.meshgrid(np.linspace(0, 1, 64), np.linspace(0, 1, 64))
     sky = np.where(down < 0.5, 1.0 - 0.5 * down, 0.15 + 1.1 * (down - 0.5))
-    room = sky * (1 + 0.25 * np.cos(4 * np.pi * across))
-    return (255 * np.clip(room, 0.1, 1)).astype(np.uint8)[..., None].repeat(3, 2)
+    reflection = sky * (1 + 0.25 * np.cos(4 * np.pi * across))
+    return (255 * np.clip(reflection, 0.1, 1)).astype(np.uint8)[..., None].repeat(3, 2)

@@ -1,7 +1,7 @@
-"""Frames of a scene by Cycles, Blender's path tracer: metal that mirrors, and soft shadows.
+"""Renderer with Cycles, Blender's path tracer: reflections on metal and soft shadows.
 
-Blender runs in a process of its own (`blender_worker.py`), which ends with this one. It draws on a
-graphics card where it finds one; a card's pixels differ a little from a processor's.
+Blender runs in a separate process (`blender_worker.py`), which ends with this one. It uses a GPU
+where available; GPU pixels differ slightly from CPU pixels.
 """
 
 from __future__ import annotations
@@ -23,23 +23,25 @@ from data.render.appearance import RGB, STANDARD_VIEW, View
 from data.world.shapes import CUBE_HALF, RADIUS
 
 BPY = "4.2.23"
-"""The release of Blender's module that the extra `blender` installs; another draws other pixels."""
+"""Release of Blender's module in the extra `blender`; other releases give other pixels."""
 SAMPLES = 32
-"""Light paths a pixel at most; what noise is left goes with the denoiser."""
+"""Largest number of light paths per pixel; a denoiser removes the remaining noise."""
 VERSION = f"blender-1, bpy {BPY}, {SAMPLES} samples"
 
 WORKER = Path(__file__).with_name("blender_worker.py")
 
 
 class BlenderRenderer:
-    """Draws frames of any scene at one size, in a Blender of its own, whose lamps and ground are
-    those of `blender_worker.py` under any view."""
+    """Renders frames of any scene at one size, in one Blender process.
+
+    Lamps and ground are those of `blender_worker.py`, whatever the view.
+    """
 
     version = VERSION
 
     def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  as long as the worker
-        # Without -P the worker would take the files beside it for libraries.
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  lives as long as the worker
+        # Without -P the worker would import the modules beside it.
         self._worker = subprocess.Popen(
             [sys.executable, "-P", str(WORKER)],
             stdin=subprocess.PIPE,
@@ -47,7 +49,7 @@ class BlenderRenderer:
             stderr=self._errors,
         )
         camera = view.camera.sized(width, height)
-        picture = {
+        settings = {
             "width": width,
             "height": height,
             "focal": camera.focal,
@@ -56,46 +58,48 @@ class BlenderRenderer:
             "half_heights": {"cube": CUBE_HALF, "sphere": RADIUS, "cylinder": RADIUS},
             "samples": SAMPLES,
         }
-        self._ask(picture, "starting")
+        self._request(settings, "starting")
 
     @staticmethod
     def check() -> None:
-        """Raises UserError where Blender's module is not installed, or another release of it."""
-        needs = f"renderer=blender needs Blender's module bpy {BPY}"
-        mend = "install it with pip install -e '.[blender]', or use renderer=bullet"
+        """Raises UserError unless the right release of Blender's module is installed."""
         try:
-            found = importlib.metadata.version("bpy")
-        except importlib.metadata.PackageNotFoundError as error:
-            raise UserError(f"{needs}, which is not installed: {mend}") from error
-        if found != BPY:
-            raise UserError(f"{needs}, and {found} is installed: {mend}")
+            installed = importlib.metadata.version("bpy")
+        except importlib.metadata.PackageNotFoundError:
+            installed = None
+        if installed != BPY:
+            raise UserError(
+                f"renderer=blender needs Blender's module bpy {BPY} (installed: {installed}): "
+                "install it with pip install -e '.[blender]', or use renderer=bullet",
+                code="missing-package",
+            )
 
     def render(self, scene: Scene, frame: int) -> Image.Image:
-        """One frame as an RGB image of this renderer's size.
+        """Render one frame as an RGB image.
 
         Raises:
-            UserError: Blender came to an end.
+            UserError: the Blender process ended.
         """
         objects = [
             {
                 "shape": look.shape,
                 "material": look.material,
                 "color": [_linear(value / 255) for value in RGB[look.color]],
-                "position": place,
-                "quaternion": turn,
+                "position": position,
+                "quaternion": quaternion,
             }
-            for look, place, turn in zip(
+            for look, position, quaternion in zip(
                 scene.objects,
                 scene.positions[frame].tolist(),
                 scene.quaternions[frame].tolist(),
                 strict=True,
             )
         ]
-        png = self._ask(objects, f"drawing frame {frame} of {scene.scene_id}")
+        png = self._request(objects, f"rendering frame {frame} of {scene.scene_id}")
         return Image.open(io.BytesIO(png)).convert("RGB")
 
-    def _ask(self, request: Any, doing: str) -> bytes:
-        """The bytes that answer a request."""
+    def _request(self, request: Any, activity: str) -> bytes:
+        """Send a request to the worker and return the bytes of its response."""
         try:
             self._worker.stdin.write(json.dumps(request).encode() + b"\n")
             self._worker.stdin.flush()
@@ -106,14 +110,15 @@ class BlenderRenderer:
             pass
         status = self._worker.wait()
         self._errors.seek(0)
-        words = self._errors.read().decode(errors="replace").split("\n")
-        last = next((line.strip() for line in reversed(words) if line.strip()), f"status {status}")
+        lines = self._errors.read().decode(errors="replace").split("\n")
+        last = next((line.strip() for line in reversed(lines) if line.strip()), f"status {status}")
         raise UserError(
-            f"renderer=blender: Blender ended while {doing} ({last}); run the same command again, "
-            "with fewer workers where memory is short, or use renderer=bullet"
+            f"renderer=blender: Blender ended while {activity} ({last}); run the command again, "
+            "with fewer workers if memory is short, or use renderer=bullet",
+            code="renderer-failed",
         )
 
 
 def _linear(value: float) -> float:
-    """An sRGB value in [0, 1] as the share of light that it stands for."""
+    """Convert an sRGB value in [0, 1] to linear light."""
     return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4

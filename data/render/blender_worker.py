@@ -1,10 +1,10 @@
-"""Blender's side of `data.render.blender`: a program of its own that draws what it is asked to.
+"""The worker process of `data.render.blender`.
 
-Blender keeps one global scene, prints to standard output, and may take its process down with it:
-here it can. Each request is a line of JSON on standard input, first the picture (see `Studio`),
-then one frame's objects after another (see `Studio.draw`). Each answer, on standard output, is a
-line {"bytes": n} and n bytes: none for the picture, a PNG for a frame. The program ends when its
-input does, for then nobody is left to draw for. It needs `bpy` and the standard library alone.
+Blender has one global scene, prints to standard output and may crash, so it runs in a separate
+process. Each request is a line of JSON on standard input: first the settings (see `Studio`), then
+the objects of one frame after another (see `Studio.render`). Each response on standard output is a
+line {"bytes": n} and n bytes: none for the settings, a PNG for a frame. The process exits when its
+input ends. It needs only `bpy` and the standard library.
 """
 
 from __future__ import annotations
@@ -28,18 +28,17 @@ MATERIALS = {
 GROUND = (0.36, 0.355, 0.34)
 """The ground's colour, linear RGB."""
 BEVEL = 0.05
-"""How far edges are rounded, as a share of half the height: a sharp edge catches no light."""
+"""Rounding of edges, as a share of half the height; sharp edges would not reflect light."""
 LAMPS = {
     "key": {"place": (3.5, -3.5, 5.5), "size": 2.0, "watts": 500},
     "fill": {"place": (3.0, 4.5, 3.5), "size": 3.0, "watts": 170},
     "back": {"place": (-4.5, 1.5, 4.5), "size": 2.0, "watts": 220},
 }
-"""Square lamps that look at the origin; the wider, the softer the shadows. Simulator units."""
+"""Square lamps that point at the origin, in simulator units; larger ones cast softer shadows."""
 AMBIENT = 0.1
-"""Light from all around, which leaves no shadow and no reflection quite black."""
+"""Strength of ambient light, so that shadows and reflections are not black."""
 ADAPTIVE_NOISE, ADAPTIVE_MIN_SAMPLES = 0.05, 8
-"""A pixel is done when its noise is under this, after these many samples; the denoiser does the
-rest."""
+"""Sampling of a pixel stops at this noise level, after at least this many samples."""
 BOUNCES = 3
 
 
@@ -49,11 +48,11 @@ def main() -> None:
         studio = Studio(json.loads(requests.get()), Path(folder) / "frame.png")
         _answer(answers, b"")
         while True:
-            _answer(answers, studio.draw(json.loads(requests.get())))
+            _answer(answers, studio.render(json.loads(requests.get())))
 
 
 def _channels(folder: str) -> tuple[SimpleQueue[str], BinaryIO]:
-    """Requests as they come, and the file for answers, out of reach of what Blender prints."""
+    """The queue of requests, and the file for responses, which Blender's output cannot reach."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     requests: SimpleQueue[str] = SimpleQueue()
@@ -61,7 +60,7 @@ def _channels(folder: str) -> tuple[SimpleQueue[str], BinaryIO]:
     def listen() -> None:
         for line in sys.stdin:
             requests.put(line)
-        # At once, not after the frame that is being drawn.
+        # Exit immediately, even while a frame is being rendered.
         shutil.rmtree(folder, ignore_errors=True)
         os._exit(0)
 
@@ -75,38 +74,46 @@ def _answer(answers: BinaryIO, body: bytes) -> None:
 
 
 class Studio:
-    """Ground, lamps and camera, and a solid for each look, shown in the frames that have it."""
+    """A Blender scene with ground, lamps, a camera and one solid for each look."""
 
-    def __init__(self, picture: dict[str, Any], path: Path) -> None:
-        """A picture has width and height, focal (px), the camera's eye and axes (right, down,
-        forward), samples, and half_heights by shape."""
+    def __init__(self, settings: dict[str, Any], path: Path) -> None:
+        """Set up the scene.
+
+        Args:
+            settings: width and height (px), focal (px), the camera's eye and axes (right, down,
+                forward), samples, and half_heights by shape.
+            path: File for rendered frames.
+        """
         import bpy
 
         bpy.ops.wm.read_factory_settings(use_empty=True)
         self._scene = bpy.context.scene
         self._scene.render.filepath = str(path)
         self._path = path
-        self._meshes = {shape: _mesh(shape, h) for shape, h in picture["half_heights"].items()}
+        self._meshes = {shape: _mesh(shape, h) for shape, h in settings["half_heights"].items()}
         self._solids: dict[tuple[str, str, tuple[float, ...]], Any] = {}
-        _set_quality(self._scene, picture)
-        _set_camera(self._scene, picture)
+        _set_quality(self._scene, settings)
+        _set_camera(self._scene, settings)
         _set_lamps(self._scene)
         _set_ground(self._scene)
 
-    def draw(self, objects: list[dict[str, Any]]) -> bytes:
-        """A PNG of objects, each with its shape, material, color (linear RGB), position and
-        quaternion (x y z w)."""
+    def render(self, objects: list[dict[str, Any]]) -> bytes:
+        """Render a PNG of objects.
+
+        Args:
+            objects: shape, material, color (linear RGB), position and quaternion (x y z w) each.
+        """
         import bpy
 
         for solid in self._solids.values():
             solid.hide_render = True
-        for shown in objects:
-            look = (shown["shape"], shown["material"], tuple(shown["color"]))
+        for item in objects:
+            look = (item["shape"], item["material"], tuple(item["color"]))
             if look not in self._solids:
                 self._solids[look] = self._add(*look)
             solid = self._solids[look]
-            x, y, z, w = shown["quaternion"]
-            solid.location, solid.rotation_quaternion = shown["position"], (w, x, y, z)
+            x, y, z, w = item["quaternion"]
+            solid.location, solid.rotation_quaternion = item["position"], (w, x, y, z)
             solid.hide_render = False
         bpy.ops.render.render(write_still=True)
         return self._path.read_bytes()
@@ -121,14 +128,14 @@ class Studio:
         if shape != "sphere":
             bevel = solid.modifiers.new("edges", "BEVEL")
             bevel.width, bevel.segments = BEVEL * solid.dimensions.z / 2, 3
-            # Flat faces stay flat between their round edges.
+            # Keeps faces flat between rounded edges.
             solid.modifiers.new("shading", "WEIGHTED_NORMAL")
         self._scene.collection.objects.link(solid)
         return solid
 
 
 def _mesh(shape: str, half: float) -> Any:
-    """A mesh of half height `half` with an empty slot for a material."""
+    """A mesh of half height `half` with an empty material slot."""
     import bmesh
     import bpy
 
@@ -162,16 +169,16 @@ def _material(name: str, color: tuple[float, ...]) -> Any:
     return material
 
 
-def _set_quality(scene: Any, picture: dict[str, Any]) -> None:
+def _set_quality(scene: Any, settings: dict[str, Any]) -> None:
     scene.render.engine = "CYCLES"
-    scene.render.resolution_x, scene.render.resolution_y = picture["width"], picture["height"]
+    scene.render.resolution_x, scene.render.resolution_y = settings["width"], settings["height"]
     scene.render.image_settings.file_format = "PNG"
     scene.render.image_settings.color_mode = "RGB"
     scene.render.image_settings.compression = 0
     scene.render.dither_intensity = 0
-    # Blender's own choice, made for films, would grey the colours that objects are named by.
+    # Blender's default transform would desaturate the objects' colours.
     scene.view_settings.view_transform = "Standard"
-    scene.cycles.samples = picture["samples"]
+    scene.cycles.samples = settings["samples"]
     scene.cycles.adaptive_threshold = ADAPTIVE_NOISE
     scene.cycles.adaptive_min_samples = ADAPTIVE_MIN_SAMPLES
     scene.cycles.use_denoising = True
@@ -182,36 +189,36 @@ def _set_quality(scene: Any, picture: dict[str, Any]) -> None:
 
 
 def _use_gpu(scene: Any) -> None:
-    """Draw on the graphics cards, where Blender finds any."""
+    """Render on GPUs where available."""
     import bpy
 
     preferences = bpy.context.preferences.addons["cycles"].preferences
     for kind in ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL"):
         try:
             preferences.compute_device_type = kind
-        except TypeError:  # this build of Blender does not know the kind
+        except TypeError:  # not supported by this build of Blender
             continue
         preferences.refresh_devices()
-        cards = [device for device in preferences.devices if device.type == kind]
-        for card in cards:
-            card.use = True
-        if cards:
+        gpus = [device for device in preferences.devices if device.type == kind]
+        for gpu in gpus:
+            gpu.use = True
+        if gpus:
             scene.cycles.device = "GPU"
             return
 
 
-def _set_camera(scene: Any, picture: dict[str, Any]) -> None:
+def _set_camera(scene: Any, settings: dict[str, Any]) -> None:
     import bpy
     from mathutils import Matrix
 
     lens = bpy.data.cameras.new("camera")
     lens.sensor_fit, lens.sensor_width = "HORIZONTAL", 36.0
-    lens.lens = picture["focal"] * lens.sensor_width / picture["width"]
+    lens.lens = settings["focal"] * lens.sensor_width / settings["width"]
     camera = bpy.data.objects.new("camera", lens)
-    right, down, forward = picture["axes"]
-    # A camera of Blender looks down its own -z, with y up.
+    right, down, forward = settings["axes"]
+    # Blender's cameras look along their -z axis, with y up.
     turn = Matrix([right, [-v for v in down], [-v for v in forward]]).transposed()
-    camera.matrix_world = Matrix.Translation(picture["eye"]) @ turn.to_4x4()
+    camera.matrix_world = Matrix.Translation(settings["eye"]) @ turn.to_4x4()
     scene.collection.objects.link(camera)
     scene.camera = camera
 
@@ -225,10 +232,10 @@ def _set_lamps(scene: Any) -> None:
         light.size, light.energy = lamp["size"], lamp["watts"]
         solid = bpy.data.objects.new(name, light)
         solid.location = lamp["place"]
-        # A lamp shines down its own -z.
+        # Blender's lamps shine along their -z axis.
         solid.rotation_euler = Vector(lamp["place"]).to_track_quat("Z", "Y").to_euler()
         scene.collection.objects.link(solid)
-    world = bpy.data.worlds.new("room")
+    world = bpy.data.worlds.new("ambient")
     world.use_nodes = True
     background = world.node_tree.nodes["Background"].inputs
     background["Color"].default_value, background["Strength"].default_value = (1, 1, 1, 1), AMBIENT

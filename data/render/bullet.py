@@ -1,9 +1,9 @@
-"""Frames of a scene by Bullet's rasteriser.
+"""Renderer with Bullet's software rasteriser.
 
-Bullet's software renderer (TinyRenderer, no OpenGL) draws the objects from smooth meshes, metal
-with a reflection-like texture and a sharp highlight, rubber matt. It cannot clip a large floor nor
-soften a shadow, so floor and contact shadows are shaded here, behind the objects' mask. Frames are
-drawn at twice the size and averaged, which smooths the outlines.
+TinyRenderer (no OpenGL) renders the objects from smooth meshes: metal with a reflection-like
+texture and a sharp highlight, rubber matt. It can neither clip a large floor nor soften a shadow,
+so this module adds the floor and contact shadows behind the objects' mask. Frames are rendered at
+twice the size and averaged, for anti-aliasing.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ NEAR, FAR = 0.1, 50.0
 
 
 class BulletRenderer:
-    """Draws frames of any scene at one size, in this process, without a window."""
+    """Renders frames of any scene at one size, in this process, without a window."""
 
     version = VERSION
 
     def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
-        self._seen_as = view
+        self._scene_view = view
         self._bullet, self._rasteriser = self._connect()
         self._fine = view.camera.sized(width * OVERSAMPLING, height * OVERSAMPLING)
-        self._view = self._bullet.computeViewMatrix(self._fine.eye, [0, 0, 0], [0, 0, 1])
+        self._view_matrix = self._bullet.computeViewMatrix(self._fine.eye, [0, 0, 0], [0, 0, 1])
         self._projection = _projection(self._fine)
         self._floor = Floor(view.camera.sized(width, height), view.light)
         self._textures = self._load_textures()
@@ -49,23 +49,23 @@ class BulletRenderer:
 
     @staticmethod
     def check() -> None:
-        """It runs wherever scenes are simulated."""
+        """It has no requirements beyond those of the simulation."""
 
     def render(self, scene: Scene, frame: int) -> Image.Image:
-        """One frame as an RGB image of this renderer's size."""
+        """Render one frame as an RGB image."""
         self.pose(scene, frame)
-        touched, objects, cover = _average(*self.photograph())
+        touched, objects, cover = _average(*self.capture())
         shade = self._floor.shade(scene.positions[frame], self._shadows[frame])
         bands = []
-        for drawn, tint in zip(objects, self._seen_as.floor, strict=True):
+        for channel, tint in zip(objects, self._scene_view.floor, strict=True):
             plane = shade * tint
             pixels = plane.reshape(-1)
-            pixels[touched] = drawn + (1 - cover) * pixels[touched]
+            pixels[touched] = channel + (1 - cover) * pixels[touched]
             bands.append(Image.fromarray(np.rint(plane, out=plane).astype(np.uint8)))
         return Image.merge("RGB", bands)
 
     def pose(self, scene: Scene, frame: int) -> list[int]:
-        """Put a scene's objects where they are at a frame, and give their handles in the mask."""
+        """Move the objects to their poses at a frame, and return their handles in the mask."""
         if scene.scene_id != self._scene_id:
             self._load(scene)
         for handle, look, place, turn in zip(
@@ -75,20 +75,23 @@ class BulletRenderer:
             scene.quaternions[frame].tolist(),
             strict=True,
         ):
-            # A reflection stays where the room is while a ball rolls.
+            # The reflection on a sphere does not move as it rolls.
             turn = [0, 0, 0, 1] if look.shape == "sphere" else turn
             self._bullet.resetBasePositionAndOrientation(handle, place, turn)
         return list(self._handles)
 
-    def photograph(self) -> tuple[np.ndarray, np.ndarray]:
-        """The posed objects without a floor at OVERSAMPLING times the size: (H, W, 4) uint8, and
-        the mask (H, W) int32, an object's handle or -1."""
+    def capture(self) -> tuple[np.ndarray, np.ndarray]:
+        """Render the objects without a floor at OVERSAMPLING times the size.
+
+        Returns:
+            Pixels (H, W, 4) uint8, and the mask (H, W) int32: an object's handle or -1.
+        """
         _, _, pixels, _, mask = self._bullet.getCameraImage(
             self._fine.width,
             self._fine.height,
-            self._view,
+            self._view_matrix,
             self._projection,
-            lightDirection=self._seen_as.light,
+            lightDirection=self._scene_view.light,
             lightColor=[1, 1, 1],
             shadow=0,
             lightAmbientCoeff=0.45,
@@ -99,7 +102,7 @@ class BulletRenderer:
         return pixels, mask
 
     def _connect(self) -> tuple[BulletClient, int]:
-        """A Bullet client, and which of its rasterisers draws."""
+        """A Bullet client, and the id of its rasteriser."""
         bullet = connect()
         return bullet, bullet.ER_TINY_RENDERER
 
@@ -115,7 +118,7 @@ class BulletRenderer:
         self._scene_id = scene.scene_id
 
     def _clear(self) -> None:
-        # Bodies are taken out one by one: resetting the simulation loses megabytes each time.
+        # resetSimulation would leak megabytes each time.
         for handle in self._handles:
             self._bullet.removeBody(handle)
         self._handles, self._scene_id = [], None
@@ -139,7 +142,7 @@ class BulletRenderer:
         return bullet.createMultiBody(0, -1, self._visuals[look])
 
     def _mesh(self, look: SceneObject) -> dict[str, Any]:
-        """An object's mesh as createVisualShape takes it."""
+        """Arguments of createVisualShape for an object's mesh."""
         vertices, normals, uvs, triangles = mesh(look.shape)
         return {
             "vertices": vertices.tolist(),
@@ -150,7 +153,7 @@ class BulletRenderer:
 
 
 def save_textures(folder: Path) -> dict[str, Path]:
-    """Write each material's texture as a PNG, since Bullet reads textures from files alone."""
+    """Write each material's texture as a PNG, because Bullet reads textures only from files."""
     paths = {material: folder / f"{material}.png" for material in MATERIALS}
     for material, path in paths.items():
         Image.fromarray(texture(material)).save(path)
@@ -158,33 +161,34 @@ def save_textures(folder: Path) -> dict[str, Path]:
 
 
 def _average(pixels: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Objects averaged down by two, at the few pixels that they touch.
+    """Downsample the objects by two, at the pixels that they touch.
 
     Args:
-        pixels: (2H, 2W, 4) uint8, and mask (2H, 2W) int32, negative where no object is.
+        pixels: (2H, 2W, 4) uint8.
+        mask: (2H, 2W) int32, -1 without an object.
 
     Returns:
-        (P,) flat indices of the touched pixels of the small image, there (3, P) float32 objects on
-        black, and (P,) float32 the share of the pixel that they cover.
+        (P,) flat indices of the touched pixels in the small image; their colours (3, P) float32 on
+        black; and (P,) float32 the share of each pixel that objects cover.
     """
-    # Two neighbours at once: only where no object is has a mask all bits set.
+    # Compares two neighbours at once: all bits of the mask are set where it has no object.
     pairs = mask.view(np.int64)
     touched = np.flatnonzero((pairs[0::2] & pairs[1::2]) != -1)
     width = mask.shape[1]
     row, column = np.divmod(touched, width // 2)
     first = 2 * row * width + 2 * column
     four = first + np.array([[0], [1], [width], [width + 1]])
-    seen = mask.ravel()[four] >= 0
-    drawn = pixels.view(np.uint32).ravel()[four] * seen
-    total = drawn.view(np.uint8).reshape(4, -1).sum(axis=0, dtype=np.uint16)
+    is_object = mask.ravel()[four] >= 0
+    masked = pixels.view(np.uint32).ravel()[four] * is_object
+    total = masked.view(np.uint8).reshape(4, -1).sum(axis=0, dtype=np.uint16)
     objects = ((total + 2) // 4).reshape(-1, 4)[:, :3].T.astype(np.float32)
-    # To whole 255ths, as if the cover were a fourth channel of the image.
-    cover = (seen.sum(axis=0, dtype=np.uint16) * 255 + 2) // 4
+    # Rounded to 1/255, as a fourth channel of the image would be.
+    cover = (is_object.sum(axis=0, dtype=np.uint16) * 255 + 2) // 4
     return touched, objects, cover.astype(np.float32) / 255
 
 
 def _projection(camera: Camera) -> list[float]:
-    """OpenGL's projection matrix, column by column, for square pixels."""
+    """OpenGL's projection matrix for square pixels, in column-major order."""
     x, y = 2 * camera.focal / camera.width, 2 * camera.focal / camera.height
     depth, shift = -(FAR + NEAR) / (FAR - NEAR), -2 * FAR * NEAR / (FAR - NEAR)
     return [x, 0, 0, 0, 0, y, 0, 0, 0, 0, depth, -1, 0, 0, shift, 0]

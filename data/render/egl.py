@@ -1,8 +1,7 @@
-"""Frames of a scene by OpenGL: Bullet's EGL plugin, for machines whose driver draws without a
-window.
+"""Renderer with OpenGL: Bullet's EGL plugin, for machines with a headless graphics driver.
 
-It draws what the rasteriser draws: the same meshes, poses, camera, light and floor. Its pixels
-depend on the driver: they are alike, not equal, from machine to machine.
+Meshes, poses, camera, light and floor equal those of the `bullet` renderer. Pixels depend on the
+driver, so they differ slightly between machines.
 """
 
 from __future__ import annotations
@@ -28,92 +27,94 @@ if TYPE_CHECKING:
 VERSION = "egl-1"
 
 WINDOW = (1024, 768)
-"""What the plugin draws into, px; more it would only enlarge."""
+"""Size of the plugin's frame buffer in px; it would enlarge larger images."""
 
 
 def start() -> BulletClient:
-    """A Bullet client with the EGL plugin, proved by a first picture."""
+    """Connect a Bullet client with the EGL plugin and render a test image."""
     bullet = connect()
     plugin = importlib.util.find_spec("eglRenderer")
     if plugin is None or bullet.loadPlugin(plugin.origin, "_eglRendererPlugin") < 0:
-        sys.exit("this pybullet comes without eglRenderer")
-    for _ in range(2):  # the second is the last to print a greeting
+        sys.exit("this build of pybullet lacks eglRenderer")
+    for _ in range(2):  # the plugin prints messages during the first two
         bullet.getCameraImage(8, 8, renderer=bullet.ER_BULLET_HARDWARE_OPENGL)
     return bullet
 
 
 @cache
-def _stage() -> tuple[BulletClient, Path]:
-    """This process's client, and the folder of its meshes. A second one would disturb the first."""
-    # Kept to the end, for Bullet reads a mesh's file whenever a body is made of it.
+def _shared_client() -> tuple[BulletClient, Path]:
+    """The client of this process and the folder of its meshes; two clients would interfere."""
+    # Kept until exit, because Bullet reads a mesh's file whenever it creates a body.
     folder = tempfile.TemporaryDirectory(prefix="dynapix-egl-")
     _save_meshes(Path(folder.name))
     with silence(1), silence(2):
         bullet = start()
-    atexit.register(_end, bullet, folder)
+    atexit.register(_disconnect, bullet, folder)
     return bullet, Path(folder.name)
 
 
-def _end(bullet: BulletClient, folder: tempfile.TemporaryDirectory) -> None:
-    """Close a client without its farewell on the screen."""
+def _disconnect(bullet: BulletClient, folder: tempfile.TemporaryDirectory) -> None:
+    """Disconnect a client without its console output."""
     with silence(1):
         bullet.disconnect()
     folder.cleanup()
 
 
 class EglRenderer(BulletRenderer):
-    """Draws frames of any scene at one size, through OpenGL, without a window."""
+    """Renders frames of any scene at one size with OpenGL, without a window."""
 
     version = VERSION
-    _on_stage: EglRenderer | None = None
-    """Whose scene stands in the process's client."""
+    _active: EglRenderer | None = None
+    """The renderer whose objects are in the shared client."""
 
     def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
-        """Raises UserError where the plugin cannot draw so large a frame."""
+        """Raises UserError for frames larger than the plugin supports."""
         if width * OVERSAMPLING > WINDOW[0] or height * OVERSAMPLING > WINDOW[1]:
             raise UserError(
-                f"renderer=egl draws frames of {WINDOW[0] // OVERSAMPLING} x "
-                f"{WINDOW[1] // OVERSAMPLING} px at most, you ask for {width} x {height}: make "
-                "them smaller, or use renderer=bullet"
+                f"renderer=egl supports frames of at most {WINDOW[0] // OVERSAMPLING} x "
+                f"{WINDOW[1] // OVERSAMPLING} px, not {width} x {height}: use a smaller size, or "
+                "renderer=bullet",
+                code="frame-too-large",
             )
         super().__init__(width, height, view)
 
     def pose(self, scene: Scene, frame: int) -> list[int]:
-        before = EglRenderer._on_stage
-        if before is not None and before is not self:
-            before._clear()
-        EglRenderer._on_stage = self
+        previous = EglRenderer._active
+        if previous is not None and previous is not self:
+            previous._clear()
+        EglRenderer._active = self
         return super().pose(scene, frame)
 
     @staticmethod
     @cache
     def check() -> None:
-        """Raises UserError where no driver draws without a window."""
-        # Without one Bullet ends its whole process, so that another has to try.
+        """Raises UserError where no driver can render without a window."""
+        # Bullet exits without one, so the check runs in a separate process.
         code = "from data.render.egl import start; start()"
-        tried = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-        if tried.returncode != 0:
-            words = tried.stderr.strip().splitlines() or [f"status {tried.returncode}"]
+        attempt = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        if attempt.returncode != 0:
+            lines = attempt.stderr.strip().splitlines() or [f"status {attempt.returncode}"]
             raise UserError(
-                "renderer=egl needs a graphics driver that draws without a window, and none could "
-                f"be started ({words[-1]}): install the driver with its EGL library, or use "
-                "renderer=bullet"
+                "renderer=egl needs a graphics driver that renders without a window, and none "
+                f"starts ({lines[-1]}): install the driver with its EGL library, or use "
+                "renderer=bullet",
+                code="missing-driver",
             )
 
     def _connect(self) -> tuple[BulletClient, int]:
-        bullet, self._folder = _stage()
+        bullet, self._folder = _shared_client()
         return bullet, bullet.ER_BULLET_HARDWARE_OPENGL
 
     def _add(self, look: SceneObject) -> int:
-        return self._new_body(look)  # its mesh brings its texture
+        return self._new_body(look)  # its mesh file includes the texture
 
     def _mesh(self, look: SceneObject) -> dict[str, Any]:
         return {"fileName": str(self._folder / f"{look.material}-{look.shape}.obj")}
 
 
 def _save_meshes(folder: Path) -> None:
-    """Write every shape in every material as an .obj file with its texture: the plugin takes no
-    mesh from memory, and does not change the texture of one."""
+    """Write each shape in each material as an .obj file with its texture, because the plugin can
+    neither take meshes from memory nor change their textures."""
     for material, picture in save_textures(folder).items():
         (folder / f"{material}.mtl").write_text(f"newmtl {material}\nmap_Kd {picture.name}\n")
         for shape in SHAPES:

@@ -1,4 +1,4 @@
-"""The ground that objects stand on, shaded pixel by pixel: one soft lamp and contact shadows."""
+"""Per-pixel shading of the floor: one soft lamp and contact shadows."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ SHADOW_DEPTH = 0.55
 
 _SPREAD = 2 * (0.85 * RADIUS) ** 2
 _REACH = 1.0
-"""How far a shadow is drawn, simulator units. Beyond 0.984 it takes so little that float32 does not
-change: exp(-d^2 / _SPREAD) times SHADOW_DEPTH is under 2^-25."""
+"""Radius of a shadow, simulator units. Beyond 0.984 it does not change a float32, because
+exp(-d^2 / _SPREAD) times SHADOW_DEPTH is below 2^-25."""
 
 
 class Floor:
-    """The floor as one camera sees it, under a lamp at `light`."""
+    """The floor in the image of one camera, under a lamp at `light`."""
 
     def __init__(self, camera: Camera, light: tuple[float, float, float]) -> None:
         self._camera, self._light = camera, light
@@ -30,11 +30,11 @@ class Floor:
         self._x = points[:, :1, 0].astype(np.float32).astype(float)
 
     def shade(self, positions: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-        """How bright the floor is: brightest in the middle, falling off with distance as under one
-        lamp, and darkened around where each object stands.
+        """Compute the brightness of the floor, which falls with distance and under objects.
 
         Args:
-            positions: (N, 3) where the objects are, and boxes (N, 4) where `shadows` has them.
+            positions: (N, 3) positions of the objects.
+            boxes: (N, 4) their shadows' boxes, from `shadows`.
 
         Returns:
             (H, W) float32.
@@ -57,17 +57,17 @@ class Floor:
         return shade
 
     def shadows(self, positions: np.ndarray) -> np.ndarray:
-        """(..., 4) left, top, right and bottom of the pixels that the shadows of objects at
-        (..., 3) reach."""
+        """(..., 4) left, top, right and bottom of the pixels in the shadows of objects at
+        (..., 3)."""
         ground = np.zeros(positions.shape)
         ground[..., :2] = self._shadow_centres(positions)
         corners = _REACH * np.array([[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]])
-        # A corner behind the camera is projected far below the image, where it does no harm.
+        # A corner behind the camera is projected far below the image and clipped.
         pixels, _ = self._camera.project(ground[..., None, :] + corners)
         size = self._camera.width, self._camera.height
         boxes = np.concatenate([pixels.min(axis=-2), pixels.max(axis=-2) + 1], axis=-1)
         return np.clip(boxes, 0, [*size, *size]).astype(int)
 
     def _shadow_centres(self, positions: np.ndarray) -> np.ndarray:
-        """(..., 2) where on the ground the shadows of objects at (..., 3) are darkest."""
+        """(..., 2) positions on the floor where the shadows of objects at (..., 3) are darkest."""
         return positions[..., :2] - 0.5 * RADIUS * np.asarray(self._light[:2]) / self._light[2]

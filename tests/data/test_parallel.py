@@ -1,5 +1,4 @@
-"""Work that is spread is done whole, on this machine and on a Ray cluster, also when a worker is
-killed."""
+"""Worker pools finish every job, on this machine and on a Ray cluster, even if a worker dies."""
 
 from __future__ import annotations
 
@@ -10,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from conf.errors import UserError
 from conf.schema import PARALLEL_BACKENDS
 from data.parallel import Workers
+from tests.user_errors import raises_user_error
 
 
-def square(number: int, victim: Path | None = None) -> int:
-    """The first worker that comes here with a `victim` that is not there leaves it, and dies."""
-    if victim is not None and not victim.exists():
-        victim.touch()
+def square(number: int, marker: Path | None = None) -> int:
+    """Square a number; kill the first worker that receives the `marker` file and create it."""
+    if marker is not None and not marker.exists():
+        marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return number * number
 
@@ -29,20 +28,20 @@ def die(number: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", PARALLEL_BACKENDS)
-def test_a_killed_workers_jobs_are_done_by_others(tmp_path, engine) -> None:
+def test_jobs_of_a_killed_worker_are_retried(tmp_path, engine) -> None:
     jobs = {str(k): partial(square, k) for k in range(20)}
-    jobs["7"] = partial(square, 7, tmp_path / "victim")
+    jobs["7"] = partial(square, 7, tmp_path / "marker")
     results = dict(Workers(2, engine).run(jobs, "squaring", "number"))
-    assert (tmp_path / "victim").exists()
+    assert (tmp_path / "marker").exists()
     assert results == {str(k): k * k for k in range(20)}
 
 
 @pytest.mark.slow
-def test_workers_that_keep_dying_are_told() -> None:
-    with pytest.raises(UserError, match=r"squaring: workers die .* try workers=1"):
+def test_workers_that_keep_dying_are_an_error() -> None:
+    with raises_user_error("dying-workers", contains="workers=1"):
         list(Workers(2).run({"1": partial(die, 1), "2": partial(die, 2)}, "squaring", "number"))
 
 
-def test_a_jobs_own_fault_is_its_own() -> None:
+def test_exception_of_a_job_is_raised() -> None:
     with pytest.raises(ZeroDivisionError):
         list(Workers(2).run({"1": partial(divmod, 1, 0)}, "dividing", "number"))

@@ -1,4 +1,4 @@
-"""A store is whole or named: same bytes every time, killed builds go on, damage is found."""
+"""Laws of stores: builds are deterministic and resume when killed; damage is detected."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from pathlib import Path
 import psutil
 import pytest
 
-from conf.errors import SettingsError, UserError
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from data.build import build, ensure_benchmark, ensure_items
 from data.parallel import Workers
@@ -22,10 +21,11 @@ from data.partial_build import lock_partial_build
 from data.store import MANIFEST, hash_file, hash_files, open_store, write_atomically
 from data.world.sampling import format_scene_id
 from data.world.scenes import split_scenes
+from tests.user_errors import raises_user_error
 
 
 def small(**changes: object) -> BenchmarkConfig:
-    """Six scenes, a few items: quick to build whole."""
+    """A config with six scenes and a few items, which builds quickly."""
     few = Quota(train=2, test=1)
     settings = {
         "name": "small",
@@ -49,20 +49,20 @@ def copy(built: Path, tmp_path: Path) -> Path:
     return tmp_path / "small"
 
 
-def contents(folder: Path) -> dict[str, str]:
+def file_contents(folder: Path) -> dict[str, str]:
     frames = {p.name: hash_file(p) for p in (folder / "frames").glob("*.zip")}
     return {**hash_files(folder), **frames, MANIFEST: (folder / MANIFEST).read_text()}
 
 
 @pytest.mark.slow
-def test_two_builds_are_the_same_bytes_whatever_the_workers(built, tmp_path) -> None:
+def test_builds_are_byte_identical_with_any_number_of_workers(built, tmp_path) -> None:
     ensure_benchmark(small(), tmp_path, workers=2)
-    assert contents(tmp_path / "small") == contents(built)
+    assert file_contents(tmp_path / "small") == file_contents(built)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", [".small.partial/scenes", "small/frames"])
-def test_a_killed_build_goes_on_to_the_same_bytes(built, tmp_path, part) -> None:
+def test_killed_build_resumes_to_identical_bytes(built, tmp_path, part) -> None:
     code = (
         "from pathlib import Path\n"
         "from tests.data.test_store import *\n"
@@ -82,13 +82,13 @@ def test_a_killed_build_goes_on_to_the_same_bytes(built, tmp_path, part) -> None
     assert not psutil.wait_procs(workers, timeout=30)[1]
     first = {p.name: p.stat().st_mtime_ns for p in parts.glob("[!.]*")}
     ensure_benchmark(small(), tmp_path, workers=1)
-    assert contents(tmp_path / "small") == contents(built)
+    assert file_contents(tmp_path / "small") == file_contents(built)
     kept = tmp_path / "small" / parts.name
     assert all((kept / name).stat().st_mtime_ns == when for name, when in first.items())
 
 
 @pytest.mark.slow
-def test_a_cluster_that_loses_a_worker_builds_the_same_bytes(built, tmp_path) -> None:
+def test_cluster_that_loses_a_worker_builds_identical_bytes(built, tmp_path) -> None:
     killed = []
 
     def kill_one() -> None:
@@ -108,24 +108,24 @@ def test_a_cluster_that_loses_a_worker_builds_the_same_bytes(built, tmp_path) ->
 
 
 @pytest.mark.slow
-def test_a_build_of_other_scenes_is_not_thrown_away(tmp_path) -> None:
+def test_partial_build_with_other_scenes_is_kept(tmp_path) -> None:
     nothing = {"selection": SelectionConfig(), "retrieval": RetrievalTrackConfig()}
-    with pytest.raises(UserError, match="would be empty"):
+    with raises_user_error("empty-benchmark"):
         build(small(**nothing), tmp_path / "small", Workers(1))
-    with pytest.raises(UserError, match=r"with benchmark\.max_objects=6, you ask for 5"):
+    with raises_user_error("different-settings", contains="benchmark.max_objects=6"):
         build(small(max_objects=5), tmp_path / "small", Workers(1))
     scenes = tmp_path / ".small.partial" / "scenes"
     first = {p.name: p.stat().st_mtime_ns for p in scenes.iterdir()}
     assert len(first) == 6
-    # Other items of the same scenes go on with them.
+    # A build of other items resumes with the same scenes.
     build(small(), tmp_path / "small", Workers(1))
     kept = tmp_path / "small" / "scenes"
     assert {p.name: p.stat().st_mtime_ns for p in kept.iterdir()} == first
 
 
 @pytest.mark.slow
-def test_builds_at_once_make_one_store(tmp_path, built) -> None:
-    """As the jobs of a sweep do that start together: one builds, and the others wait for it."""
+def test_concurrent_builds_make_one_store(tmp_path, built) -> None:
+    """One process builds, and the others wait for it, as in the jobs of a sweep."""
     stores = []
     others = [
         threading.Thread(
@@ -146,7 +146,7 @@ def test_builds_at_once_make_one_store(tmp_path, built) -> None:
 
 
 @pytest.mark.parametrize("scenes", [10, 12, 100])
-def test_a_scene_has_one_split_in_every_size(scenes) -> None:
+def test_split_of_a_scene_is_independent_of_the_number_of_scenes(scenes) -> None:
     names = [format_scene_id(0, k) for k in range(500)]
     some, more = split_scenes(small(), names[:scenes]), split_scenes(small(), names)
     for split in ("train", "test"):
@@ -155,30 +155,30 @@ def test_a_scene_has_one_split_in_every_size(scenes) -> None:
     assert len(more["test"]) == 100
 
 
-def test_a_split_without_scenes_is_refused() -> None:
-    with pytest.raises(UserError, match=r"test_share=0.01 of 4 scenes leaves none to test on"):
+def test_empty_split_is_refused() -> None:
+    with raises_user_error("empty-split", contains="benchmark.test_share=0.01"):
         split_scenes(small(test_share=0.01), list("abcd"))
 
 
 @pytest.mark.parametrize("part", ["selection.parquet", "scenes"])
-def test_a_damaged_part_is_named(copy, part) -> None:
+def test_damaged_or_missing_file_is_named(copy, part) -> None:
     path = copy / part
     path = next(path.iterdir()) if path.is_dir() else path
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
-    with pytest.raises(UserError, match=f"{path.name} is damaged"):
+    with raises_user_error("damaged-file", contains=path.name):
         open_store(copy)
     path.unlink()
-    with pytest.raises(UserError, match=f"{path.name} is missing"):
+    with raises_user_error("missing-file", contains=path.name):
         open_store(copy)
 
 
-@pytest.mark.parametrize("maker", ["generator", "renderer", "builders"])
-def test_a_store_of_another_version_is_named(copy, maker) -> None:
+@pytest.mark.parametrize("component", ["generator", "renderer", "builders"])
+def test_store_of_another_version_is_refused(copy, component) -> None:
     manifest = json.loads((copy / MANIFEST).read_text())
-    (copy / MANIFEST).write_text(json.dumps({**manifest, maker: "0"}))
-    with pytest.raises(UserError, match=f"{maker} version 0, this is version"):
+    (copy / MANIFEST).write_text(json.dumps({**manifest, component: "0"}))
+    with raises_user_error("different-version", contains=component):
         open_store(copy)
 
 
@@ -190,40 +190,39 @@ def test_a_store_of_another_version_is_named(copy, maker) -> None:
         lambda whole: b"\xff" + whole,
         lambda whole: whole.replace(b'"scenes": 6', b'"scenes": 7'),
     ],
-    ids=["cut", "a list", "no text", "edited"],
+    ids=["truncated", "list", "invalid UTF-8", "edited"],
 )
-def test_a_damaged_manifest_is_named(copy, damage) -> None:
+def test_damaged_manifest_is_refused(copy, damage) -> None:
     whole = (copy / MANIFEST).read_bytes()
     (copy / MANIFEST).write_bytes(damage(whole))
-    with pytest.raises(UserError, match=r"manifest\.json is damaged"):
+    with raises_user_error("damaged-file", contains=MANIFEST):
         open_store(copy)
 
 
-def test_other_settings_are_named(copy) -> None:
-    asked = small(selection=SelectionConfig(time={"in_1s": Quota(train=3, test=1)}))
-    with pytest.raises(
-        UserError, match=r"benchmark\.selection\.time\.in_1s\.train=2, you ask for 3"
-    ):
-        ensure_benchmark(asked, copy.parent, 1)
+def test_different_settings_are_named(copy) -> None:
+    cfg = small(selection=SelectionConfig(time={"in_1s": Quota(train=3, test=1)}))
+    key = "benchmark.selection.time.in_1s.train=2"
+    with raises_user_error("different-settings", contains=key):
+        ensure_benchmark(cfg, copy.parent, 1)
 
 
-def test_a_benchmark_that_would_be_empty_is_refused(built, tmp_path) -> None:
+def test_empty_benchmark_is_refused(built, tmp_path) -> None:
     subprocess.run(["cp", "-r", built / "scenes", tmp_path / "scenes"], check=True)
     nothing = replace(small().selection, min_displacement=1000.0)
-    with pytest.raises(UserError, match="would be empty"):
+    with raises_user_error("empty-benchmark", contains="min_displacement=1000.0"):
         build(small(selection=nothing), tmp_path / "small", Workers(1))
     assert not (tmp_path / "small").exists()
 
 
-def test_an_unknown_cell_is_named(tmp_path) -> None:
+def test_unknown_cell_is_refused(tmp_path) -> None:
     unknown = SelectionConfig(event={"future_offset_gap11": Quota(train=1)})
-    said = r"selection\.event\.future_offset_gap11: .* did you mean future_offset_gap10\?"
-    with pytest.raises(SettingsError, match=said):
+    names = ("selection.event.future_offset_gap11", "future_offset_gap10?")
+    with raises_user_error("unknown-option", contains=names):
         build(small(selection=unknown), tmp_path / "small", Workers(1))
     assert not list(tmp_path.iterdir())
 
 
-def test_a_write_that_fails_leaves_nothing(tmp_path, monkeypatch) -> None:
+def test_failed_write_leaves_no_file(tmp_path, monkeypatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device", "store")
 

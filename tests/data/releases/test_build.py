@@ -130,6 +130,6 @@ def test_an_exported_benchmark_is_read_as_a_release_with_the_same_items(tmp_path
         places = [s.image_positions[scene.in_view] for s in (back, scene)]
         np.testing.assert_allclose(*places, atol=1e-2)
         np.testing.assert_array_equal(back.in_view, scene.in_view)
-        shown = FrameCache.of(theirs).draw(other, [60])[60].astype(float)
-        drawn = FrameCache.of(ours).draw(name, [60])[60].astype(float)
+        shown = FrameCache.of(theirs).render(other, [60])[60].astype(float)
+        drawn = FrameCache.of(ours).render(name, [60])[60].astype(float)
         assert np.abs(shown - drawn).mean() < 3

@@ -1,34 +1,63 @@
-"""Frames that were decoded are kept, and no more of them than memory is given for."""
+"""The frame cache: exact archives, and a bounded number of decoded frames in memory."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from data.render import frame_cache
-from data.render.frame_cache import FrameReader
+from data.render.frame_cache import FrameCache, FrameReader, load_frames, save_frames
 
 
-def test_what_is_kept_is_bounded_however_frames_were_asked_for(micro_store, monkeypatch) -> None:
-    """One frame in twelve is asked for again and again: the other eleven must go all the same."""
+def test_decoded_frames_are_bounded_for_any_access_pattern(micro_store, monkeypatch) -> None:
+    """One frame in twelve is read repeatedly; the other eleven are evicted."""
     bound = 24 * 192 * 128 * 3
     monkeypatch.setattr(frame_cache, "CACHE_BYTES", bound)
-    shown = FrameReader(micro_store)
+    reader = FrameReader(micro_store)
     scene_ids = [*micro_store.scene_ids("train"), *micro_store.scene_ids("test")]
     for scene_id in scene_ids:
-        shown.stack(scene_id, list(range(12)))
+        reader.stack(scene_id, list(range(12)))
         for other in scene_ids:
-            shown.array(other, 0)
-    kept = shown._kept.values()
-    # A view would keep what it is a view of.
-    assert all(pixels.base is None for pixels in kept)
-    assert sum(pixels.nbytes for pixels in kept) <= bound
+            reader.array(other, 0)
+    decoded = reader._decoded.values()
+    # A view would keep the array that it is a view of.
+    assert all(pixels.base is None for pixels in decoded)
+    assert sum(pixels.nbytes for pixels in decoded) <= bound
 
 
-def test_what_is_kept_is_what_was_decoded(micro_store) -> None:
-    scene_id, shown = micro_store.scene_ids("test")[0], FrameReader(micro_store)
-    first = shown.stack(scene_id, [3, 1, 3])
-    np.testing.assert_array_equal(first, shown.stack(scene_id, [3, 1, 3]))
+def test_decoded_frames_are_exact_and_not_shared(micro_store) -> None:
+    scene_id, reader = micro_store.scene_ids("test")[0], FrameReader(micro_store)
+    first = reader.stack(scene_id, [3, 1, 3])
+    np.testing.assert_array_equal(first, reader.stack(scene_id, [3, 1, 3]))
     np.testing.assert_array_equal(first[1], FrameReader(micro_store).array(scene_id, 1))
-    # Who changes what was given changes nothing that is kept.
     first[:] = 0
-    assert shown.array(scene_id, 3).any()
+    assert reader.array(scene_id, 3).any()
+
+
+def test_stored_frame_equals_a_new_rendering(benchmark_store) -> None:
+    item = benchmark_store.selection("train")[0]
+    rendered = FrameCache.of(benchmark_store).render(item.scene_id, [item.target_frame])
+    stored = FrameReader(benchmark_store).array(item.scene_id, item.target_frame)
+    np.testing.assert_array_equal(rendered[item.target_frame], stored)
+
+
+def test_archive_round_trip_is_exact(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    frames = {k: rng.integers(0, 256, (6, 9, 3), dtype=np.uint8) for k in (7, 3, 120)}
+    save_frames(frames, tmp_path / "a.zip")
+    loaded = load_frames(tmp_path / "a.zip")
+    assert list(loaded) == [3, 7, 120]
+    for frame, pixels in frames.items():
+        np.testing.assert_array_equal(loaded[frame], pixels)
+        np.testing.assert_array_equal(load_frames(tmp_path / "a.zip", [frame])[frame], pixels)
+    assert load_frames(tmp_path / "a.zip", [4]) == {}
+    assert load_frames(tmp_path / "missing.zip") == {}
+
+
+@pytest.mark.parametrize("damage", [lambda w: w[:40], lambda w: w[:60] + b"x" + w[61:]])
+def test_damaged_archive_is_logged_and_ignored(tmp_path, caplog, damage) -> None:
+    path = tmp_path / "a.zip"
+    save_frames({5: np.full((8, 8, 3), 9, np.uint8)}, path)
+    path.write_bytes(damage(path.read_bytes()))
+    assert load_frames(path) == {}
+    assert "a.zip is damaged" in caplog.text

@@ -1,4 +1,4 @@
-"""What the camera sees: geometry against Bullet's own mask, and looks that can be told apart."""
+"""Pixels: visibility agrees with Bullet's mask, and looks are distinguishable."""
 
 from __future__ import annotations
 
@@ -25,36 +25,36 @@ def scene() -> Scene:
     return simulate_scene(0, 0, "train", LIMITS)
 
 
-def test_the_origin_is_seen_at_the_images_centre() -> None:
+def test_origin_is_projected_to_the_image_centre() -> None:
     pixel, depth = Camera().project(np.zeros(3))
     np.testing.assert_allclose(pixel, [240, 160], atol=1e-9)
     assert depth == pytest.approx(5.0, abs=1e-3)
 
 
-SEEN_AT = [0, 10, 15, 20, 60, 100]
+FRAMES = [0, 10, 15, 20, 60, 100]
 
 
-def test_the_frames_looked_at_show_all_there_is_to_see(scene: Scene) -> None:
-    """Objects out of view, whole and partly hidden, or the next test could not fail."""
-    fractions = scene.visible_fraction[SEEN_AT]
-    assert not scene.in_view[SEEN_AT].all()
+def test_tested_frames_have_every_kind_of_visibility(scene: Scene) -> None:
+    """Objects out of view, fully visible and partly hidden, so that the next test can fail."""
+    fractions = scene.visible_fraction[FRAMES]
+    assert not scene.in_view[FRAMES].all()
     assert (fractions == 1).any()
     assert ((fractions > 0.2) & (fractions < 0.8)).any()
 
 
-@pytest.mark.parametrize("frame", SEEN_AT)
+@pytest.mark.parametrize("frame", FRAMES)
 def test_visibility_agrees_with_bullets_mask(scene: Scene, frame: int) -> None:
-    drawn = BulletRenderer(240, 160)  # twice that inside: the oracle's own 480 x 320
-    handles = drawn.pose(scene, frame)
-    _, mask = drawn.photograph()
+    renderer = BulletRenderer(240, 160)  # renders at 480 x 320, the oracle's image size
+    handles = renderer.pose(scene, frame)
+    _, mask = renderer.capture()
     for k, handle in enumerate(handles):
-        seen = int((mask == handle).sum())
-        drawn.pose(alone(scene, k), frame)
-        covers = int((drawn.photograph()[1] >= 0).sum())
+        visible = int((mask == handle).sum())
+        renderer.pose(alone(scene, k), frame)
+        covers = int((renderer.capture()[1] >= 0).sum())
         if covers > 8 or covers == 0:
             assert scene.in_view[frame, k] == (covers > 0)
         if covers > 100:
-            assert scene.visible_fraction[frame, k] == pytest.approx(seen / covers, abs=0.05)
+            assert scene.visible_fraction[frame, k] == pytest.approx(visible / covers, abs=0.05)
 
 
 def alone(scene: Scene, k: int) -> Scene:
@@ -64,37 +64,37 @@ def alone(scene: Scene, k: int) -> Scene:
     return replace(scene, scene_id=name, objects=(scene.objects[k],), collisions=(), **arrays)
 
 
-def test_a_frame_is_no_distance_from_itself(scene: Scene) -> None:
-    apart = frame_displacements(scene)
-    np.testing.assert_array_equal(np.diag(apart), 0)
-    np.testing.assert_array_equal(apart, apart.T)
+def test_displacement_is_a_symmetric_distance(scene: Scene) -> None:
+    gaps = frame_displacements(scene)
+    np.testing.assert_array_equal(np.diag(gaps), 0)
+    np.testing.assert_array_equal(gaps, gaps.T)
     assert object_match_scores(scene, 40)[40] == 0
     assert (object_match_scores(scene, 40) <= 1).all()
 
 
-def test_the_same_frame_is_the_same_pixels(scene: Scene) -> None:
+def test_rendering_is_independent_of_the_previous_scene(scene: Scene) -> None:
     first = BulletRenderer(192, 128).render(scene, 50).tobytes()
-    again = get_renderer("bullet", 192, 128)
-    again.render(simulate_scene(0, 1, "train", LIMITS), 3)
-    assert again.render(scene, 50).tobytes() == first
+    other = get_renderer("bullet", 192, 128)
+    other.render(simulate_scene(0, 1, "train", LIMITS), 3)
+    assert other.render(scene, 50).tobytes() == first
 
 
 def crop(look: SceneObject, place: tuple[float, float], yaw: float) -> np.ndarray:
-    """The pixels of one object alone, at the tiny preset's frame size, and its mask."""
+    """Pixels and mask of one object in an empty scene, at the tiny preset's frame size."""
     height = 0.18 if look.shape == "cube" else 0.2
     position = np.array([[[*place, height]]], np.float32)
     turn = np.array([[[0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]]], np.float32)
     none = np.zeros((1, 1, 3), np.float32)
-    there = np.ones((1, 1), bool)
+    in_view = np.ones((1, 1), bool)
     one = Scene(
         f"{look}{place}{yaw}", "train", (look,), (), position, turn, none, none,
-        none[..., :2], there, there.astype(np.float32),
+        none[..., :2], in_view, in_view.astype(np.float32),
     )  # fmt: skip
-    drawn = get_renderer("bullet", 192, 128)
-    drawn.pose(one, 0)
-    pixels, mask = drawn.photograph()
-    seen = (mask >= 0)[..., None]
-    fine = np.dstack([pixels[..., :3] * seen, seen])
+    renderer = get_renderer("bullet", 192, 128)
+    renderer.pose(one, 0)
+    pixels, mask = renderer.capture()
+    is_object = (mask >= 0)[..., None]
+    fine = np.dstack([pixels[..., :3] * is_object, is_object])
     small = fine.reshape(128, 2, 192, 2, 4).mean(axis=(1, 3))
     pixels, cover = small[..., :3], small[..., 3]
     rows, columns = np.nonzero(cover > 0.5)
@@ -102,12 +102,12 @@ def crop(look: SceneObject, place: tuple[float, float], yaw: float) -> np.ndarra
     return np.dstack([pixels[box], 255 * cover[box]])
 
 
-def features(picture: np.ndarray, what: str) -> np.ndarray:
-    """A few numbers that show colour, material or shape in a crop."""
+def features(picture: np.ndarray, attribute: str) -> np.ndarray:
+    """Features of a crop that depend on the colour, material or shape."""
     inside = picture[..., 3] > 250
     rgb = picture[inside][:, :3] / 255
     light = rgb.max(axis=1)
-    if what == "color":
+    if attribute == "color":
         hue = [colorsys.rgb_to_hsv(*p) for p in rgb]
         h, s, _ = np.array(hue).T
         around = 2 * np.pi * h
@@ -115,7 +115,7 @@ def features(picture: np.ndarray, what: str) -> np.ndarray:
         return np.array(
             [strong * np.cos(around).mean(), strong * np.sin(around).mean(), 0.4 * light.mean()]
         )
-    if what == "material":
+    if attribute == "material":
         column = picture[:, picture.shape[1] // 2, :3].max(axis=1) / max(light.max(), 1e-6) / 255
         steps = np.abs(np.diff(column[1:-1]))
         return np.array([light.std() / light.mean(), 3 * steps.max(), light.min() / light.max()])
@@ -133,7 +133,7 @@ PLACES = [(x, y) for x in (-1.5, -0.5, 0.5) for y in (-0.8, 0.1, 0.9)]
 
 @pytest.fixture(scope="module")
 def crops() -> list[tuple[int, SceneObject, np.ndarray]]:
-    """Every look at every place, turned at random."""
+    """Crops of every look at every position, with a random yaw."""
     rng = np.random.default_rng(0)
     looks = [SceneObject(s, m, c) for s in SHAPES for m in MATERIALS for c in COLORS]
     return [
@@ -144,27 +144,27 @@ def crops() -> list[tuple[int, SceneObject, np.ndarray]]:
 
 
 @pytest.mark.parametrize(
-    ("what", "values"), [("color", COLORS), ("material", MATERIALS), ("shape", SHAPES)]
+    ("attribute", "values"), [("color", COLORS), ("material", MATERIALS), ("shape", SHAPES)]
 )
-def test_looks_can_be_told_apart_at_the_tiny_size(crops, what, values) -> None:
-    """The most alike of the crops at some places names the look of those at others."""
-    known, asked = [], []
+def test_looks_are_distinguishable_at_the_tiny_size(crops, attribute, values) -> None:
+    """A nearest-neighbour classifier generalises to other positions."""
+    known, held_out = [], []
     for place, look, picture in crops:
-        # Materials are told apart within a shape and colour, as an eye would.
-        context = (look.shape, look.color) if what == "material" else ()
-        row = (context, getattr(look, what), features(picture, what))
-        (known if place % 2 == 0 else asked).append(row)
+        # Materials are compared within a shape and colour.
+        context = (look.shape, look.color) if attribute == "material" else ()
+        row = (context, getattr(look, attribute), features(picture, attribute))
+        (known if place % 2 == 0 else held_out).append(row)
     right = 0
-    for context, name, found in asked:
-        near = min(
-            (r for r in known if r[0] == context), key=lambda r: float(((r[2] - found) ** 2).sum())
+    for context, name, vector in held_out:
+        nearest = min(
+            (r for r in known if r[0] == context), key=lambda r: float(((r[2] - vector) ** 2).sum())
         )
-        right += near[1] == name
+        right += nearest[1] == name
     assert set(values) == {name for _, name, _ in known}
-    assert right / len(asked) >= 0.95
+    assert right / len(held_out) >= 0.95
 
 
-def test_colors_are_far_apart_on_paper() -> None:
+def test_colors_differ_in_rgb() -> None:
     values = np.array(list(RGB.values()), float)
     gaps = np.linalg.norm(values[:, None] - values[None], axis=-1)
     assert gaps[~np.eye(len(values), dtype=bool)].min() > 60

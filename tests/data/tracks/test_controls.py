@@ -1,4 +1,4 @@
-"""Controls change one thing and nothing else."""
+"""Controls change one property of an item and keep all others."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import pytest
 from data.records import sample_prefix_frames
 from data.tracks.controls import MATCHED_ANCHOR, prefix_under_control
 
-ALIKE = (
+SHARED_FIELDS = (
     "scene_id", "prefix_start", "prefix_stop", "target_frame", "event_frame", "candidates",
     "answer", "horizon", "distractors", "split",
 )  # fmt: skip
 
 
-def test_a_matched_pair_differs_in_its_anchor_alone(benchmark_store) -> None:
+def test_matched_pair_differs_only_in_its_anchor(benchmark_store) -> None:
     items = benchmark_store.selection(suite=MATCHED_ANCHOR)
     assert len(items) >= 4
     for by_event, by_time in zip(items[::2], items[1::2], strict=True):
         assert (by_event.family, by_time.family) == ("event", "time")
         assert by_event.question != by_time.question
-        for axis in ALIKE:
+        for axis in SHARED_FIELDS:
             assert getattr(by_event, axis) == getattr(by_time, axis)
 
 
-def test_both_questions_of_a_pair_are_answered_by_the_target(benchmark_store) -> None:
+def test_target_answers_both_questions_of_a_pair(benchmark_store) -> None:
     for item in benchmark_store.selection(suite=MATCHED_ANCHOR):
         events = [c.frame for c in benchmark_store.scene(item.scene_id).collisions]
         assert item.target_frame == min(e for e in events if e > item.prefix_stop)
@@ -35,23 +35,23 @@ def test_both_questions_of_a_pair_are_answered_by_the_target(benchmark_store) ->
             assert f"like {seconds:g} second" in item.question
 
 
-def test_the_benchmarks_own_items_hold_no_controls(benchmark_store) -> None:
+def test_default_suite_contains_no_controls(benchmark_store) -> None:
     assert {i.suite for i in benchmark_store.selection()} == {"dynapix"}
 
 
 @pytest.mark.parametrize("count", [2, 5, 12])
-def test_a_shuffled_prefix_shows_the_same_frames_in_another_order(benchmark_store, count) -> None:
+def test_shuffled_prefix_has_the_same_frames_in_another_order(benchmark_store, count) -> None:
     for item in benchmark_store.selection("test"):
-        shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, count)
+        frames = sample_prefix_frames(item.prefix_start, item.prefix_stop, count)
         shuffled = prefix_under_control(item, count, "shuffled_prefix")
-        assert shuffled != shown
-        assert sorted(shuffled) == shown
+        assert shuffled != frames
+        assert sorted(shuffled) == frames
         assert prefix_under_control(item, count, "shuffled_prefix") == shuffled
     other = replace(item, item_id="another")
     assert count == 2 or prefix_under_control(other, count, "shuffled_prefix") != shuffled
 
 
-def test_candidates_alone_come_without_a_prefix(benchmark_store) -> None:
+def test_candidate_only_items_have_no_prefix(benchmark_store) -> None:
     item = benchmark_store.selection("test")[0]
     assert prefix_under_control(item, 12, "candidate_only") == []
     assert prefix_under_control(item, 12, None) == sample_prefix_frames(

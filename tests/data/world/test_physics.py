@@ -24,19 +24,19 @@ def fingerprint(scene: Scene) -> str:
     return hashlib.sha256(arrays + repr((scene.objects, scene.collisions)).encode()).hexdigest()
 
 
-def test_a_scene_is_the_same_bits_in_another_process_and_order() -> None:
-    here = [fingerprint(simulate_scene(3, k, "train", LIMITS)) for k in (2, 0, 1)]
+def test_scenes_are_bit_identical_in_another_process_and_order() -> None:
+    first = [fingerprint(simulate_scene(3, k, "train", LIMITS)) for k in (2, 0, 1)]
     code = (
         "from tests.data.world.test_physics import *\n"
         "for k in (0, 1, 2): print(fingerprint(simulate_scene(3, k, 'train', LIMITS)))"
     )
-    there = subprocess.run(
+    second = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout.split()
-    assert [here[1], here[2], here[0]] == there[-3:]
+    assert [first[1], first[2], first[0]] == second[-3:]
 
 
-def test_a_sliding_cube_slows_down_by_friction_alone() -> None:
+def test_friction_decelerates_a_sliding_cube() -> None:
     motion = shared_world().simulate([Body(CUBE, (0.0, 0.0), 0.0, (-2.0, 0.0))], frames=26)
     seconds = 25 / FPS
     lost = 2.0 - np.linalg.norm(motion.velocities[25, 0])
@@ -45,25 +45,28 @@ def test_a_sliding_cube_slows_down_by_friction_alone() -> None:
     assert travelled == pytest.approx(2 * seconds - FRICTION_DECELERATION / 2, rel=0.02)
 
 
-def test_two_balls_on_a_line_swap_their_motion_when_they_meet() -> None:
-    ball = [SceneObject("sphere", "metal", color) for color in ("red", "blue")]
-    bodies = [Body(ball[0], (0.0, -1.0), 0, (0.0, 2.0)), Body(ball[1], (0.0, 0.0), 0, (0.0, 0.0))]
+def test_collision_of_two_spheres_conserves_momentum() -> None:
+    spheres = [SceneObject("sphere", "metal", color) for color in ("red", "blue")]
+    bodies = [
+        Body(spheres[0], (0.0, -1.0), 0, (0.0, 2.0)),
+        Body(spheres[1], (0.0, 0.0), 0, (0.0, 0.0)),
+    ]
     motion = shared_world().simulate(bodies, frames=40)
     (hit,) = motion.collisions
-    # The gap is 1 unit less two radii, travelled at about 2 units a second.
+    # The gap is 1 unit minus two radii, at about 2 units per second.
     assert hit.frame / FPS == pytest.approx(0.6 / 2, abs=0.06)
     before = motion.velocities[hit.frame - 1].sum(axis=0)
     after = motion.velocities[hit.frame].sum(axis=0)
     np.testing.assert_allclose(before[:2], after[:2], atol=0.08)
 
 
-def test_contacts_closer_than_the_gap_are_one_event() -> None:
+def test_contacts_within_the_gap_are_one_collision() -> None:
     assert _debounce({(0, 1): [10, 11, 16]}) == ((Collision(10, (0, 1)),), False)
     assert _debounce({(0, 1): [10, 17]})[1]
 
 
 @pytest.mark.parametrize("index", range(4))
-def test_scenes_keep_the_limits(index: int) -> None:
+def test_scenes_respect_the_limits(index: int) -> None:
     scene = simulate_scene(1, index, "train", LIMITS)
     assert LIMITS.min_objects <= len(scene.objects) <= LIMITS.max_objects
     assert 1 <= len(scene.collisions) <= LIMITS.max_collisions
@@ -73,7 +76,7 @@ def test_scenes_keep_the_limits(index: int) -> None:
 
 
 @pytest.mark.parametrize("index", range(4))
-def test_removing_an_object_moves_nothing_it_never_touched(index: int) -> None:
+def test_removing_an_object_does_not_affect_untouched_objects(index: int) -> None:
     bodies, motion = sample_bodies(1, index, LIMITS)
     factual = record_scene("factual", "train", bodies, motion)
     for removed in range(len(factual.objects)):
@@ -87,7 +90,7 @@ def test_removing_an_object_moves_nothing_it_never_touched(index: int) -> None:
 
 
 def touched_by(scene: Scene, start: int) -> dict[int, int]:
-    """The frame from which each object has been touched by `start`, directly or through others."""
+    """The frame of each object's first contact with `start`, directly or through others."""
     reached = {start: 0}
     for collision in scene.collisions:
         for one, two in (collision.objects, collision.objects[::-1]):
@@ -97,7 +100,7 @@ def touched_by(scene: Scene, start: int) -> dict[int, int]:
 
 
 def reached_in(scene: Scene, index: int, reached: dict[int, int], kept: list[int]) -> int:
-    """The frame at which an object first meets, in the counterfactual, one whose path changed."""
+    """The frame of an object's first contact in the counterfactual with one whose path changed."""
     changed = {kept.index(k) for k in reached if k in kept}
     for collision in scene.collisions:
         if changed & set(collision.objects):
@@ -108,8 +111,7 @@ def reached_in(scene: Scene, index: int, reached: dict[int, int], kept: list[int
 
 
 @pytest.mark.parametrize("index", range(6))
-def test_a_motion_put_together_is_that_of_all_at_once(index: int) -> None:
-    """What is sampled body by body, some of them simulated alone, is what Bullet does with all."""
+def test_incremental_motion_equals_a_joint_simulation(index: int) -> None:
     bodies, motion = sample_bodies(11, index, LIMITS)
     together = shared_world().simulate(bodies)
     assert np.array_equal(together.states, motion.states)
