@@ -1,44 +1,27 @@
-"""The experiment trackers that transformers' Trainer can report to, and whether one is there."""
+"""Check the experiment trackers that transformers' Trainer reports to."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 
 from conf.errors import UserError
 
-PACKAGES = {
-    "tensorboard": "tensorboard",
-    "wandb": "wandb",
-    "trackio": "trackio",
-    "azure_ml": "azureml",
-    "clearml": "clearml",
-    "codecarbon": "codecarbon",
-    "comet_ml": "comet_ml",
-    "dagshub": "dagshub",
-    "dvclive": "dvclive",
-    "flyte": "flytekit",
-    "kubeflow": "kubeflow",
-    "mlflow": "mlflow",
-    "neptune": "neptune",
-    "swanlab": "swanlab",
-}
-"""The package that is imported for each of the Trainer's names."""
-EXTRAS = ("tensorboard", "wandb")
-"""Those that this project has an extra for, of the same name."""
-
 
 def check_trackers(report_to: Sequence[str]) -> None:
-    """Raises UserError where a tracker is none that the Trainer knows, or is not installed."""
+    """Check that the Trainer knows each tracker and that its package is installed.
+
+    Call this after `restrict_to_one_gpu`: it imports transformers if there is a tracker.
+
+    Raises:
+        UserError: A tracker is unknown or not installed.
+    """
+    if not report_to:
+        return
+    from transformers.integrations import get_reporting_integration_callbacks
+
     for name in report_to:
-        if name not in PACKAGES:
-            raise UserError(
-                f"train.report_to names {name}, which is no tracker; the options are "
-                f"{', '.join(PACKAGES)}"
-            )
-        if find_spec(PACKAGES[name]) is None:
-            what = f"-e '.[{name}]'" if name in EXTRAS else PACKAGES[name].replace("_", "-")
-            raise UserError(
-                f"train.report_to names {name}, which is not installed: pip install {what}, or "
-                "leave it out"
-            )
+        try:
+            for callback in get_reporting_integration_callbacks([name]):
+                callback()
+        except (ImportError, RuntimeError, ValueError) as error:
+            raise UserError(f"train.report_to={name}: {error}", code="unknown-tracker") from error

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from conf.entry import Run, command
-from conf.multirun.processes import restrict_to_one_gpu
+from conf.gpus import restrict_to_one_gpu
 from conf.runs import finished_metrics
 from conf.schema import ContrastiveCommand
 from conf.trackers import check_trackers
@@ -25,8 +25,8 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
         log.info("%s is finished; delete it, or give run=NAME, to train anew", run.folder)
         return metrics
 
-    check_trackers(cfg.train.report_to)
     restrict_to_one_gpu()
+    check_trackers(cfg.train.report_to)
 
     from models import distributed
 

@@ -1,45 +1,50 @@
-"""Runs each job of a sweep as its own process, so that one's failure or leak is its own."""
+"""Run each job of a sweep as a child process, so that failures and memory leaks stay in it."""
 
 from __future__ import annotations
 
 import json
 import logging
+import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hydra.core.config_loader import ConfigLoader
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus, configure_log, setup_globals
 from hydra.experimental.callback import Callback
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 
-from conf.multirun.processes import LOOK_EVERY, end, start, visible_gpus
-from conf.multirun.summary import JOB_FILE, final_metrics, read_jobs, write_sweep_table
+from conf.gpus import visible_gpus
+from conf.multirun.table import JOB_FILE, final_metrics, read_jobs, write_sweep_table
 from conf.runs import differences, run_name, write_json
 
 log = logging.getLogger(__name__)
 
-NOT_FOR_CHILDREN = (
+POLL = 0.05
+"""Time (s) between two looks at the child processes."""
+GRACE = 10.0
+"""Time (s) for a terminated child process to end before it is killed."""
+PARENT_ONLY = (
     "hydra.mode",
     "hydra.sweep",
     "hydra.launcher",
     "hydra/sweeper",
     "hydra/launcher",
 )
+"""Hydra overrides that are not passed on to the jobs."""
 
 
 @dataclass(frozen=True)
-class Child:
-    """A job as a process."""
+class Job:
+    """A job of a sweep: its run folder and the command that runs it."""
 
     folder: Path
     title: str
@@ -48,13 +53,18 @@ class Child:
 
     @property
     def output(self) -> Path:
+        """File with the job's stdout and stderr."""
         return self.folder / "output.log"
 
 
-class ProcessLauncher(Launcher):
-    """Runs as many jobs at once as there are GPUs, each on its own; one at a time without any."""
+Ended = tuple[Job, int | None, float | None]
+"""A job that has ended, its exit status and its wall time (s); None for an unknown value."""
 
-    # Hydra takes launchers of this package only.
+
+class ProcessLauncher(Launcher):
+    """Runs one job at a time on each visible GPU, or one job at a time without a GPU."""
+
+    # Hydra only instantiates launchers of this package.
     __module__ = "hydra_plugins.dynapix"
 
     def setup(
@@ -67,144 +77,149 @@ class ProcessLauncher(Launcher):
     def launch(
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
-        """Run the jobs that have not finished before. A job returns its metrics, None where it
-        failed; the others go on."""
+        """Run the jobs that are not finished, and log each as it ends.
+
+        The value of a job is its metrics, or None if it failed; the other jobs still run.
+        """
         setup_globals()
         hydra = self.config.hydra
         configure_log(hydra.hydra_logging, hydra.verbose)
-        # Killed politely, the sweep takes its children along, as with Ctrl-C.
+        # On SIGTERM, as on Ctrl-C, the sweep ends its child processes.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         sweep = Path(hydra.sweep.dir)
-        children = self._children([list(overrides) for overrides in job_overrides], initial_job_idx)
-        if len(children) > 1:
-            log.info("sweep %s: %d jobs", sweep, len(children))
+        jobs = [self._job(n, list(o)) for n, o in enumerate(job_overrides, initial_job_idx)]
+        if len(jobs) > 1:
+            log.info("sweep %s: %d jobs", sweep, len(jobs))
         if initial_job_idx == 0:
-            _forget_from(sweep, len(children))
-        with closing(self.run([child for child in children if not self._finished(child)])) as ended:
-            for child, code, seconds in ended:
-                _ended(child, code, seconds)
+            # Jobs of an earlier, longer sweep are not part of this sweep's table.
+            for old in read_jobs(sweep)[len(jobs) :]:
+                (sweep / str(old["job"]) / JOB_FILE).unlink()
+        with closing(self.run([job for job in jobs if not self._is_finished(job)])) as ended:
+            for job, status, seconds in ended:
+                _record_end(job, status, seconds)
         return [
-            JobReturn(child.overrides, status=JobStatus.COMPLETED, _return_value=_metrics(child))
-            for child in children
+            JobReturn(job.overrides, status=JobStatus.COMPLETED, _return_value=_metrics(job))
+            for job in jobs
         ]
 
-    def run(self, children: list[Child]) -> Iterator[tuple[Child, int | None, float | None]]:
-        """Each child with its exit code and wall time (s), as it ends. Those that still run when
-        the iterator is closed are ended."""
-        waiting, free = children[::-1], visible_gpus() or [None]
-        running: list[tuple[Child, subprocess.Popen, str | None, float]] = []
+    def run(self, jobs: list[Job]) -> Iterator[Ended]:
+        """Run jobs and yield each as it ends; closing the iterator ends those that still run."""
+        waiting, free = jobs[::-1], visible_gpus() or [None]
+        running: dict[subprocess.Popen, tuple[Job, str | None, float]] = {}
         try:
             while waiting or running:
                 while waiting and free:
-                    child, gpu = waiting.pop(), free.pop(0)
-                    log.info("%s: started%s", child.title, f" on GPU {gpu}" if gpu else "")
-                    process = start(child.command, child.output, gpu)
-                    running.append((child, process, gpu, time.monotonic()))
-                time.sleep(LOOK_EVERY)
-                for one in [one for one in running if one[1].poll() is not None]:
-                    running.remove(one)
-                    child, process, gpu, started = one
+                    job, gpu = waiting.pop(), free.pop(0)
+                    log.info("%s: started%s", job.title, f" on GPU {gpu}" if gpu else "")
+                    running[start_process(job.command, job.output, gpu)] = (
+                        job,
+                        gpu,
+                        time.monotonic(),
+                    )
+                time.sleep(POLL)
+                for process in [process for process in running if process.poll() is not None]:
+                    job, gpu, started = running.pop(process)
                     free.append(gpu)
-                    yield child, process.returncode, time.monotonic() - started
+                    yield job, process.returncode, time.monotonic() - started
         finally:
-            end([process for _, process, *_ in running])
+            end_processes(list(running))
 
-    def _children(self, jobs: list[list[str]], first: int) -> list[Child]:
+    def _job(self, number: int, overrides: list[str]) -> Job:
         hydra = self.config.hydra
-        sweep = run_name(self.config.run, hydra.overrides.task)
-        fixed = _as_typed(hydra.overrides.task, self.loader)
-        forwarded = [
-            o for o in hydra.overrides.hydra if not o.lstrip("+").startswith(NOT_FOR_CHILDREN)
-        ]
-        children = []
-        for number, overrides in enumerate(jobs, first):
-            told = " ".join(o.lstrip("+") for o in overrides if o not in fixed)
-            command = [sys.executable, "-m", self.module, *overrides, f"run='{sweep}/{number}'"]
-            # What a preset sweeps over is spread over its jobs by now.
-            command += [*forwarded, "hydra.sweeper.params=null"]
-            folder = Path(hydra.sweep.dir) / str(number)
-            children.append(Child(folder, f"#{number} {told}".rstrip(), overrides, command))
-        return children
+        title = " ".join(o.lstrip("+") for o in overrides if o not in hydra.overrides.task)
+        run = f"{run_name(self.config.run, hydra.overrides.task)}/{number}"
+        passed_on = [o for o in hydra.overrides.hydra if not o.lstrip("+").startswith(PARENT_ONLY)]
+        # The parameters of a sweep preset are already in the job's overrides.
+        passed_on.append("hydra.sweeper.params=null")
+        command = [sys.executable, "-m", self.module, *overrides, f"run='{run}'", *passed_on]
+        return Job(Path(hydra.sweep.dir) / str(number), f"#{number} {title}", overrides, command)
 
-    def _finished(self, child: Child) -> bool:
-        if not (child.folder / "metrics.json").exists() or differences(
-            child.folder, job_settings(self.loader, self.config, child.overrides)
-        ):
+    def _is_finished(self, job: Job) -> bool:
+        settings = job_settings(self.loader, self.config, job.overrides)
+        if not (job.folder / "metrics.json").exists() or differences(job.folder, settings):
             return False
-        log.info("%s: finished before, skipped", child.title)
-        _record(child, "done", None)
+        log.info("%s: already finished, skipped", job.title)
+        _record(job, "done", None)
         return True
 
 
 def job_settings(loader: ConfigLoader, config: DictConfig, overrides: list[str]) -> Any:
-    """The settings of one job of a sweep, composed and resolved."""
+    """The composed and resolved settings of one job of a sweep."""
     cfg = loader.load_sweep_config(config, overrides)
-    with open_dict(cfg):
-        del cfg["hydra"]
-    return OmegaConf.to_container(cfg, resolve=True)
+    own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+    return OmegaConf.to_container(own, resolve=True)
 
 
-def _as_typed(overrides: Sequence[str], loader: ConfigLoader) -> set[str]:
-    """Overrides as they were typed, and as Hydra's own sweeper passes them on."""
-    parsed = OverridesParser.create(config_loader=loader).parse_overrides(list(overrides))
-    passed_on = {
-        f"{o.get_key_element()}={o.get_value_element_as_str()}"
-        for o in parsed
-        if not o.is_sweep_override()
-    }
-    return passed_on | set(overrides)
+def start_process(command: list[str], output: Path, gpu: str | None = None) -> subprocess.Popen:
+    """Start a process that writes to a file and sees one GPU, if any is given."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    visible = {} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu}
+    with output.open("wb") as out:
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=subprocess.STDOUT,
+            env=os.environ | visible,
+        )
 
 
-def _ended(child: Child, code: int | None, seconds: float | None) -> None:
-    """Record and tell how a child ended; its code is None where that is not known."""
+def end_processes(processes: list[subprocess.Popen]) -> None:
+    """Terminate processes, and kill those that are still running after GRACE seconds."""
+    for process in processes:
+        process.terminate()
+    deadline = time.monotonic() + GRACE
+    try:
+        for process in processes:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(max(0.0, deadline - time.monotonic()))
+    finally:
+        # A second Ctrl-C arrives here too.
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def _record_end(job: Job, status: int | None, seconds: float | None) -> None:
+    """Record and log how a job ended."""
     seconds = seconds and round(seconds, 1)
-    _record(child, "done" if code == 0 else "failed", seconds)
-    took = f" {'in' if code == 0 else 'after'} {seconds} s" if seconds is not None else ""
-    if code == 0:
-        found = list(final_metrics(_metrics(child) or {}).items())[:3]
-        told = "".join(f", {name} {value:.4g}" for name, value in found)
-        log.info("%s: done%s%s", child.title, took, told)
+    _record(job, "done" if status == 0 else "failed", seconds)
+    took = "" if seconds is None else f" after {seconds} s"
+    if status == 0:
+        values = list(final_metrics(_metrics(job) or {}).items())[:3]
+        log.info("%s: done%s%s", job.title, took, "".join(f", {n} {v:.4g}" for n, v in values))
         return
-    said = child.output.read_text(errors="replace") if child.output.exists() else ""
-    lines = "".join(f"\n    {line}" for line in said.splitlines()[-5:])
-    log.error("%s: failed%s, %s ends:%s", child.title, took, child.output, lines)
+    output = job.output.read_text(errors="replace") if job.output.exists() else ""
+    lines = "".join(f"\n    {line}" for line in output.splitlines()[-5:])
+    log.error("%s: failed%s, last lines of %s:%s", job.title, took, job.output, lines)
 
 
-def _metrics(child: Child) -> dict[str, float] | None:
-    """What a job that ended well measured; None for one that failed."""
-    if json.loads((child.folder / JOB_FILE).read_text())["status"] == "failed":
+def _metrics(job: Job) -> dict[str, float] | None:
+    """Metrics of a job; None if it failed."""
+    if json.loads((job.folder / JOB_FILE).read_text())["status"] == "failed":
         return None
-    path = child.folder / "metrics.json"
+    path = job.folder / "metrics.json"
     return json.loads(path.read_text()) if path.exists() else {}
 
 
-def _record(child: Child, status: str, seconds: float | None) -> None:
-    path = child.folder / JOB_FILE
-    now = {"overrides": child.overrides, "status": status, "seconds": seconds}
+def _record(job: Job, status: str, seconds: float | None) -> None:
+    path = job.folder / JOB_FILE
+    record = {"overrides": job.overrides, "status": status, "seconds": seconds}
     if seconds is None and path.exists():
+        # The sweep was started again; the time of the job's own run is still known.
         before = json.loads(path.read_text())
-        # How long it took is known where this sweep ran it before.
-        now["seconds"] = before["seconds"] if before["status"] == status else None
-    # A job that a cluster never started has no folder.
+        record["seconds"] = before["seconds"] if before["status"] == status else None
+    # A job that the cluster did not start has no folder.
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, now)
-
-
-def _forget_from(folder: Path, count: int) -> None:
-    """Leave the jobs of an earlier, longer sweep in this folder out of the table."""
-    for job in read_jobs(folder):
-        if job.number >= count:
-            (folder / str(job.number) / JOB_FILE).unlink()
+    write_json(path, record)
 
 
 class TableCallback(Callback):
-    """Ends a sweep with its table, and with exit code 1 where a job failed."""
+    """Prints the table of a sweep at its end, and exits with status 1 if a job failed."""
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         folder = Path(config.hydra.sweep.dir)
-        jobs = read_jobs(folder)
-        if not jobs:
-            return
-        print(write_sweep_table(folder))
-        if any(job.status == "failed" for job in jobs):
-            sys.exit(1)
+        if jobs := read_jobs(folder):
+            print(write_sweep_table(folder))
+            if any(job["status"] == "failed" for job in jobs):
+                sys.exit(1)

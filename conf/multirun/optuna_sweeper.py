@@ -1,17 +1,18 @@
-"""Chooses the settings of a sweep's next jobs by what the jobs before them measured, with Optuna.
+"""Search for settings with Optuna: each job's settings depend on the results of earlier jobs.
 
-The study is kept in the sweep's folder: each trial before its job starts, its value after. So a
-sweep that was killed goes on with the jobs it had begun, and a finished one adds none.
+study.json in the sweep's folder records the settings of each trial before its job starts; the
+results are in the jobs' folders. A search that was killed resumes with the jobs that it had
+started and then tries what it would have tried without the interruption.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import random
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, RangeSweep
@@ -21,25 +22,23 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
 from conf.errors import SettingsError, UserError
-from conf.multirun.launcher import job_settings
-from conf.multirun.processes import visible_gpus
-from conf.multirun.summary import final_metrics, is_lower_better
-from conf.runs import differences
+from conf.gpus import visible_gpus
+from conf.multirun.table import final_metrics, is_lower_better
+from conf.runs import other_settings_error, setting_differences, write_json
 
 if TYPE_CHECKING:
     from optuna import Study
     from optuna.distributions import BaseDistribution
-    from optuna.trial import FrozenTrial
 
 log = logging.getLogger(__name__)
 
-JOURNAL = "study.journal"
+STUDY_FILE = "study.json"
 METRICS = {"train.sft": "answer_letter_accuracy", "train.contrastive": "mrr"}
-"""What a command's jobs are compared by where hydra.sweeper.metric is not given."""
+"""Default of hydra.sweeper.metric for each command."""
 
 
 class OptunaSweeper(Sweeper):
-    # Hydra takes sweepers of this package only.
+    # Hydra only instantiates sweepers of this package.
     __module__ = "hydra_plugins.dynapix"
 
     def __init__(
@@ -59,158 +58,112 @@ class OptunaSweeper(Sweeper):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        self.config = config
         self.loader = hydra_context.config_loader
-        self.command = task_function.__module__
+        self.folder = Path(config.hydra.sweep.dir)
+        self.metric = self.metric or METRICS.get(task_function.__module__)
         self.launcher = Plugins.instance().instantiate_launcher(
             hydra_context=hydra_context, task_function=task_function, config=config
         )
 
     def sweep(self, arguments: list[str]) -> None:
-        """Run trials until the study has as many as were asked for."""
-        self.metric = self.metric or METRICS.get(self.command)
-        if self.metric is None:
-            raise SettingsError(
-                f"{self.command} has no usual metric to search by: give hydra.sweeper.metric=NAME, "
-                "a name in a run's metrics.json"
-            )
+        """Run trials until the study has `n_trials`."""
         overrides = self._overrides(arguments)
         swept = {key: o for key, o in overrides.items() if o.is_sweep_override()}
-        if not swept:
-            raise SettingsError(
-                "there is nothing to search: give a key several values, or an interval as "
-                "'train.lr=tag(log,interval(1e-5,1e-3))'"
-            )
-        space = {key: distribution(override) for key, override in swept.items()}
         self.fixed = [str(o.input_line) for key, o in overrides.items() if key not in swept]
-        study = self._open(swept)
+        self._check(swept)
+        optuna = _import_optuna()
+        space = {key: distribution(override) for key, override in swept.items()}
+        study = optuna.create_study(
+            direction="minimize" if is_lower_better(str(self.metric)) else "maximize"
+        )
+        settings = {key: str(o.input_line).partition("=")[2] for key, o in overrides.items()}
+        for params in self._recorded_trials(settings):
+            study.add_trial(
+                optuna.trial.create_trial(
+                    state=optuna.trial.TrialState.RUNNING, params=params, distributions=space
+                )
+            )
         log.info("search by %s: %d jobs", self.metric, self.n_trials)
-        self._launch(study, study.trials)
-        at_once = max(1, self.n_jobs or len(visible_gpus()))
-        while (asked := len(study.trials)) < self.n_trials:
-            for number in range(asked, min(asked + at_once, self.n_trials)):
-                self._begin_trial(study, space, number)
-            self._launch(study, study.trials[asked:])
-        _tell_best(study, str(self.metric))
+        self._run_trials(study, first=0)
+        batch = max(1, self.n_jobs or len(visible_gpus()))
+        while (first := len(study.trials)) < self.n_trials:
+            for number in range(first, min(first + batch, self.n_trials)):
+                # One seed per trial, so that a resumed search samples the same trials.
+                seed = random.Random(f"{self.seed}/{number}").getrandbits(32)
+                study.sampler = optuna.samplers.TPESampler(seed=seed, constant_liar=True)
+                study.ask(space)
+            trials = [trial.params for trial in study.trials]
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_json(self.folder / STUDY_FILE, {"settings": settings, "trials": trials})
+            self._run_trials(study, first)
+        _log_best(study, str(self.metric))
 
     def _overrides(self, arguments: list[str]) -> dict[str, Override]:
-        """What a preset sweeps over and, before it, what was typed; by key."""
+        """Parameters of a sweep preset, replaced by overrides of the command line, by key."""
         lines = [*(f"{key}={value}" for key, value in self.params.items()), *arguments]
         parsed = OverridesParser.create(config_loader=self.loader).parse_overrides(lines)
         return {override.get_key_element(): override for override in parsed}
 
-    def _open(self, swept: dict[str, Override]) -> Study:
-        """The study of the sweep's folder. Raises SettingsError where it is one of another kind."""
-        folder = Path(self.config.hydra.sweep.dir)
-        folder.mkdir(parents=True, exist_ok=True)
-        study = open_study(folder / JOURNAL, str(self.metric))
-        now = {
-            "hydra.sweeper.metric": str(self.metric),
-            **{key: str(o.input_line).partition("=")[2] for key, o in swept.items()},
-        }
-        there = study.user_attrs.get("asked", now)
-        other = [
-            f"{key} is {there.get(key, 'fixed')} there and {now.get(key, 'fixed')} now"
-            for key in sorted(there.keys() | now.keys())
-            if there.get(key) != now.get(key)
-        ]
-        if study.trials and not other:
-            # Every job of a sweep has the first one's fixed settings.
-            first = job_settings(self.loader, self.config, self._job(study.trials[0]))
-            other = differences(folder / "0", first)
-        if other:
+    def _check(self, swept: dict[str, Override]) -> None:
+        if self.metric is None:
             raise SettingsError(
-                f"{folder} holds a search with other settings: {'; '.join(other[:3])}. "
-                "Choose another folder with run=NAME, or delete this one."
+                "this command has no default metric to search by: give "
+                "hydra.sweeper.metric=NAME, with a name in a run's metrics.json",
+                code="missing-metric",
             )
-        if not study.user_attrs:
-            study.set_user_attr("asked", now)
-        return study
-
-    def _begin_trial(self, study: Study, space: dict[str, BaseDistribution], number: int) -> None:
-        from optuna import create_study
-        from optuna.samplers import TPESampler
-        from optuna.trial import TrialState, create_trial
-
-        # Seeded for each trial, so that a search that was killed draws what it would have.
-        seed = random.Random(f"{self.seed}/{number}").getrandbits(32)
-        drawing = create_study(
-            sampler=TPESampler(seed=seed, constant_liar=True), direction=study.direction
-        )
-        drawing.add_trials(study.trials)
-        drawn = drawing.ask(space)
-        # Optuna would write one key after another, and a kill might come between them.
-        study.add_trial(
-            create_trial(
-                state=TrialState.RUNNING, params=drawn.params, distributions=drawn.distributions
+        if not swept:
+            raise SettingsError(
+                "the search has no parameters: give a key several values, or an interval such as "
+                "'train.lr=tag(log,interval(1e-5,1e-3))'",
+                code="nothing-to-search",
             )
-        )
 
-    def _job(self, trial: FrozenTrial) -> list[str]:
-        return [*self.fixed, *(f"{key}={value}" for key, value in trial.params.items())]
+    def _recorded_trials(self, settings: dict[str, str]) -> list[dict[str, Any]]:
+        """Settings of the trials of an earlier start. Raises SettingsError for another search."""
+        path = self.folder / STUDY_FILE
+        if not path.exists():
+            return []
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if other := setting_differences(record["settings"], settings):
+            raise other_settings_error(f"{self.folder} contains a search", other)
+        return record["trials"]
 
-    def _launch(self, study: Study, trials: Sequence[FrozenTrial]) -> None:
-        """Run the jobs of trials and give the study their values. Trials of jobs that have finished
-        come too: the launcher passes over them, and their place in the table is kept."""
-        if not trials:
-            return
-        jobs = [self._job(trial) for trial in trials]
-        returns = self.launcher.launch(jobs, initial_job_idx=trials[0].number)
-        for trial, returned in zip(trials, returns, strict=True):
-            # A failed job gets no value, so that the same command tries it again.
-            if (metrics := returned.return_value) is not None:
-                self._tell(study, trial.number, final_metrics(metrics))
+    def _run_trials(self, study: Study, first: int) -> None:
+        """Run the jobs of the trials from number `first`, and report their results to the study.
 
-    def _tell(self, study: Study, number: int, metrics: dict[str, float]) -> None:
-        from optuna.trial import TrialState
-
-        if self.metric not in metrics:
-            raise UserError(
-                f"hydra.sweeper.metric={self.metric}: a job of {self.command} measures "
-                f"{', '.join(sorted(metrics)) or 'nothing'} here"
-            )
-        value = metrics[self.metric]
-        if math.isfinite(value):
-            study.tell(number, value, skip_if_finished=True)
-        else:
-            study.tell(number, state=TrialState.FAIL, skip_if_finished=True)
-
-
-def open_study(journal: Path, metric: str) -> Study:
-    """The study of a journal, begun anew where no trial of it has ended: the metric, by which it
-    goes which way is better, may have been mistyped so far. Raises UserError without Optuna."""
-    try:
-        import optuna
-        from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend
-    except ImportError as error:
-        raise UserError("hydra/sweeper=optuna needs Optuna: pip install -e '.[optuna]'") from error
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-
-    def opened() -> Study:
-        return optuna.create_study(
-            storage=JournalStorage(JournalFileBackend(str(journal))),
-            study_name="study",
-            direction="minimize" if is_lower_better(metric) else "maximize",
-            load_if_exists=True,
-        )
-
-    _end_torn_line(journal)
-    study = opened()
-    if any(trial.state.is_finished() for trial in study.trials):
-        return study
-    journal.unlink()
-    return opened()
+        The launcher skips finished jobs. A failed job has no result, so that a restart repeats it.
+        """
+        trials = study.trials[first:]
+        jobs = [[*self.fixed, *(f"{k}={v}" for k, v in trial.params.items())] for trial in trials]
+        for trial, job in zip(
+            trials, self.launcher.launch(jobs, first) if jobs else [], strict=True
+        ):
+            if job.return_value is None:
+                continue
+            metrics = final_metrics(job.return_value)
+            if self.metric not in metrics:
+                raise UserError(
+                    f"hydra.sweeper.metric={self.metric} is not a metric of this command; the "
+                    f"options are {', '.join(sorted(metrics)) or 'none'}",
+                    code="unknown-metric",
+                )
+            value = metrics[self.metric]
+            if math.isfinite(value):
+                study.tell(trial.number, value)
+            else:
+                study.tell(trial.number, state=type(trial.state).FAIL)
 
 
 def distribution(override: Override) -> BaseDistribution:
-    """What Optuna draws a key from: an interval, of whole numbers as int(interval(...)) and by
-    magnitude as tag(log, ...); a range of whole numbers; or a choice."""
-    from optuna.distributions import (
-        CategoricalDistribution,
-        FloatDistribution,
-        IntDistribution,
-    )
+    """The distribution that Optuna samples a key from.
+
+    An interval is continuous; int(interval(...)) has whole numbers and tag(log, interval(...)) a
+    logarithmic scale. A range of whole numbers has its step. Any other sweep is a choice.
+
+    Raises:
+        SettingsError: The bounds are invalid.
+    """
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     value = override.value()
     try:
@@ -223,20 +176,22 @@ def distribution(override: Override) -> BaseDistribution:
             return IntDistribution(min(values), max(values), step=abs(int(value.step)))
         return CategoricalDistribution(list(override.sweep_string_iterator()))
     except ValueError as error:
-        raise SettingsError(f"{override.input_line}: {error}") from error
+        raise SettingsError(f"{override.input_line}: {error}", code="invalid-interval") from error
 
 
-def _end_torn_line(journal: Path) -> None:
-    """Drop what a kill or a full disk left of a line: the next one would be appended to it."""
-    text = journal.read_bytes() if journal.exists() else b""
-    if not text.endswith(b"\n"):
-        journal.write_bytes(text[: text.rfind(b"\n") + 1])
+def _import_optuna() -> Any:
+    try:
+        import optuna
+    except ImportError as error:
+        raise UserError(
+            "hydra/sweeper=optuna needs Optuna: pip install -e '.[optuna]'", code="missing-package"
+        ) from error
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    return optuna
 
 
-def _tell_best(study: Study, metric: str) -> None:
-    from optuna.trial import TrialState
-
-    if study.get_trials(deepcopy=False, states=[TrialState.COMPLETE]):
+def _log_best(study: Study, metric: str) -> None:
+    if any(trial.value is not None for trial in study.trials):
         best = study.best_trial
-        told = " ".join(f"{key.lstrip('+')}={value}" for key, value in best.params.items())
-        log.info("best: #%d %s, %s %.4g", best.number, told, metric, best.value)
+        params = " ".join(f"{key.lstrip('+')}={value}" for key, value in best.params.items())
+        log.info("best: #%d %s, %s %.4g", best.number, params, metric, best.value)

@@ -14,7 +14,7 @@ from hydra.core.plugins import Plugins
 
 from conf.multirun.launcher import ProcessLauncher
 from conf.multirun.optuna_sweeper import OptunaSweeper
-from conf.multirun.slurm_launcher import SubmititLauncher
+from conf.multirun.submitit_launcher import SubmititLauncher
 
 
 @dataclass

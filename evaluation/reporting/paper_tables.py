@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 
 from conf.errors import UserError
-from conf.multirun.summary import AT_START_SUFFIX
+from conf.multirun.table import AT_START_SUFFIX
 from evaluation.metrics.intervals import Interval
 from evaluation.reporting import reference as paper
 from evaluation.reporting.measurements import SUITES, Measured

@@ -5,8 +5,6 @@ from itertools import permutations
 
 import pytest
 
-from conf.errors import UserError
-from conf.multirun.summary import best_value, varying_overrides, write_sweep_table
 from conf.runs import Run, open_run, run_name
 from tests.user_errors import raises_user_error
 
@@ -65,22 +63,3 @@ def test_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with raises_user_error("write-failed", contains="file/r"):
         open_run(Run("r", tmp_path / "file" / "r"), SETTINGS, "train.sft", [])
-
-
-def test_the_best_of_a_metric_goes_by_its_name():
-    values = [2.0, 1.0, float("nan")]
-    assert best_value("eval_loss", values) == 1.0
-    assert best_value("median_rank", values) == 1.0
-    assert best_value("set_aside", values) == 1.0
-    assert best_value("accuracy", values) == 2.0
-    assert best_value("accuracy", [float("nan")]) is None
-
-
-def test_only_what_varies_is_a_column():
-    jobs = [["+exp=cot", "x=1", "y=3"], ["+exp=cot", "x=2", "y=3"]]
-    assert varying_overrides(jobs) == [{"x": "1"}, {"x": "2"}]
-
-
-def test_a_folder_without_a_sweep_is_told(tmp_path):
-    with pytest.raises(UserError, match="holds no sweep"):
-        write_sweep_table(tmp_path)

@@ -10,7 +10,7 @@ from transformers import ProgressCallback, TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.errors import UserError
-from conf.multirun.summary import AT_START_SUFFIX
+from conf.multirun.table import AT_START_SUFFIX
 from conf.runs import write_text
 from train.common.curves import curves_figure
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from huggingface_hub import ModelCardData
 
-from conf.multirun.summary import AT_START_SUFFIX
+from conf.multirun.table import AT_START_SUFFIX
 from conf.schema import ContrastiveCommand, RetrieverConfig, SftCommand, StudentConfig
 from models.fingerprints import is_hub_model
 from models.resolved import read_resolved

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import torch
 
+from conf import gpus
 from conf.entry import Run
 from conf.errors import UserError
-from conf.multirun import processes
 from conf.schema import SftCommand
 from data.records import SelectionItem
 from data.store import Store
@@ -115,5 +115,5 @@ def test_a_run_keeps_to_one_gpu_unless_ranks_were_started(monkeypatch, visible, 
     monkeypatch.delenv("LOCAL_RANK", raising=False)
     if rank is not None:
         monkeypatch.setenv("LOCAL_RANK", rank)
-    processes.restrict_to_one_gpu()
+    gpus.restrict_to_one_gpu()
     assert os.environ["CUDA_VISIBLE_DEVICES"] == kept

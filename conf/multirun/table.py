@@ -1,0 +1,81 @@
+"""The table of a sweep: one row per job, read from the jobs' folders."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from conf.runs import write_text
+
+JOB_FILE = "job.json"
+AT_START_SUFFIX = "_at_start"
+"""End of the name of a metric that is measured before the first step of a run."""
+LOWER_IS_BETTER = r"loss|_rank$|set_aside|too_short|reject"
+
+
+def read_jobs(folder: Path) -> list[dict[str, Any]]:
+    """The jobs of a sweep that have ended, by number.
+
+    Returns:
+        For each job its number (`job`), `overrides`, `status` (done or failed), wall time
+        (`seconds`, None if unknown) and `metrics`.
+    """
+    jobs = []
+    for path in folder.glob(f"[0-9]*/{JOB_FILE}"):
+        job = {"job": int(path.parent.name), "metrics": {}, **json.loads(path.read_text())}
+        metrics = path.with_name("metrics.json")
+        if job["status"] == "done" and metrics.exists():
+            job["metrics"] = final_metrics(json.loads(metrics.read_text()))
+        jobs.append(job)
+    return sorted(jobs, key=lambda job: job["job"])
+
+
+def final_metrics(metrics: dict[str, float]) -> dict[str, float]:
+    """The metrics of a run without those of its start, which most jobs of a sweep share."""
+    return {name: value for name, value in metrics.items() if not name.endswith(AT_START_SUFFIX)}
+
+
+def write_sweep_table(folder: Path) -> str:
+    """Write the table of a sweep as sweep.csv and, with the best values marked, as sweep.txt.
+
+    Returns:
+        The text of sweep.txt.
+    """
+    # Imported here because most commands run no sweep.
+    import pandas as pd
+
+    jobs = read_jobs(folder)
+    metrics = sorted({name for job in jobs for name in job["metrics"]})
+    settings = varying_overrides([job["overrides"] for job in jobs])
+    rows = [
+        {"job": job["job"], **varying, **{name: job["metrics"].get(name) for name in metrics}}
+        | {"status": job["status"], "seconds": job["seconds"]}
+        for job, varying in zip(jobs, settings, strict=True)
+    ]
+    table = pd.DataFrame(rows)
+    write_text(folder / "sweep.csv", table.to_csv(index=False))
+    text = table.map(lambda value: f"{value:.4g}" if isinstance(value, float) else str(value))
+    for name in metrics:
+        best = table[name].min() if is_lower_better(name) else table[name].max()
+        text[name] += (table[name] == best).map({True: "*", False: ""})
+    text = text.mask(table.isna(), "-")
+    lines = text.to_string(index=False, justify="left").splitlines()
+    page = "\n".join(line.rstrip() for line in lines)
+    write_text(folder / "sweep.txt", page + "\n")
+    return page
+
+
+def varying_overrides(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
+    """For each job, the overrides (key to value) that differ between jobs."""
+    by_key = [dict(o.lstrip("+").split("=", 1) for o in job if "=" in o) for job in jobs]
+    keys = dict.fromkeys(key for job in by_key for key in job)
+    differ = [key for key in keys if len({job.get(key) for job in by_key}) > 1]
+    return [{key: job[key] for key in differ if key in job} for job in by_key]
+
+
+def is_lower_better(metric: str) -> bool:
+    """Whether a metric is a loss, a rank or a number of rejected results."""
+    return re.search(LOWER_IS_BETTER, metric) is not None
