@@ -178,5 +178,13 @@ def corpus(store: Store, rationales: list[Rationale]) -> list[str]:
     # Every digit and the timestamps' frame, often enough to be worth merges.
     clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
     asked = [instruction(mode, "cot") for mode in MODES]
-    prompts = [*asked_questions, *letters, *asked, *questions.QUESTIONS, "user", "assistant", "Later: "]
+    prompts = [
+        *asked_questions,
+        *letters,
+        *asked,
+        *questions.QUESTIONS,
+        "user",
+        "assistant",
+        "Later: ",
+    ]
     return [*prompts * 20, *clock, *(r.text for r in rationales)]
