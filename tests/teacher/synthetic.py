@@ -1,4 +1,4 @@
-"""Scenes in closed form: objects at constant velocity before a pinhole camera."""
+"""Scenes in closed form: objects at constant velocity in front of a pinhole camera."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def project(points: np.ndarray) -> np.ndarray:
 
 
 def on_ground(pixel: tuple[float, float]) -> np.ndarray:
-    """The ground point that is seen at a pixel."""
+    """The point on the ground at a pixel."""
     right, down, forward = axes()
     x, y = (np.asarray(pixel) - CENTRE) / FOCAL
     ray = forward + x * right + y * down
@@ -54,8 +54,8 @@ def scene(
     scene_id: str = "scene",
     frames: int = FRAMES,
 ) -> Scene:
-    """Objects from `starts` (x, y) at `velocities` (units/s); they pass through one another, and
-    a collision is the first frame at which a pair is within 0.4."""
+    """Objects from `starts` (x, y) at `velocities` (units/s); they pass through each
+    other, and a pair collides in the first frame with a distance of at most 0.4."""
     start, velocity = (np.array(a, dtype=float).reshape(-1, 2) for a in (starts, velocities))
     count = len(start)
     time = np.arange(frames)[:, None, None] / FPS
@@ -109,7 +109,7 @@ def item(
     scene_id: str = "scene",
     split: str = "train",
 ) -> SelectionItem:
-    """An item whose candidates are `frames`; `scene_ids` names the scenes of foreign ones."""
+    """An item with the candidates `frames`; `scene_ids` has the other scenes of candidates."""
     foreign = scene_ids or {}
     return SelectionItem(
         item_id=item_id,

@@ -1,7 +1,7 @@
-"""What rationales claim is read, the true let through and the false found.
+"""Claims of rationales: false ones are contradicted, true ones are not.
 
-claims.txt holds sentences about FACTS, each marked true or false, with its section's letter.
-prose.jsonl holds a language model's rationales with the predicates that they were written from.
+claims.txt has sentences about FACTS, each with its truth and the letter of its section.
+prose.jsonl has rationales by a language model, with the predicates in their prompts.
 """
 
 import json
@@ -107,7 +107,7 @@ def verdicts(section, sentence):
 
 
 @pytest.mark.parametrize(("truth", "section", "sentence"), CASES)
-def test_a_false_sentence_is_contradicted_and_a_true_one_is_not(truth, section, sentence):
+def test_only_false_sentences_are_contradicted(truth, section, sentence):
     found = contradicted(f"{SECTION[section]}: {sentence}", FACTS)
     assert bool(found) == (truth == "false"), found
 
@@ -150,16 +150,16 @@ def test_a_false_sentence_is_contradicted_and_a_true_one_is_not(truth, section, 
             "The green metal sphere and the blue rubber sphere will not meet.",
             {f"meeting not ({GREEN} and {BLUE})": "supported"},
         ),
-        # What an object that is out of view does before it comes in is not known.
+        # The motion of an object out of view is unknown.
         ("S", "The purple metal cylinder rolls slowly.", {f"speed slowly ({PURPLE})": "unknown"}),
-        # Whom a pronoun stands for is not guessed.
+        # Ambiguous pronouns are not resolved.
         (
             "P",
             "The red metal cube is close to the blue rubber sphere and it is near the bottom.",
             None,
         ),
         ("S", "It is near the bottom.", {f"region {BOTTOM}": "unknown"}),
-        # Where there is nothing, it is not, whatever it is.
+        # No object is there, so the claim is false of any subject.
         ("S", "It is near the top.", {"region near the top": "contradicted"}),
         ("M", "If it were struck, the gray rubber cylinder would move east.", {}),
         (
@@ -178,7 +178,7 @@ def test_a_false_sentence_is_contradicted_and_a_true_one_is_not(truth, section, 
         ("O", "Only candidate D agrees.", {"agrees in D": "contradicted"}),
     ],
 )
-def test_claims_are_read_with_their_subject_and_their_polarity(section, sentence, claims):
+def test_subject_and_polarity_of_claims(section, sentence, claims):
     found = verdicts(section, sentence)
     if claims is None:
         assert "contradicted" not in found.values()
@@ -187,7 +187,7 @@ def test_claims_are_read_with_their_subject_and_their_polarity(section, sentence
 
 
 @pytest.mark.parametrize(
-    ("section", "plain", "unsure"),
+    ("section", "plain", "ambiguous"),
     [
         ("S", "The {0} is near the top.", "The {0} recalls somebody near the top."),
         ("S", "The {0} heads west.", "The {0} meets the {1} and heads west."),
@@ -199,18 +199,18 @@ def test_claims_are_read_with_their_subject_and_their_polarity(section, sentence
         ),
     ],
 )
-def test_only_what_is_certain_is_contradicted(section, plain, unsure):
+def test_ambiguous_claims_are_not_contradicted(section, plain, ambiguous):
     found = verdicts(section, plain.format(RED, BLUE))
     assert "contradicted" in found.values()
-    assert "contradicted" not in verdicts(section, unsure.format(RED, BLUE)).values()
+    assert "contradicted" not in verdicts(section, ambiguous.format(RED, BLUE)).values()
 
 
-def test_most_of_what_true_sentences_say_is_supported():
+def test_most_claims_of_true_sentences_are_supported():
     found = [v for truth, s, text in CASES if truth == "true" for v in verdicts(s, text).values()]
     assert found.count("supported") > 0.9 * len(found) > 200
 
 
-def test_a_claim_stands_where_its_span_says():
+def test_spans_of_claims():
     text = f"Scene parse: The {RED} is near the left.\nOutcome: B is right.\nAnswer: B"
     spans = {(c.kind, text[slice(*c.span)]) for c in extract_claims(text, FACTS)}
     assert ("region", "near the left") in spans
@@ -220,7 +220,7 @@ def test_a_claim_stands_where_its_span_says():
 
 @pytest.fixture(scope="module")
 def narrated(benchmark_store):
-    """The benchmark's training items with their predicates and the narrator's rationales."""
+    """Training items of the benchmark with predicates and the narrator's rationales."""
     found = []
     for item in benchmark_store.selection("train"):
         scene = benchmark_store.scene(item.scene_id)
@@ -232,7 +232,7 @@ def narrated(benchmark_store):
 
 
 @pytest.mark.slow
-def test_nothing_that_the_narrator_says_is_contradicted(narrated):
+def test_no_claim_of_the_narrator_is_contradicted(narrated):
     for item, predicates, text in narrated:
         assert contradicted(text, predicates) == []
         assert contradicted(paraphrase(text, Random(item.item_id)), predicates) == []
@@ -240,7 +240,7 @@ def test_nothing_that_the_narrator_says_is_contradicted(narrated):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_flipped_fact_is_found(narrated, kind):
+def test_false_fact_is_contradicted(narrated, kind):
     found = []
     for item, predicates, _ in narrated:
         for false, _ in falsehoods(predicates, item, kind, Random(item.item_id), seed=1):
@@ -248,14 +248,14 @@ def test_a_flipped_fact_is_found(narrated, kind):
     assert sum(found) >= 0.97 * len(found) > 20
 
 
-def test_nothing_that_a_language_model_rightly_says_is_contradicted():
+def test_no_true_claim_of_a_language_model_is_contradicted():
     for record in PROSE:
         assert contradicted(record["text"], predicates_from(record["predicates"])) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", EDITS)
-def test_a_false_word_in_prose_is_found(kind):
+def test_false_word_in_prose_is_contradicted(kind):
     found = []
     for record in PROSE:
         predicates = predicates_from(record["predicates"])
@@ -265,7 +265,7 @@ def test_a_false_word_in_prose_is_found(kind):
 
 
 @pytest.mark.slow
-def test_no_text_makes_it_raise_and_the_same_text_gives_the_same():
+def test_extraction_never_raises_and_is_deterministic():
     rng = Random(0)
     words = [*PHRASES, RED, BLUE, "the red cube", "A", "B", "Candidate D", "near the top", "both"]
     words += [*",.;:()—’'\n", "it", "they", "Outcome: ", "Answer: ", "\nPrediction: ", "", "“", "é"]
@@ -279,14 +279,14 @@ def test_no_text_makes_it_raise_and_the_same_text_gives_the_same():
 
 
 @pytest.mark.slow
-def test_the_validator_rejects_what_is_contradicted_and_keeps_the_claims(narrated):
+def test_validator_rejects_contradictions_and_returns_claims(narrated):
     cfg = TeacherConfig(name="template")
     item, predicates, text = narrated[0]
     verdict = validate_rationale(text, predicates, item, cfg)
     assert verdict.accepted
     assert {c.verdict for c in verdict.claims} <= {"supported", "unknown"}
     assert sum(c.verdict == "supported" for c in verdict.claims) > 20
-    told, _ = next(falsehoods(predicates, item, "color", Random(0), seed=1))
-    false = validate_rationale(told, predicates, item, cfg)
+    text, _ = next(falsehoods(predicates, item, "color", Random(0), seed=1))
+    false = validate_rationale(text, predicates, item, cfg)
     assert not false.accepted
     assert {reason.split(":")[0] for reason in false.reasons} == {"contradicts"}

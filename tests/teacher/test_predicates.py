@@ -1,4 +1,4 @@
-"""Laws of the predicates, on scenes that are known in closed form."""
+"""Predicates of scenes in closed form and of a benchmark, compared with the oracle."""
 
 import json
 import math
@@ -21,7 +21,7 @@ from tests.teacher import synthetic
 
 
 def toward(start, pixel, frames):
-    """The velocity that takes an object from a ground point to a pixel in so many frames."""
+    """The velocity that moves an object from a ground point to a pixel in a number of frames."""
     return (synthetic.on_ground(pixel)[:2] - start) / frames * synthetic.FPS
 
 
@@ -41,7 +41,7 @@ def test_compass(delta, word):
     assert compass_direction(np.array(delta, dtype=float)) == word
 
 
-def test_rolling_southwest():
+def test_motion_to_the_southwest():
     start = synthetic.on_ground((300, 100))[:2]
     scene = synthetic.scene([start, (0, -1)], [toward(start, (180, 220), 100), (0, 0)])
     moving, still = extract_facts(scene, 20, 40, 90).objects
@@ -50,12 +50,12 @@ def test_rolling_southwest():
     assert (still.speed, still.heading, still.extent) == ("stationary", None, "stays")
 
 
-def test_a_pair_on_a_course_meets():
+def test_pair_on_a_collision_course_meets():
     scene = synthetic.scene([(-1.5, 0), (1.5, 0.1)], [(1, 0), (-1, 0)])
     (contact,) = scene.collisions
     assert find_collision_courses(scene, 10) == [(0, 1)]
     names = tuple(o.phrase for o in scene.objects)
-    # They close at two units a second and meet after about 32 frames; the cut is 6, then 20.
+    # They approach at 2 units/s and meet after about 32 frames; the cut is frame 6, then 20.
     for stop, when in ((6, "soon"), (20, "imminent")):
         facts = extract_facts(scene, 0, stop, contact.frame)
         assert facts.courses[0].objects == names
@@ -64,7 +64,7 @@ def test_a_pair_on_a_course_meets():
         assert facts.close[0].objects == names
 
 
-def test_a_pair_that_has_just_met_is_on_no_course():
+def test_pair_that_has_just_met_is_not_on_a_course():
     scene = synthetic.scene([(-1.5, 0), (1.5, 0)], [(1, 0), (-1, 0)])
     contact = scene.collisions[0].frame
     assert find_collision_courses(scene, contact - 1) == [(0, 1)]
@@ -72,20 +72,19 @@ def test_a_pair_that_has_just_met_is_on_no_course():
         assert find_collision_courses(scene, cut) == []
 
 
-def test_what_the_clip_does_not_show_is_not_foretold():
-    """A pair that would meet after the last frame neither will nor will not meet."""
+def test_meeting_after_the_last_frame_is_unseen():
     scene = synthetic.scene([(-1.5, 0), (1.5, 0)], [(0.4, 0), (-0.4, 0)], frames=60)
     assert not scene.collisions
     assert find_collision_courses(scene, 50) == [(0, 1)]
     assert extract_facts(scene, 20, 50, 55).courses[0].when == "unseen"
 
 
-def test_parallel_and_parting_pairs_are_on_no_course():
+def test_parallel_and_separating_pairs_are_not_on_a_course():
     scene = synthetic.scene([(0, 0), (0, 1), (-1, -1)], [(0.5, 0), (0.5, 0), (-0.5, -0.5)])
     assert find_collision_courses(scene, 10) == []
 
 
-def test_time_to_event_is_counted_from_the_cut():
+def test_time_of_a_meeting_is_counted_from_the_cut():
     scene = synthetic.scene([(-1.5, 0), (1.5, 0)], [(1, 0), (-1, 0)])
     contact = scene.collisions[0].frame
     assert find_cut(scene, 0, contact) == contact - 12
@@ -94,7 +93,7 @@ def test_time_to_event_is_counted_from_the_cut():
     assert find_cut(scene, contact - 15, contact) is None
 
 
-def test_leaving_the_view():
+def test_object_that_leaves_the_view():
     start = synthetic.on_ground((440, 160))[:2]
     scene = synthetic.scene([start, (0, 0)], [toward(start, (600, 160), 60), (0, 0)])
     moving = extract_facts(scene, 0, 10, 80).objects[0]
@@ -114,43 +113,45 @@ DIRECTIONS = {
 }
 
 
-def region_in_words(x, y, width, height):
+def expected_region(x, y, width, height):
     down = "top" if 3 * y < height else "bottom" if 3 * y >= 2 * height else ""
     across = "left" if 3 * x < width else "right" if 3 * x >= 2 * width else ""
     return f"near the {'-'.join(filter(None, (down, across))) or 'center'}"
 
 
-def speed_in_words(velocity):
+def expected_speed(velocity):
     speed = math.sqrt(sum(float(v) ** 2 for v in velocity))
     bounds = [(0.05, "stationary"), (0.6, "slowly"), (1.5, "steadily"), (3.0, "quickly")]
     return next((word for bound, word in bounds if speed < bound), "very quickly")
 
 
-def agrees(word, way):
+def points_along(word, displacement):
     """Whether a compass word is the nearest to the direction of a displacement."""
-    way = np.asarray(way, dtype=float)
-    cosine = way @ DIRECTIONS[word] / np.linalg.norm(way) / np.linalg.norm(DIRECTIONS[word])
+    displacement = np.asarray(displacement, dtype=float)
+    cosine = displacement @ DIRECTIONS[word]
+    cosine /= np.linalg.norm(displacement) * np.linalg.norm(DIRECTIONS[word])
     return cosine > math.cos(math.pi / 8) - 1e-9
 
 
 def closest_pass(scene, i, j, cut, since):
-    """How near two objects come in 60 frames if both keep on straight, by walking the lines."""
+    """Distances of two objects over 60 frames of straight motion in small steps, and their relative
+    speed."""
     ground = scene.positions[:, :, :2]
     steps = [(ground[cut, k] - ground[since[k], k]) / (cut - since[k]) for k in (i, j)]
     ahead = np.arange(0, 60, 0.01)[:, None]
-    apart = ground[cut, j] + ahead * steps[1] - ground[cut, i] - ahead * steps[0]
-    return np.linalg.norm(apart, axis=-1), 25 * np.linalg.norm(steps[1] - steps[0])
+    gaps = ground[cut, j] + ahead * steps[1] - ground[cut, i] - ahead * steps[0]
+    return np.linalg.norm(gaps, axis=-1), 25 * np.linalg.norm(steps[1] - steps[0])
 
 
-def seen(scene, frame, k):
+def expected_sight(scene, frame, k):
     if not scene.in_view[frame, k]:
         return "out of view"
     return "shown" if scene.visible_fraction[frame, k] > 0.05 else "hidden"
 
 
-def test_every_fact_follows_from_the_stored_oracle(benchmark_store):
-    """Regions, speeds, directions, meetings and closeness, worked out anew in plain words."""
-    told = Counter()
+def test_every_fact_agrees_with_the_oracle(benchmark_store):
+    """Regions, speeds, directions, meetings and closeness, computed by independent code."""
+    counts = Counter()
     for item in benchmark_store.selection():
         scene, target = benchmark_store.scene(item.scene_id), item.target_frame
         predicates = extract_predicates(item, scene, benchmark_store.scene)
@@ -167,25 +168,28 @@ def test_every_fact_follows_from_the_stored_oracle(benchmark_store):
                 since[k] = max(since[k], c.frame) if c.frame <= cut else since[k]
         for k, o in enumerate(predicates.objects):
             assert o.object == scene.objects[k].phrase
-            assert (o.sight, o.target_sight) == (seen(scene, cut, k), seen(scene, target, k))
+            assert (o.sight, o.target_sight) == (
+                expected_sight(scene, cut, k),
+                expected_sight(scene, target, k),
+            )
             for frame, sight, region in (
                 (cut, o.sight, o.region),
                 (target, o.target_sight, o.target_region),
             ):
-                told["region"] += 1
+                counts["region"] += 1
                 if sight == "out of view":
                     assert region == "out of view"
                 else:
                     place = scene.image_positions[frame, k]
-                    assert region == region_in_words(*place, width, height)
+                    assert region == expected_region(*place, width, height)
             if o.sight == "out of view":
                 assert (o.speed, o.heading) == (None, None)
             else:
-                assert o.speed == speed_in_words(scene.velocities[cut, k])
+                assert o.speed == expected_speed(scene.velocities[cut, k])
                 way = (scene.image_positions[cut, k] - scene.image_positions[since[k], k]) * square
                 rests = o.speed == "stationary" or np.hypot(*way) < 1e-6
-                assert rests if o.heading is None else agrees(o.heading, way)
-                told["heading"] += o.heading is not None
+                assert rests if o.heading is None else points_along(o.heading, way)
+                counts["heading"] += o.heading is not None
             moved = (scene.image_positions[target, k] - scene.image_positions[cut, k]) * square
             far = math.hypot(*moved)
             if {o.sight, o.target_sight} == {"out of view"}:
@@ -197,17 +201,17 @@ def test_every_fact_follows_from_the_stored_oracle(benchmark_store):
                     "moves across": far >= 60,
                 }
                 assert words[o.extent]
-                assert far < 8 if o.travel is None else agrees(o.travel, moved)
+                assert far < 8 if o.travel is None else points_along(o.travel, moved)
             gone = {o.sight == "out of view", o.target_sight == "out of view"} == {True, False}
             assert (o.object in (*predicates.entering, *predicates.leaving)) == gone
             assert not (o.object in predicates.entering and o.sight != "out of view")
-            told["crossing"] += gone
-        check_meetings(scene, predicates, cut, target, since, told)
-    assert min(told[kind] for kind in ("region", "heading", "crossing", "course", "close")) > 5
-    assert told["never"] > 0
+            counts["crossing"] += gone
+        check_meetings(scene, predicates, cut, target, since, counts)
+    assert min(counts[kind] for kind in ("region", "heading", "crossing", "course", "close")) > 5
+    assert counts["never"] > 0
 
 
-def check_meetings(scene, predicates, cut, target, since, told):
+def check_meetings(scene, predicates, cut, target, since, counts):
     names = [o.phrase for o in scene.objects]
     on_course = {frozenset(m.objects): m.when for m in predicates.courses}
     contacts = {frozenset(m.objects): m.when for m in predicates.contacts}
@@ -230,24 +234,24 @@ def check_meetings(scene, predicates, cut, target, since, told):
         if any(cut - 5 < frame <= cut for frame in met) or cut in (since[i], since[j]):
             assert pair not in on_course
         else:
-            apart, closing = closest_pass(scene, i, j, cut, since)
-            nearing = apart[1] < apart[0] and closing >= 0.05
-            if abs(apart.min() - 0.5) > 1e-3:  # the walk's own steps are that coarse
-                assert (pair in on_course) == (nearing and apart.min() < 0.5)
+            distances, closing = closest_pass(scene, i, j, cut, since)
+            nearing = distances[1] < distances[0] and closing >= 0.05
+            if abs(distances.min() - 0.5) > 1e-3:  # The steps are that coarse.
+                assert (pair in on_course) == (nearing and distances.min() < 0.5)
             if pair in on_course:
                 assert on_course[pair] == when or (when is None and on_course[pair] == "unseen")
-                told["course"] += 1
-                told["never"] += on_course[pair] is None
+                counts["course"] += 1
+                counts["never"] += on_course[pair] is None
         ground = scene.positions[target, :, :2]
         near = np.hypot(*(ground[i] - ground[j])) < 0.6 and scene.in_view[target, [i, j]].all()
         assert (pair in close) == near
         if near:
             middle = scene.image_positions[target, [i, j]].mean(0)
-            assert close[pair] == region_in_words(*middle, *scene.image_size)
-            told["close"] += 1
+            assert close[pair] == expected_region(*middle, *scene.image_size)
+            counts["close"] += 1
 
 
-def test_no_fact_of_a_benchmark_holds_a_number(benchmark_store):
+def test_predicates_of_a_benchmark_contain_no_number(benchmark_store):
     for item in benchmark_store.selection():
         predicates = extract_predicates(
             item, benchmark_store.scene(item.scene_id), benchmark_store.scene
@@ -264,7 +268,7 @@ def cases(count):
         frames = tuple(int(f) for f in 40 + rng.permutation(80)[:4])
         answer = int(rng.integers(4))
         if not scene.in_view[frames[answer]].any():
-            continue  # No builder names a target that shows nothing.
+            continue  # No builder selects a target without visible objects.
         foreign = {(answer + 1) % 4: "other"} if k % 3 == 0 else {}
         item = synthetic.item(
             frames,
@@ -278,16 +282,15 @@ def cases(count):
             yield item, predicates
 
 
-def test_no_number_in_any_predicate():
+def test_predicates_of_random_scenes_contain_no_number():
     for _, predicates in cases(60):
         text = json.dumps(predicates.to_dict())
         assert not any(c.isdigit() for c in text)
         assert not find_numbers(text)
 
 
-def test_differences_of_a_candidate_are_there(benchmark_store):
-    """A region or a missing object that a candidate is said to show is what its frame shows."""
-    told = 0
+def test_differences_of_candidates_agree_with_the_oracle(benchmark_store):
+    checked = 0
     for item in benchmark_store.selection():
         scene = benchmark_store.scene(item.scene_id)
         predicates = extract_predicates(item, scene, benchmark_store.scene)
@@ -296,11 +299,11 @@ def test_differences_of_a_candidate_are_there(benchmark_store):
             frame, other = named.frame, benchmark_store.scene(named.scene_id)
             right = (named.scene_id, frame) == (item.scene_id, item.target_frame)
             assert candidate.agrees == right
-            here, there = ([o.phrase for o in s.objects] for s in (scene, other))
-            assert candidate.other_objects == (set(here) != set(there))
+            names, others = ([o.phrase for o in s.objects] for s in (scene, other))
+            assert candidate.other_objects == (set(names) != set(others))
             for d in candidate.differences:
-                i = here.index(d.object) if d.object in here else None
-                j = there.index(d.object) if d.object in there else None
+                i = names.index(d.object) if d.object in names else None
+                j = others.index(d.object) if d.object in others else None
                 if d.kind == "region":
                     cell = other.image_positions[frame, j] / other.image_size * 3
                     column, row = np.clip(np.floor(cell), 0, 2).astype(int)
@@ -313,11 +316,11 @@ def test_differences_of_a_candidate_are_there(benchmark_store):
                     way = other.image_positions[frame, j]
                     way = way - scene.image_positions[item.target_frame, i]
                     assert way @ DIRECTIONS[d.heading] > 0
-                told += 1
-    assert told > 50
+                checked += 1
+    assert checked > 50
 
 
-def test_a_displaced_object_is_named_with_its_direction():
+def test_displacement_has_a_direction_and_an_extent():
     start = synthetic.on_ground((220, 160))[:2]
     scene = synthetic.scene([start, (0, -1)], [toward(start, (340, 160), 100), (0, 0)])
     item = synthetic.item((60, 80, 100, 120), answer=0)

@@ -1,4 +1,4 @@
-"""A random Qwen3 of a few hundred thousand weights with a tokenizer of its own, made offline."""
+"""A random Qwen3 with a few hundred thousand weights and its own tokenizer, made offline."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ TEMPLATE = (
 
 
 def save_tiny_qwen3(folder: Path, texts: Iterable[str], vocabulary: int = 1024) -> Path:
-    """Write a model and a tokenizer trained on `texts` as vLLM reads them."""
-    # Imported here, for few of the tests that import this file serve a model.
+    """Save a model, and a tokenizer trained on `texts`, in the format that vLLM reads."""
+    # Imported here, because few of the tests that import this file serve a model.
     import torch
     from transformers import Qwen3Config, Qwen3ForCausalLM
 
@@ -43,7 +43,7 @@ def save_tiny_qwen3(folder: Path, texts: Iterable[str], vocabulary: int = 1024) 
     )
     model = Qwen3ForCausalLM(config).to(torch.bfloat16)
     with torch.no_grad():
-        # It never ends by itself, so that every answer has the length that was asked for.
+        # The model never ends a response, so that all responses have the requested length.
         model.model.embed_tokens.weight[config.eos_token_id] = 0
     model.save_pretrained(folder)
     tokenizer.save_pretrained(folder)
