@@ -14,7 +14,8 @@ from typing import Any
 from tqdm import tqdm
 
 from data.records import FrameRef, RetrievalQuery, SelectionItem
-from evaluation.generators.response_schema import Record, parse, read_record
+from evaluation.generators.response_schema import Record, read_record
+from models.student.answer_parser import parse_choice
 from models.student.generation import GeneratedText
 
 Subject = SelectionItem | RetrievalQuery | FrameRef
@@ -64,7 +65,7 @@ Response = Answer | FreeTextResponse
 
 def score_response(item: SelectionItem, mode: str, written: GeneratedText) -> Answer:
     """What a text says to an item, and whether that is right."""
-    choice = parse(written.text, cut=written.cut)
+    choice = parse_choice(written.text, cut=written.cut)
     valid = read_record(written.text) is not None if mode in RECORD_MODES else None
     return Answer(
         item.item_id,
