@@ -70,7 +70,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     told = [tables.rank_differences_table(apart)] if apart else []
     told += [tables.index_table(indexes)] if indexes else []
     standard_test.write_ranks(run.folder, found, queries)
-    also = {"build": store.identity, "indexes": indexes, "apart": apart}
+    also = {"build": store.identity, "indexes": indexes, "differences": apart}
     standard_test.write_report(run.folder, rows, curves, told, **also)
     return {name: found.value for name, found in rows[0].measures.items() if name != "tie_rate"}
 

@@ -47,7 +47,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from evaluation.embedders.embed import embedders
     from evaluation.generators.model_source import open_generator
     from evaluation.metrics import breakdown
-    from evaluation.reporting import reference, tables
+    from evaluation.reporting import tables
     from evaluation.reporting.results import UNTRAINED
     from evaluation.retrieval import predicted_texts, standard_test, text_matching
     from models.precision import resolve_precision
@@ -84,9 +84,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     told = {mode: predicted_texts.counts(of) for mode, of in written.items()}
     reading = tables.parsing_table(told, "What was written")
     also = {"build": store.identity, "indexes": [], "texts": told}
-    standard_test.write_report(
-        run.folder, rows, curves, [reading], reference.RETRIEVAL_TWO_STAGE, **also
-    )
+    standard_test.write_report(run.folder, rows, curves, [reading], "retrieval_two_stage", **also)
     write_text(run.folder / "matched.jsonl", "".join(json.dumps(m) + "\n" for m in matched))
     return metrics
 

@@ -1,4 +1,4 @@
-"""The page's browser of items: which are shown, what is told of each, and their frames."""
+"""The items that the page shows: their choice, their frames, and the models' responses."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import base64
 import io
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,143 +16,252 @@ from tqdm import tqdm
 from conf.errors import UserError
 from data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
-from data.store import Store
-from evaluation.reporting.run_responses import Said, Scored
+from data.store import Store, open_store
+from data.tracks.controls import MATCHED_ANCHOR
+from evaluation.metrics.significance import PairedComparison
+from evaluation.reporting.comparisons import check_selection_items, compare_models
+from evaluation.reporting.figures import count_confusions
+from evaluation.reporting.measurements import Measurement, deduplicate
+from evaluation.reporting.run_responses import (
+    Responses,
+    SimilarityResponse,
+    TextResponse,
+    Variant,
+    read_responses,
+)
 
-OBSERVED = 6
-"""Frames of a prefix that are shown."""
-WIDTH = 160
-"""Of a frame, px."""
-QUALITY = 70
-"""Of WebP, from 0 to 100."""
-TEXT = 4000
-"""Characters of an answer that are shown."""
+PREFIX_FRAMES = 6
+FRAME_WIDTH = 160
+"""Pixels."""
+WEBP_QUALITY = 70
+TEXT_LIMIT = 4000
+"""Characters of a response."""
 
-Answers = Mapping[str, Mapping[str, Said | Scored]]
-"""What each model said, by its label and by item."""
+RunResponses = Mapping[Path, Mapping[Variant, Responses]]
 
 
-def spread(
-    items: Sequence[SelectionItem], answers: Answers, bound: int, seed: int
+@dataclass
+class ItemBrowser:
+    """The items of the page, and what was computed from the responses to all items.
+
+    Attributes:
+        entries: The items, as the page's script reads them.
+        frames: Data URLs of their frames by name.
+        notes: Sentences on the shown and the missing items of each benchmark.
+        confusions: Counts of `count_confusions`, by item set and model.
+        comparisons: Paired comparisons by benchmark.
+    """
+
+    entries: list[dict[str, Any]] = field(default_factory=list)
+    frames: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    confusions: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    comparisons: dict[str, list[list[PairedComparison]]] = field(default_factory=dict)
+
+
+def browse_items(
+    selections: Sequence[Measurement], stores: Path, limit: int, seed: int
+) -> ItemBrowser:
+    """At most `limit` items of each benchmark with responses.
+
+    Raises:
+        UserError: two runs measured different items of one benchmark.
+    """
+    runs = {m.run.folder: m.run for m in selections}
+    responses = {folder: read_responses(run) for folder, run in runs.items()}
+    check_selection_items(selections, [_responses_of(m, responses) or None for m in selections])
+    browser = ItemBrowser()
+    for name in dict.fromkeys(m.benchmark for m in selections):
+        answered = [
+            m
+            for m in deduplicate(selections)
+            if m.benchmark == name and _responses_of(m, responses)
+        ]
+        if not answered:
+            continue
+        try:
+            store = open_store(stores / name)
+        except UserError as error:
+            browser.notes.append(f"The items of {name} cannot be shown: {error} benchmark={name}.")
+            continue
+        if {m.run.report["build"] for m in answered} - {store.identity}:
+            # Its items can differ although their ids agree.
+            browser.notes.append(
+                f"The items of {name} cannot be shown: {store.folder} was rebuilt since the runs."
+            )
+            continue
+        _add_benchmark(browser, store, answered, responses, limit, seed)
+    return browser
+
+
+def _add_benchmark(
+    browser: ItemBrowser,
+    store: Store,
+    answered: Sequence[Measurement],
+    responses: RunResponses,
+    limit: int,
+    seed: int,
+) -> None:
+    items = {
+        i.item_id: i for suite in (None, MATCHED_ANCHOR) for i in store.selection("test", suite)
+    }
+    by_label: dict[str, Responses] = {}
+    unchanged: dict[str, tuple[Measurement, Responses]] = {}
+    for m in answered:
+        label, of_model = ", ".join([m.label, *m.variants]), _responses_of(m, responses)
+        by_label[label] = of_model
+        if not m.variants:
+            unchanged[label] = (m, of_model)
+        pairs = [(items[k].letter, r.answer.letter) for k, r in of_model.items() if k in items]
+        browser.confusions.setdefault(m.items, {})[label] = count_confusions(pairs)
+    # Controls are compared by the run that measured them.
+    if unchanged:
+        browser.comparisons[store.name] = compare_models(unchanged, items, seed)
+    known = [i for k, i in items.items() if any(k in r for r in by_label.values())]
+    shown = choose_items(known, by_label, limit, seed)
+    browser.entries += page_entries(shown, by_label, store)
+    frames, errors = encode_frames(shown, store)
+    browser.frames |= frames
+    browser.notes.append(
+        f"{store.name}: {len(shown):,} of {len(known):,} answered items, spread over subtypes and "
+        "over correct and wrong answers; items=N shows another number."
+    )
+    if errors:
+        more = f" ({len(errors) - 1:,} more scenes)" if errors[1:] else ""
+        browser.notes.append(f"Frames are missing: {errors[0]}{more}.")
+
+
+def _responses_of(m: Measurement, responses: RunResponses) -> Responses:
+    return responses.get(m.run.folder, {}).get((m.report_key, m.row.control), {})
+
+
+def choose_items(
+    items: Sequence[SelectionItem], responses: Mapping[str, Responses], limit: int, seed: int
 ) -> list[SelectionItem]:
-    """At most `bound` items that show most: each one taken has the subtypes, and in them the right
-    and the wrong answers of each model, that those before it show least of; by family and subtype.
-    `seed` chooses among items that show as much."""
+    """At most `limit` items, chosen greedily so that the subtypes, and in them the correct and the
+    wrong answers of each model, are equally frequent; by family and subtype. `seed` orders ties."""
     order = np.random.default_rng(seed).permutation(len(items))
-    waiting = {items[k].item_id: items[k] for k in order}
-    cells = {name: _cells(item, answers) for name, item in waiting.items()}
-    seen: Counter[tuple] = Counter()
+    remaining = {items[k].item_id: items[k] for k in order}
+    cells = {item_id: _cells(item, responses) for item_id, item in remaining.items()}
+    counts: Counter[tuple] = Counter()
     chosen = []
-    while waiting and len(chosen) < bound:
-        best = max(waiting, key=lambda name: sum(1 / (1 + seen[c]) for c in cells[name]))
-        seen.update(cells[best])
-        chosen.append(waiting.pop(best))
+    while remaining and len(chosen) < limit:
+        best = max(remaining, key=lambda k: sum(1 / (1 + counts[c]) for c in cells[k]))
+        counts.update(cells[best])
+        chosen.append(remaining.pop(best))
     return sorted(chosen, key=lambda item: (FAMILIES.index(item.family), item.subtype))
 
 
-def _cells(item: SelectionItem, answers: Answers) -> list[tuple]:
-    subtype = (item.family, item.subtype)
-    given = {label: said.get(item.item_id) for label, said in answers.items()}
-    return [(*subtype, label, s.choice.letter == item.letter) for label, s in given.items() if s]
+def _cells(item: SelectionItem, responses: Mapping[str, Responses]) -> list[tuple]:
+    return [
+        (item.family, item.subtype, label, r[item.item_id].answer.letter == item.letter)
+        for label, r in responses.items()
+        if item.item_id in r
+    ]
 
 
-def entries(
-    items: Sequence[SelectionItem], answers: Answers, store: Store
+def page_entries(
+    items: Sequence[SelectionItem], responses: Mapping[str, Responses], store: Store
 ) -> Iterator[dict[str, Any]]:
-    """What the page tells of each item, frames by the names that `pictures` gives them."""
+    """The page's data of each item; frames by the names of `encode_frames`."""
     for item in items:
-        shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, OBSERVED)
         yield {
             "id": item.item_id,
             "benchmark": store.name,
             "family": item.family,
             "subtype": item.subtype,
             "question": item.question,
-            "prefix": [frame_name(store, FrameRef(item.scene_id, f)) for f in shown],
+            "prefix": [_frame_name(store, frame) for frame in _prefix(item)],
             "observed": f"frames {item.prefix_start} to {item.prefix_stop} of {item.scene_id}",
             "candidates": [
                 {
                     "letter": letter,
-                    "frame": frame_name(store, c),
-                    "told": f"{c.source.replace('_', ' ')}: frame {c.frame}"
+                    "frame": _frame_name(store, c),
+                    "caption": f"{c.source.replace('_', ' ')}: frame {c.frame}"
                     + (f" of {c.scene_id}" if c.scene_id != item.scene_id else ""),
                 }
                 for letter, c in zip(LETTERS, item.candidates, strict=True)
             ],
             "answer": item.letter,
-            "truth": truth(item, store),
-            "said": [
-                _told(label, said[item.item_id], item)
-                for label, said in answers.items()
-                if item.item_id in said
+            "truth": describe_truth(item, store),
+            "responses": [
+                _response_entry(label, r[item.item_id], item)
+                for label, r in responses.items()
+                if item.item_id in r
             ],
         }
 
 
-def truth(item: SelectionItem, store: Store) -> list[str]:
-    """What the oracle has of an item, in sentences."""
+def describe_truth(item: SelectionItem, store: Store) -> list[str]:
+    """The oracle's facts on an item, in sentences."""
     scene = store.scene(item.scene_id)
-    after = item.target_frame - item.prefix_stop
-    told = [
-        f"{item.letter} is right: frame {item.target_frame}, {after} frames after the observation. "
-        f"Any two candidates differ by {item.min_displacement:.0f} px or more."
+    sentences = [
+        f"{item.letter} is correct: frame {item.target_frame}, "
+        f"{item.target_frame - item.prefix_stop} frames after the prefix. Any two candidates "
+        f"differ by {item.min_displacement:.0f} px or more."
     ]
     for collision in scene.collisions:
         if item.prefix_stop < collision.frame <= item.target_frame:
             one, other = (scene.objects[k].phrase for k in collision.objects)
-            told.append(f"The {one} and the {other} collide at frame {collision.frame}.")
-    return told
+            sentences.append(f"The {one} and the {other} collide at frame {collision.frame}.")
+    return sentences
 
 
-def _told(label: str, said: Said | Scored, item: SelectionItem) -> dict[str, Any]:
-    choice = said.choice
-    text = said.text
-    if len(text) > TEXT:
-        text = f"{text[:TEXT]}… (the first {TEXT:,} of {len(text):,} characters; the run's "
-        text += "answers.jsonl has the others)"
-    verdict = (
-        "unread" if choice.letter is None else ["wrong", "right"][choice.letter == item.letter]
-    )
-    reason = str(choice.reason) if choice.letter is None and choice.reason else None
+def _response_entry(
+    label: str, response: TextResponse | SimilarityResponse, item: SelectionItem
+) -> dict[str, Any]:
+    answer, text = response.answer, response.text
+    if len(text) > TEXT_LIMIT:
+        text = (
+            f"{text[:TEXT_LIMIT]}… (the first {TEXT_LIMIT:,} of {len(text):,} characters; the "
+            "run's answers.jsonl has all of them)"
+        )
+    if answer.letter is None:
+        verdict, reason = "unparsed", answer.reason and str(answer.reason)
+    else:
+        verdict, reason = "correct" if answer.letter == item.letter else "wrong", None
     return {
-        "by": label, "letter": choice.letter, "verdict": verdict, "reason": reason, "text": text,
-        "cut": said.cut,
+        "model": label, "letter": answer.letter, "verdict": verdict, "reason": reason,
+        "text": text, "truncated": response.truncated,
     }  # fmt: skip
 
 
-def frame_name(store: Store, frame: FrameRef) -> str:
+def _prefix(item: SelectionItem) -> list[FrameRef]:
+    frames = sample_prefix_frames(item.prefix_start, item.prefix_stop, PREFIX_FRAMES)
+    return [FrameRef(item.scene_id, frame) for frame in frames]
+
+
+def _frame_name(store: Store, frame: FrameRef) -> str:
     return f"{store.name}/{frame.scene_id}/{frame.frame}"
 
 
-def pictures(items: Sequence[SelectionItem], store: Store) -> tuple[dict[str, str], list[str]]:
-    """Every frame of the items once, as WebP data of `WIDTH` px; and of scenes whose frames are
-    gone why, in a sentence each."""
+def encode_frames(items: Sequence[SelectionItem], store: Store) -> tuple[dict[str, str], list[str]]:
+    """The frames of the items as WebP data URLs by name, and a sentence for each scene whose frames
+    cannot be read."""
     wanted: dict[str, set[int]] = {}
     for item in items:
-        prefix = sample_prefix_frames(item.prefix_start, item.prefix_stop, OBSERVED)
-        wanted.setdefault(item.scene_id, set()).update(prefix)
-        for c in item.candidates:
-            wanted.setdefault(c.scene_id, set()).add(c.frame)
-    frames, found, gone = FrameReader(store), {}, []
+        for frame in (*_prefix(item), *item.candidates):
+            wanted.setdefault(frame.scene_id, set()).add(frame.frame)
+    reader, frames, errors = FrameReader(store), {}, []
     for scene_id, indices in tqdm(wanted.items(), desc=f"frames of {store.name}", unit="scene"):
         ordered = sorted(indices)
         try:
-            stack = frames.stack(scene_id, ordered)
+            stack = reader.stack(scene_id, ordered)
         except (UserError, OSError) as error:
-            gone.append(str(error))
+            errors.append(str(error))
             continue
         for index, pixels in zip(ordered, stack, strict=True):
-            found[frame_name(store, FrameRef(scene_id, index))] = webp(pixels)
-    return found, gone
+            frames[_frame_name(store, FrameRef(scene_id, index))] = encode_webp(pixels)
+    return frames, errors
 
 
-def webp(pixels: np.ndarray) -> str:
-    """(height, width, 3) uint8 as a data address of an image of `WIDTH` px."""
+def encode_webp(pixels: np.ndarray) -> str:
+    """(height, width, 3) uint8 as the data URL of an image of `FRAME_WIDTH` pixels."""
     from PIL import Image
 
     height, width = pixels.shape[:2]
-    size = (WIDTH, round(height * WIDTH / width))
-    target = io.BytesIO()
+    size = (FRAME_WIDTH, round(height * FRAME_WIDTH / width))
+    buffer = io.BytesIO()
     image = Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS)
-    image.save(target, "WEBP", quality=QUALITY, method=6)
-    return f"data:image/webp;base64,{base64.b64encode(target.getvalue()).decode()}"
+    image.save(buffer, "WEBP", quality=WEBP_QUALITY, method=6)
+    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -1,49 +1,64 @@
-"""The rows of measured models, each with what its table needs of the run that it stands in."""
+"""The rows of all runs' reports, each with what the report needs of its run."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from evaluation.reporting.results import UNTRAINED, RetrievalResult, SelectionResult
-from evaluation.reporting.runs import CHOICES, RANKINGS, Finished, training_of, unreadable
+from evaluation.reporting.runs import (
+    RETRIEVAL_KINDS,
+    SELECTION_KINDS,
+    FinishedRun,
+    reading,
+    training_settings,
+)
 
-SUITES = {"movi_a": "MoVi-A", "physion": "Physion"}
+TRANSFER_SUITES = {"movi_a": "MoVi-A", "physion": "Physion"}
 """The paper's transfer suites by their simulator."""
+REGIMES = {
+    "answer_only": "answer-only",
+    "cot": "full student",
+    "cot_no_candidate_analysis": "- candidate analysis",
+    "cot_no_match_layout": "- match layout",
+}
+"""The paper's names of the training regimes."""
+ABLATED_REGIMES = ("cot_no_candidate_analysis", "cot_no_match_layout")
+"""The regimes without a part of the rationale."""
 
 
 @dataclass(frozen=True)
-class Measured:
-    """A row with what its table needs of the run that it stands in.
+class Measurement:
+    """A row of a run's report, with its run.
 
-    `training` holds the settings that the model was trained by, None for one as it was released,
-    and nothing where they are not known. `reported` is the name that the run's report gives the
-    model, where the row's is another.
+    Attributes:
+        training: Settings of the training run; None for a released model, empty if unknown.
+        reported_name: The model's name in the run's report, if the row's name is another.
     """
 
     row: SelectionResult | RetrievalResult
-    run: Finished
+    run: FinishedRun
     training: dict[str, Any] | None = None
-    reported: str | None = None
+    reported_name: str | None = None
 
     @property
     def benchmark(self) -> str:
         return self.row.benchmark
 
     @property
-    def ways(self) -> list[str]:
-        """How its items were chosen and shown, where that is not all of them as they are."""
+    def variants(self) -> list[str]:
+        """The suite and the control of its items; empty for the benchmark's unchanged items."""
         if isinstance(self.row, RetrievalResult):
             return []
-        return [way for way in (self.row.suite, self.row.control) if way is not None]
+        return [variant for variant in (self.row.suite, self.row.control) if variant is not None]
 
     @property
     def items(self) -> str:
-        """What its items are called, those of the whole benchmark by its name."""
-        return ", ".join([self.benchmark, *self.ways])
+        """The name of its item set: the benchmark and the variants."""
+        return ", ".join([self.benchmark, *self.variants])
 
     @property
     def trained(self) -> bool:
@@ -51,142 +66,139 @@ class Measured:
 
     @property
     def regime(self) -> str | None:
-        """How a student was trained."""
         return (self.training or {}).get("train", {}).get("regime")
 
     @property
     def home(self) -> str | None:
-        """The benchmark that the model was trained on, where that is known."""
+        """The benchmark that the model was trained on, if known."""
         return (self.training or {}).get("benchmark", {}).get("name")
 
     @property
     def seed(self) -> int | None:
-        """That of the training."""
+        """The seed of the training."""
         return (self.training or {}).get("seed")
 
     @property
     def base(self) -> str | None:
-        """What a student began from, or is as it was released."""
+        """The base of a student, or the released model itself."""
         settings = self.training if self.trained else self.run.config
         return settings.get("student", {}).get("name")
 
     @property
     def model(self) -> str:
-        """What the run's report calls the model."""
-        return self.reported or self.row.name
+        """The model's name in the run's report."""
+        return self.reported_name or self.row.name
 
     @property
     def label(self) -> str:
         return f"{self.row.name} ({self.row.mode})"
 
     @property
-    def known_by(self) -> str:
-        """What the run of a selection row knows it by: the mode in which its one model was asked,
-        or which of its embedders chose."""
+    def report_key(self) -> str:
+        """The key of a selection row's details in its report: the mode, or the embedder's name."""
         return self.model if self.run.kind == "similarity" else self.row.mode
-
-    def told(self, kind: str) -> Any:
-        """What else the run reports of a selection row's model, such as its subtypes."""
-        return self.run.report.get(kind, {}).get(self.known_by)
 
     @property
     def column(self) -> str:
-        """What a column of this benchmark is called."""
-        return SUITES.get(self._benchmark.get("simulator"), self.benchmark)
+        """The heading of this benchmark's column."""
+        simulator = self.run.config.get("benchmark", {}).get("simulator")
+        return TRANSFER_SUITES.get(simulator, self.benchmark)
 
     @property
-    def is_of_suite(self) -> bool:
-        """Whether its items are of a transfer suite, or of scenes that stand in for one."""
-        told = self._benchmark
-        return told.get("simulator") in SUITES or told.get("standin") in SUITES
-
-    @property
-    def _benchmark(self) -> dict[str, Any]:
-        return self.run.config.get("benchmark", {})
+    def is_transfer_suite(self) -> bool:
+        """Whether its items are of a transfer suite or of its stand-in."""
+        benchmark = self.run.config.get("benchmark", {})
+        return bool({benchmark.get("simulator"), benchmark.get("standin")} & {*TRANSFER_SUITES})
 
 
-def read_rows(runs: Sequence[Finished], root: Path) -> tuple[list[Measured], list[Measured]]:
+def read_measurements(
+    runs: Sequence[FinishedRun], root: Path
+) -> tuple[list[Measurement], list[Measurement]]:
     """The selection and the retrieval rows of runs below `root`.
 
     Raises:
-        UserError: a report is of another version.
+        UserError: a report is damaged or of another version.
     """
-    choices = [m for run in runs if run.kind in CHOICES for m in _rows(run, root, SelectionResult)]
-    ranks = [m for run in runs if run.kind in RANKINGS for m in _rows(run, root, RetrievalResult)]
-    return choices, ranks
+    kinds = ((SELECTION_KINDS, SelectionResult), (RETRIEVAL_KINDS, RetrievalResult))
+    selections, retrievals = (
+        [m for run in runs if run.kind in names for m in _read_rows(run, root, row_type)]
+        for names, row_type in kinds
+    )
+    return selections, retrievals
 
 
-def _rows(
-    run: Finished, root: Path, kind: type[SelectionResult] | type[RetrievalResult]
-) -> list[Measured]:
-    training = training_of(run, root)
-    try:
-        rows = [kind.from_dict(row) for row in run.report["rows"]]
-    except (KeyError, TypeError) as error:
-        raise unreadable(run.folder) from error
-    # A trained retriever's report has a row of what it began from, too.
-    return [
-        Measured(row, run, None if row.name.startswith(UNTRAINED) else training) for row in rows
-    ]
+def _read_rows(
+    run: FinishedRun, root: Path, row_type: type[SelectionResult] | type[RetrievalResult]
+) -> Iterator[Measurement]:
+    training = training_settings(run, root)
+    with reading(run.folder):
+        rows = [row_type.from_dict(row) for row in run.report["rows"]]
+    for row in rows:
+        # A trained retriever's report also has rows of its untrained base.
+        yield Measurement(row, run, None if row.name.startswith(UNTRAINED) else training)
 
 
-def once(rows: Iterable[Measured]) -> list[Measured]:
-    """Each row once, for a released model's stands in the reports of several trained from it; and
-    what runs measured otherwise under one name, each with its run's name."""
-    kept: list[Measured] = []
+def deduplicate(rows: Iterable[Measurement]) -> list[Measurement]:
+    """Each row once: the reports of several retrievers repeat the row of their common base.
+
+    Different rows of one name get the names of their runs.
+    """
+    kept: list[Measurement] = []
     for m in rows:
         if all(m.row != other.row for other in kept):
             kept.append(m)
-    called = Counter(_place(m) for m in kept)
-    return [_with_run(m) if called[_place(m)] > 1 else m for m in kept]
+    counts = Counter(map(_line, kept))
+    return [_name_run(m) if counts[_line(m)] > 1 else m for m in kept]
 
 
-def _place(m: Measured) -> tuple:
-    """What tells a row from others of a table."""
+def _line(m: Measurement) -> tuple:
+    """The line of a table that the row belongs to."""
     row = m.row
-    how = row.mode if isinstance(row, SelectionResult) else (row.width, row.builder)
-    return m.run.kind, m.items, row.name, how
+    variant = row.mode if isinstance(row, SelectionResult) else (row.width, row.builder)
+    return m.run.kind, m.items, row.name, variant
 
 
-def _with_run(m: Measured) -> Measured:
+def _name_run(m: Measurement) -> Measurement:
     row = replace(m.row, name=f"{m.row.name}, {m.run.name}")
-    return replace(m, row=row, reported=m.row.name)
+    return replace(m, row=row, reported_name=m.row.name)
 
 
-def model_names(rows: Sequence[Measured]) -> list[str]:
-    """Of each row what its line is called where a line is a model on several benchmarks: the model;
-    what was measured again on the same items has its run's name."""
-    taken: set[tuple[str, str, str]] = set()
+def model_names(rows: Sequence[Measurement]) -> list[str]:
+    """A name for each row such that the rows of one model on several benchmarks share it; a second
+    row on the same items keeps the name with its run."""
+    used: set[tuple[str, str, str]] = set()
     names = []
     for m in rows:
         cell = (m.model, m.row.mode, m.items)
-        names.append(m.row.name if cell in taken else m.model)
-        taken.add(cell)
+        names.append(m.row.name if cell in used else m.model)
+        used.add(cell)
     return names
 
 
-def by_items(rows: Iterable[Measured]) -> dict[str, list[Measured]]:
-    """What is measured on other items never stands in one table."""
-    found: dict[str, list[Measured]] = {}
+def group_by_items(rows: Iterable[Measurement]) -> dict[str, list[Measurement]]:
+    """The rows by their item set: rows on different items never share a table."""
+    groups: dict[str, list[Measurement]] = {}
     for m in rows:
-        found.setdefault(m.items, []).append(m)
-    return found
+        groups.setdefault(m.items, []).append(m)
+    return groups
 
 
-def transfers(rows: Sequence[Measured]) -> set[str]:
-    """The benchmarks where no model was trained, which are or stand in for the paper's transfer
-    suites, or on which models are measured that were trained elsewhere."""
+def transfer_benchmarks(rows: Sequence[Measurement]) -> set[str]:
+    """Benchmarks that no model was trained on and that are transfer suites, or on which models are
+    measured that were trained on another benchmark."""
     homes = {m.home for m in rows if m.home}
-    return {m.benchmark for m in rows if m.is_of_suite or m.home not in (None, m.benchmark)} - homes
+    return {
+        m.benchmark for m in rows if m.is_transfer_suite or m.home not in (None, m.benchmark)
+    } - homes
 
 
-def widest(rows: Sequence[Measured]) -> list[Measured]:
-    """The rows over all queries, of each run's model that of its largest width alone."""
-    best: dict[tuple[Path, str], Measured] = {}
+def widest_rows(rows: Sequence[Measurement]) -> list[Measurement]:
+    """The rows over all queries at the largest width of each run's model."""
+    widest: dict[tuple[Path, str], Measurement] = {}
     for m in rows:
         key = (m.run.folder, m.row.name)
         if m.row.builder is None and (
-            key not in best or (m.row.width or 0) > (best[key].row.width or 0)
+            key not in widest or (m.row.width or 0) > (widest[key].row.width or 0)
         ):
-            best[key] = m
-    return list(best.values())
+            widest[key] = m
+    return list(widest.values())

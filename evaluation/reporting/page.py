@@ -1,8 +1,9 @@
-"""The report as one file that opens without a network: tables, figures, and a browser of items."""
+"""The report as one HTML file that needs no network: tables, figures, and a browser of items."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -12,39 +13,57 @@ import jinja2
 from markupsafe import Markup
 
 from conf.runs import write_text
-from evaluation.reporting.checks import Browser
-from evaluation.reporting.plots import inlined
+from evaluation.reporting.figures import FAINT, GRID, INK
+from evaluation.reporting.item_browser import ItemBrowser
 from evaluation.reporting.sections import Section
+from evaluation.reporting.table import Best
 
-STYLE, SCRIPT = "page.css", "page.js"
+PAGE_COLORS = {
+    "#ffffff": "var(--card)",
+    "#000000": "currentColor",
+    INK: "currentColor",
+    FAINT: "var(--soft)",
+    GRID: "var(--line)",
+}
+"""Colors of a figure that follow the page's light or dark theme."""
 
 
 def write_page(
-    path: Path, sections: Sequence[Section], browser: Browser, runs: Sequence[str]
+    path: Path, sections: Sequence[Section], browser: ItemBrowser, runs: Sequence[str]
 ) -> None:
-    """Write the page whole or not at all; `runs` are the names of those that it is over."""
-    loader = jinja2.PackageLoader("evaluation.reporting")
+    """Write the page atomically. `runs` are the names of the runs that it covers."""
     environment = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True,
+        loader=jinja2.PackageLoader("evaluation.reporting"), autoescape=True,
+        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    folder = files("evaluation.reporting") / "templates"
-    drawn = [figure for section in sections for figure in section.figures]
-    pictures = {f.path: Markup(inlined(f.path, k)) for k, f in enumerate(drawn)}
+    environment.tests["best"] = lambda cell: isinstance(cell, Best)
+    templates = files("evaluation.reporting") / "templates"
+    figures = [figure for section in sections for figure in section.figures]
     page = environment.get_template("page.html").render(
         sections=sections,
-        pictures=pictures,
+        svgs={f.path: Markup(inline_svg(f.path, k)) for k, f in enumerate(figures)},
         runs=runs,
         notes=browser.notes,
         has_items=bool(browser.entries),
-        data=embedded({"items": browser.entries, "frames": browser.frames}),
-        style=Markup((folder / STYLE).read_text(encoding="utf-8")),
-        script=Markup((folder / SCRIPT).read_text(encoding="utf-8")),
+        data=script_json({"items": browser.entries, "frames": browser.frames}),
+        style=Markup((templates / "page.css").read_text(encoding="utf-8")),
+        script=Markup((templates / "page.js").read_text(encoding="utf-8")),
     )
     write_text(path, page)
 
 
-def embedded(value: Any) -> Markup:
-    """JSON inside a script element, which nothing in it can close."""
+def script_json(value: Any) -> Markup:
+    """JSON for a script element; no text in it can close the element."""
     text = json.dumps(value, ensure_ascii=False, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c").replace("\u2028", "\\u2028"))
+
+
+def inline_svg(path: Path, number: int) -> str:
+    """An SVG file as an element in the page's colors; `number` makes its ids unique."""
+    svg = path.read_text(encoding="utf-8")
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>f{number}-", svg)
+    for color, page_color in PAGE_COLORS.items():
+        svg = svg.replace(color, page_color)
+    return svg

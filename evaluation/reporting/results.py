@@ -1,4 +1,4 @@
-"""What models, retrievers and pipelines measured, as reports keep it."""
+"""The rows of an evaluation's report.json: selection accuracies and retrieval measures."""
 
 from __future__ import annotations
 
@@ -9,25 +9,28 @@ from evaluation.metrics.accuracy import Accuracy
 from evaluation.metrics.intervals import Interval
 
 RECALLS = (1, 10, 50)
-"""Cut-offs that the retrieval rows report."""
+"""Cut-offs of the reported recalls."""
 MEASURES = ("mrr", "median_rank", "tie_rate")
-"""What they report besides."""
+"""Retrieval measures besides the recalls."""
 UNTRAINED = "untrained"
-"""What the names of rows begin with that a trained retriever is held against."""
-
+"""Prefix of the names of retrievers without adapters."""
 SIMILARITY = "similarity"
 """The mode of a retriever that chooses the nearest candidate."""
 
 
 @dataclass(frozen=True)
 class SelectionResult:
-    """One model on one benchmark's selection items, in shares. What could not be parsed counts as
-    wrong.
+    """Accuracy of one model on the selection items of one benchmark, in shares.
 
-    `mode` says how it was asked, such as answer, reasoning or similarity; `parse_rate` is None
-    where nothing is parsed; `n` is the number of items. `horizons` are the time items by their
-    distance, "1 s" and "2 s"; the interval of `macro` is drawn over scenes. `suite` and `control`
-    are those of `SelectCommand`, None where all items were shown as they are.
+    Answers that cannot be parsed count as wrong.
+
+    Attributes:
+        mode: How the model was prompted, such as answer or reasoning, or similarity.
+        parse_rate: Share of parsed answers; None for a retriever.
+        n: Number of items.
+        macro_interval: 95% interval of `macro`, bootstrapped over scenes.
+        horizons: Accuracy on time items by their horizon, "1 s" and "2 s".
+        suite, control: As in `SelectCommand`; None for the benchmark's own items, unchanged.
     """
 
     benchmark: str
@@ -49,36 +52,43 @@ class SelectionResult:
         benchmark: str,
         name: str,
         mode: str,
-        found: Accuracy,
+        accuracy: Accuracy,
         parse_rate: float | None,
         macro_interval: Interval | None = None,
         horizons: dict[str, Interval] | None = None,
         suite: str | None = None,
         control: str | None = None,
     ) -> SelectionResult:
-        shares = (found.families, found.macro, found.micro, parse_rate)
-        told = (macro_interval, horizons or {}, suite, control)
-        return cls(benchmark, name, mode, *shares, found.micro.n, *told)
+        shares = (accuracy.families, accuracy.macro, accuracy.micro, parse_rate)
+        optional = (macro_interval, horizons or {}, suite, control)
+        return cls(benchmark, name, mode, *shares, accuracy.micro.n, *optional)
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
 
     @classmethod
     def from_dict(cls, row: dict[str, Any]) -> SelectionResult:
-        families = {name: Interval(**found) for name, found in row["families"].items()}
-        horizons = {name: Interval(**found) for name, found in row.get("horizons", {}).items()}
-        macro = row.get("macro_interval")
-        whole = {"micro": Interval(**row["micro"]), "macro_interval": macro and Interval(**macro)}
-        return cls(**{**row, "families": families, "horizons": horizons, **whole})
+        macro = row["macro_interval"]
+        intervals = {
+            "families": {name: Interval(**share) for name, share in row["families"].items()},
+            "horizons": {name: Interval(**share) for name, share in row["horizons"].items()},
+            "micro": Interval(**row["micro"]),
+            "macro_interval": macro and Interval(**macro),
+        }
+        return cls(**{**row, **intervals})
 
 
 @dataclass(frozen=True)
 class RetrievalResult:
-    """One retriever at one width (None for a pipeline without widths) on the queries of one builder
-    (None for all of them), recalls in shares. Intervals are drawn over scenes. `bytes` and
-    `seconds` are those of `evaluation.retrieval.exact_search.Ranks`; rows that differ in the time
-    alone are
-    equal."""
+    """Measures of one retriever at one width, with intervals bootstrapped over scenes.
+
+    Results that differ only in their time are equal.
+
+    Attributes:
+        width: Embedding width; None for a pipeline without widths.
+        builder: The queries' builder; None for all queries.
+        bytes, seconds: Cost of the search, as in `evaluation.retrieval.exact_search.Ranks`.
+    """
 
     benchmark: str
     name: str
@@ -101,7 +111,7 @@ class RetrievalResult:
 
     @property
     def measures(self) -> dict[str, Interval]:
-        """By the names that `evaluation.metrics.accuracy` gives them."""
+        """The measures by the names of `evaluation.metrics.ranking`."""
         recalls = {f"recall@{k}": getattr(self, f"recall_{k}") for k in RECALLS}
         return {**recalls, **{name: getattr(self, name) for name in MEASURES}}
 

@@ -1,9 +1,10 @@
-"""The runs that a report is over, read from their folders."""
+"""The finished runs that a report covers, read from their folders."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -15,129 +16,161 @@ from yaml import YAMLError
 
 from conf.errors import UserError
 
-CHOICES, RANKINGS = ("select", "similarity"), ("retrieve", "two_stage")
-STUDIES, TRAININGS = ("export_study",), ("sft", "contrastive")
-KINDS = (*CHOICES, *RANKINGS, *STUDIES, *TRAININGS)
-"""Folders below checkpoints/ that hold runs of which a report tells."""
+SELECTION_KINDS, RETRIEVAL_KINDS = ("select", "similarity"), ("retrieve", "two_stage")
+STUDY_KINDS, TRAINING_KINDS = ("export_study",), ("sft", "contrastive")
+KINDS = (*SELECTION_KINDS, *RETRIEVAL_KINDS, *STUDY_KINDS, *TRAINING_KINDS)
+"""Folders below checkpoints/ with runs that a report covers."""
 
 
 @dataclass(frozen=True)
-class Finished:
-    """A finished run: its folder, the command's folder that it is in (`kind`), its settings, its
-    report.json, which a training run has none of, and when it was first started."""
+class FinishedRun:
+    """A finished run.
+
+    Attributes:
+        kind: The folder of its command, such as select.
+        config: Its settings.
+        report: Its report.json; empty for a training run.
+        started: When it was first started, in ISO format.
+    """
 
     folder: Path
     kind: str
     name: str
     config: dict[str, Any]
     report: dict[str, Any]
-    began: str
+    started: str
 
 
-def gather(root: Path, patterns: Sequence[str] | None) -> list[Finished]:
-    """The finished runs below `root` that a pattern, such as select/*, names; all where it is null.
-    Oldest first.
+def gather_runs(root: Path, patterns: Sequence[str] | None) -> list[FinishedRun]:
+    """The finished runs below `root`, oldest first.
+
+    Args:
+        patterns: Folders or patterns of folders below `root`, such as select/*; None for all.
 
     Raises:
         UserError: nothing is measured, a pattern names no run, or a run cannot be read.
     """
-    found = [run for kind in KINDS for run in _runs(root, kind)]
+    finished = [
+        path.parent
+        for kind in KINDS
+        # A sweep's jobs are one folder deeper.
+        for path in sorted([*root.glob(f"{kind}/*/metrics.json"),
+                            *root.glob(f"{kind}/*/*/metrics.json")])
+    ]  # fmt: skip
+    folders = finished
     if patterns is not None:
-        found = [run for pattern in patterns for run in _named(root, pattern, found)]
-    runs = [_read(root, folder) for folder in dict.fromkeys(found)]
-    if all(run.kind in TRAININGS for run in runs):
+        folders = [folder for p in patterns for folder in _match(root, p, finished)]
+    runs = [_read_run(root, folder) for folder in dict.fromkeys(folders)]
+    if all(run.kind in TRAINING_KINDS for run in runs):
         raise UserError(
-            f"nothing is measured below {root}: run python -m evaluation.select "
+            f"no evaluation has finished below {root}: run python -m evaluation.select "
             "model=checkpoints/sft/RUN or python -m evaluation.retrieve "
-            "model=checkpoints/contrastive/RUN first"
+            "model=checkpoints/contrastive/RUN first",
+            code="missing-run",
         )
-    return sorted(runs, key=lambda run: (run.began, run.kind, run.name))
+    return sorted(runs, key=lambda run: (run.started, run.kind, run.name))
 
 
-def _runs(root: Path, kind: str) -> list[Path]:
-    """A command's finished runs, a sweep's jobs among them."""
-    done = [*root.glob(f"{kind}/*/metrics.json"), *root.glob(f"{kind}/*/*/metrics.json")]
-    return [path.parent for path in sorted(done)]
-
-
-def _named(root: Path, pattern: str, finished: Sequence[Path]) -> list[Path]:
-    """The runs that a pattern names, which are looked for among the `finished` ones."""
+def _match(root: Path, pattern: str, finished: Sequence[Path]) -> list[Path]:
+    """The `finished` runs that a pattern names."""
     pattern = pattern.strip("/").removeprefix(f"{root.as_posix().strip('/')}/")
     try:
         folders = [path for path in root.glob(pattern) if path.is_dir()]
     except (ValueError, NotImplementedError) as error:
         raise UserError(
-            f"runs: {pattern} is no pattern of folders below {root}: {error}"
+            f"runs: {pattern} is not a valid pattern of folders below {root}: {error}",
+            code="invalid-setting",
         ) from error
-    chosen = [path for path in folders if path in finished]
-    if chosen:
-        return sorted(chosen)
+    if matched := [path for path in folders if path in finished]:
+        return sorted(matched)
     if folders:
         kind, *name = folders[0].relative_to(root).parts
         if kind == "study" and name:
             raise UserError(
-                f"runs: {folders[0]} is a study, whose votes are reported once they are counted: "
-                f"run python -m evaluation.study.export run={'/'.join(name)}, and name its run "
-                f"below {root / 'export_study'}"
+                f"runs: {folders[0]} is a study: export its votes with python -m "
+                f"evaluation.study.export run={'/'.join(name)}, and name that run below "
+                f"{root / 'export_study'}",
+                code="unfinished-run",
             )
         raise UserError(
-            f"runs: {folders[0]} is no finished run of an evaluation or of training: run its "
-            "command again to go on with it, or name another one"
+            f"runs: {folders[0]} is not a finished run of an evaluation or a training: run its "
+            "command again, which resumes it, or name another run",
+            code="unfinished-run",
         )
-    there = [path.relative_to(root).as_posix() for path in finished]
-    near = get_close_matches(pattern, there, 3, 0.3) or there[:3]
-    told = f"; there are {', '.join(near)}" if near else ""
-    raise UserError(f"runs: {pattern} names no run below {root}{told}")
+    names = [path.relative_to(root).as_posix() for path in finished]
+    similar = get_close_matches(pattern, names, 3, 0.3) or names[:3]
+    hint = f"; existing runs: {', '.join(similar)}" if similar else ""
+    raise UserError(f"runs: {pattern} matches no run below {root}{hint}", code="missing-run")
 
 
-def _read(root: Path, folder: Path) -> Finished:
+def _read_run(root: Path, folder: Path) -> FinishedRun:
     kind, *name = folder.relative_to(root).parts
-    if not (folder / "config.yaml").exists():
-        raise UserError(
-            f"{folder / 'config.yaml'} is missing, so nobody knows what {folder} measured: delete "
-            "that folder and measure again, or leave it out with runs=[...]"
-        )
-    settings = _settings(folder / "config.yaml", f"delete {folder} and measure again")
-    report = {} if kind in TRAININGS else _report(folder)
-    return Finished(folder, kind, "/".join(name), settings, report, _began(folder))
-
-
-def _began(folder: Path) -> str:
-    try:
+    config, report = read_settings(folder, "measure again"), {}
+    with reading(folder, "run.json"):
         record = json.loads((folder / "run.json").read_text())
-        return min(str(at) for at in [record["started"], *record["earlier_starts"]])
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise unreadable(folder, "run.json") from error
+        started = min(map(str, [record["started"], *record["earlier_starts"]]))
+    if kind not in TRAINING_KINDS:
+        with reading(folder):
+            report = dict(json.loads((folder / "report.json").read_text()))
+    return FinishedRun(folder, kind, "/".join(name), config, report, started)
 
 
-def _settings(config: Path, mend: str) -> dict[str, Any]:
+def read_settings(folder: Path, remedy: str) -> dict[str, Any]:
+    """A run's config.yaml.
+
+    Raises:
+        UserError: it is missing or damaged; `remedy` says what to do once it is deleted.
+    """
+    path = folder / "config.yaml"
     try:
-        settings = OmegaConf.to_container(OmegaConf.load(config))
+        settings = OmegaConf.to_container(OmegaConf.load(path))
         if not isinstance(settings, dict):
-            raise YAMLError("it holds no settings")
-    except (YAMLError, OmegaConfBaseException) as error:
-        raise UserError(f"{config} is damaged: {mend}") from error
+            raise YAMLError("no settings")
+    except (OSError, YAMLError, OmegaConfBaseException) as error:
+        raise UserError(
+            f"{path} is missing or damaged: delete {folder} and {remedy}, or leave the run out "
+            "with runs=[...]",
+            code="damaged-file",
+        ) from error
     return settings
 
 
-def _report(folder: Path) -> dict[str, Any]:
+def training_settings(run: FinishedRun, root: Path) -> dict[str, Any] | None:
+    """The settings by which the model of an evaluation, or else its matcher, was trained.
+
+    Returns:
+        None for a released model, and an empty dictionary if the training folder is gone.
+
+    Raises:
+        UserError: the settings cannot be read.
+    """
+    model = run.config.get("model") or (run.config.get("matcher") or {}).get("model")
+    if model is None:
+        return None
+    with reading(run.folder, "config.yaml"):
+        path = Path(model)
+    # If the runs have moved, or the report runs in another folder, the model is below `root`.
+    for folder in (path, root / Path(*path.parts[1:])):
+        if (folder / "config.yaml").is_file():
+            return read_settings(folder, "train again")
+    return {}
+
+
+@contextmanager
+def reading(folder: Path, file: str = "report.json") -> Iterator[None]:
+    """Report any failure to read or to interpret a file of a run as a UserError that names it."""
     try:
-        found = json.loads((folder / "report.json").read_text())
-        return dict(found)
-    except (OSError, ValueError, TypeError) as error:
-        raise unreadable(folder) from error
-
-
-def unreadable(folder: Path, file: str = "report.json") -> UserError:
-    return UserError(
-        f"{folder / file} is missing, damaged or of another version: delete {folder} "
-        "and measure again"
-    )
+        yield
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{folder / file} is missing, damaged or of another version: delete {folder} and "
+            "measure again",
+            code="damaged-file",
+        ) from error
 
 
 def json_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """The objects in a file of JSON lines, none where it is missing; lines that a kill tore are
-    passed over."""
+    """The objects in a file of JSON lines, none if it is missing; torn lines are skipped."""
     if not path.exists():
         return
     with open(path, encoding="utf-8", errors="replace") as file:
@@ -148,22 +181,3 @@ def json_lines(path: Path) -> Iterator[dict[str, Any]]:
                 continue
             if isinstance(row, dict):
                 yield row
-
-
-def training_of(run: Finished, root: Path) -> dict[str, Any] | None:
-    """The settings that the model of an evaluation was trained by, or else its matcher; None where
-    both are as they were released, and empty where the folder is gone.
-
-    Raises:
-        UserError: they cannot be read.
-    """
-    model = run.config.get("model") or (run.config.get("matcher") or {}).get("model")
-    if model is None:
-        return None
-    if not isinstance(model, str):
-        raise unreadable(run.folder, "config.yaml")
-    # Where the runs were moved, or are reported from another folder, it is below `root`.
-    for folder in (Path(model), root / Path(*Path(model).parts[1:])):
-        if (folder / "config.yaml").is_file():
-            return _settings(folder / "config.yaml", "train again")
-    return {}

@@ -1,33 +1,45 @@
-"""What the report tells, section by section: tables in the paper's shape and figures, out of
-finished runs."""
+"""The sections of the report: tables in the paper's shape, and figures."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
 from evaluation.metrics.calibration import Calibration, PositionBias
 from evaluation.metrics.intervals import Interval
 from evaluation.metrics.significance import PairedComparison
-from evaluation.reporting import figures, plots, tables
-from evaluation.reporting import paper_tables as shaped
-from evaluation.reporting import reference as paper
-from evaluation.reporting.measurements import Measured, by_items, model_names, transfers, widest
-from evaluation.reporting.paper_tables import ABLATED, REGIMES
-from evaluation.reporting.runs import STUDIES, TRAININGS, Finished, json_lines, unreadable
+from evaluation.reporting import figures, summary_tables, tables
+from evaluation.reporting.item_browser import ItemBrowser
+from evaluation.reporting.measurements import (
+    ABLATED_REGIMES,
+    REGIMES,
+    Measurement,
+    group_by_items,
+    model_names,
+    transfer_benchmarks,
+    widest_rows,
+)
+from evaluation.reporting.runs import (
+    STUDY_KINDS,
+    TRAINING_KINDS,
+    FinishedRun,
+    json_lines,
+    reading,
+)
 from evaluation.reporting.table import Table
 from train.common.curves import curves_figure
+
+Rows = Sequence[Measurement]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawn figure in an SVG file, and what it shows."""
+    """An SVG file and its caption."""
 
     path: Path
     caption: str
@@ -35,8 +47,7 @@ class Figure:
 
 @dataclass
 class Section:
-    """A part of the report. `details` are tables that the page folds away and that the text leaves
-    out."""
+    """A part of the report. `details` are tables that the page folds and the text leaves out."""
 
     title: str
     tables: list[Table] = field(default_factory=list)
@@ -44,258 +55,250 @@ class Section:
     details: list[Table] = field(default_factory=list)
 
 
-def sections_of(
-    choices: Sequence[Measured],
-    ranks: Sequence[Measured],
-    runs: Sequence[Finished],
-    confusions: Mapping[str, Mapping[str, np.ndarray]],
-    apart: Mapping[str, Sequence[Sequence[PairedComparison]]],
+def build_sections(
+    selections: Rows,
+    retrievals: Rows,
+    runs: Sequence[FinishedRun],
+    browser: ItemBrowser,
     folder: Path,
 ) -> list[Section]:
-    """Every section that has a table, in the paper's order.
+    """The sections that have content, in the paper's order. Figures are written into `folder`.
 
     Args:
-        choices, ranks: the selection and the retrieval rows of `runs`.
-        confusions: by benchmark and model, as `plots.confusion` counts.
-        apart: by benchmark, what pairs of models are apart.
-        folder: where figures are drawn.
+        selections, retrievals: The rows of `runs`.
+
+    Raises:
+        UserError: a report is damaged or of another version.
     """
-    plain = [m for m in choices if not m.ways]
-    every = [m for m in ranks if m.row.builder is None]
-    found = [
-        zero_shot(plain, every, [run for run in runs if run.kind in STUDIES], folder),
-        distillation(plain, every, apart, folder),
-        ablation(plain),
-        transfer(plain, apart, folder),
-        controls([m for m in choices if m.ways], runs),
-        *(study(run) for run in runs if run.kind in STUDIES),
-        choices_in_detail(plain, confusions, folder),
-        rankings_in_detail(every, folder),
-        training([run for run in runs if run.kind in TRAININGS], folder),
+    draw = partial(_draw, folder)
+    unchanged = [m for m in selections if not m.variants]
+    studies = [run for run in runs if run.kind in STUDY_KINDS]
+    sections = [
+        zero_shot(unchanged, widest_rows(retrievals), studies, draw),
+        distillation(unchanged, widest_rows(retrievals), browser, draw),
+        ablation(unchanged),
+        transfer(unchanged, browser, draw),
+        controls([m for m in selections if m.variants], runs),
+        *map(human_study, studies),
+        selection_details(unchanged, browser, draw),
+        retrieval_details([m for m in retrievals if m.row.builder is None], draw),
+        training([run for run in runs if run.kind in TRAINING_KINDS], draw),
     ]
-    return [s for s in found if s.tables or s.figures or s.details]
+    return [s for s in sections if s.tables or s.figures or s.details]
 
 
 def zero_shot(
-    choices: Sequence[Measured],
-    ranks: Sequence[Measured],
-    studies: Sequence[Finished],
-    folder: Path,
+    selections: Rows, retrievals: Rows, studies: Sequence[FinishedRun], draw: Callable
 ) -> Section:
     section = Section("Zero-shot")
-    abroad = transfers(choices)
-    for benchmark, rows in by_items(m for m in choices if not m.trained).items():
-        if benchmark not in abroad:
-            of = (benchmark, rows[0].run.report.get("build"))
-            asked = [s for s in studies if (s.report.get("benchmark"), s.report.get("build")) == of]
-            section.tables.append(shaped.selection_zero_shot(benchmark, rows, asked))
-            section.figures.append(_families(folder, "zero-shot", rows, True))
-    for benchmark, rows in by_items(m for m in ranks if not m.trained).items():
-        section.tables.append(shaped.retrieval_zero_shot(benchmark, widest(rows)))
+    transfers = transfer_benchmarks(selections)
+    for benchmark, rows in group_by_items(m for m in selections if not m.trained).items():
+        if benchmark not in transfers:
+            build = (benchmark, rows[0].run.report.get("build"))
+            on_build = [
+                s for s in studies if (s.report.get("benchmark"), s.report.get("build")) == build
+            ]
+            table = summary_tables.zero_shot_selection_table(benchmark, rows, on_build)
+            section.tables.append(table)
+            section.figures.append(_family_figure(draw, "zero-shot", rows))
+    for benchmark, rows in group_by_items(m for m in retrievals if not m.trained).items():
+        paper = {
+            "paper, Table 3: direct embedders (2,002 queries, 10,000 frames)": ["retrieval_direct"],
+            "paper, Table 3: two-stage (2,002 queries, 10,000 frames)": ["retrieval_two_stage"],
+        }
+        caption = f"Zero-shot retrieval (recall in %) on {benchmark}"
+        name, title = f"retrieval-{benchmark}", f"Zero-shot, {benchmark}"
+        table = summary_tables.retrieval_summary_table(name, caption, title, rows, paper)
+        section.tables.append(table)
     return section
 
 
 def distillation(
-    choices: Sequence[Measured],
-    ranks: Sequence[Measured],
-    apart: Mapping[str, Sequence[Sequence[PairedComparison]]],
-    folder: Path,
+    selections: Rows, retrievals: Rows, browser: ItemBrowser, draw: Callable
 ) -> Section:
     section = Section("Distillation")
-    abroad = transfers(choices)
-    for benchmark, rows in by_items(choices).items():
-        if benchmark not in abroad and any(m.trained for m in rows):
-            section.tables.append(shaped.selection_distilled(benchmark, rows))
-            section.figures.append(_families(folder, "families", rows, True))
-            _add_apart(section, benchmark, apart)
-    for benchmark, rows in by_items(ranks).items():
-        if any(m.trained for m in rows):
-            section.tables.append(shaped.retrieval_distilled(benchmark, widest(rows)))
-        runs = {m.run.folder: m.run for m in rows if m.trained}
-        names = Counter(of["left"] for run in runs.values() for of in _widest_apart(run))
-        told = [
-            of if names[of["left"]] == 1 else {**of, "left": f"{of['left']}, {run.name}"}
-            for run in runs.values()
-            for of in run.report.get("apart", [])
-        ]
-        if told:
-            section.tables.append(_renamed(tables.rank_differences_table(told), benchmark))
+    transfers = transfer_benchmarks(selections)
+    for benchmark, rows in group_by_items(selections).items():
+        if benchmark not in transfers and any(m.trained for m in rows):
+            name = f"distillation-selection-{benchmark}"
+            caption = f"Distillation: selection accuracy (%) on {benchmark}"
+            paper = {"paper, Table 4a (Qwen3-VL-8B)": ["selection_distilled"]}
+            table = summary_tables.trained_selection_table(name, caption, rows, paper)
+            section.tables.append(table)
+            section.figures.append(_family_figure(draw, "families", rows))
+            _add_model_differences(section, benchmark, browser)
+    for benchmark, rows in group_by_items(retrievals).items():
+        trained = {m.run.folder: m.run for m in rows if m.trained}
+        if trained:
+            name = f"distillation-retrieval-{benchmark}"
+            caption = f"Distillation: retrieval (recall in %) on {benchmark}"
+            paper = {"paper, Table 4b (2,002 queries, 10,000 frames)": ["retrieval_distilled"]}
+            title = f"Distilled, {benchmark}"
+            table = summary_tables.retrieval_summary_table(name, caption, title, rows, paper)
+            section.tables.append(table)
+        if differences := _rank_differences(trained.values()):
+            table = tables.rank_differences_table(differences)
+            section.tables.append(_on_benchmark(table, benchmark))
     return section
 
 
-def _widest_apart(run: Finished) -> list[dict[str, Any]]:
-    """Of what a run's retrievers are apart, what they are at the widest width."""
-    return run.report.get("apart", [])[:1]
+def _rank_differences(runs: Iterable[FinishedRun]) -> list[dict[str, Any]]:
+    """The reported differences between retrievers; equal names are followed by their run's."""
+    reported = [(run, run.report.get("differences", [])) for run in runs]
+    names = Counter(d["left"] for _, differences in reported for d in differences[:1])
+    return [
+        d if names[d["left"]] == 1 else {**d, "left": f"{d['left']}, {run.name}"}
+        for run, differences in reported
+        for d in differences
+    ]
 
 
-def ablation(choices: Sequence[Measured]) -> Section:
-    """The regimes of chain of thought beside each other, in reasoning mode."""
-    told = [m for m in choices if m.row.mode == "reasoning" and m.regime in REGIMES]
-    if not any(m.regime in ABLATED for m in told):
+def ablation(selections: Rows) -> Section:
+    """The regimes with rationales, in reasoning mode."""
+    rows = [m for m in selections if m.row.mode == "reasoning" and m.regime in REGIMES]
+    if not any(m.regime in ABLATED_REGIMES for m in rows):
         return Section("Ablation")
-    told.sort(key=lambda m: list(REGIMES).index(m.regime))
-    names = zip(told, model_names(told), strict=True)
+    rows.sort(key=lambda m: list(REGIMES).index(m.regime))
+    names = zip(rows, model_names(rows), strict=True)
     labels = [f"{REGIMES[m.regime]} ({name})" for m, name in names]
     caption = "Ablation: accuracy over all items (%) in reasoning mode"
-    reference = {"paper, Table 12": paper.ABLATION}
-    return Section("Ablation", [shaped.overall_table("ablation", caption, told, labels, reference)])
+    paper = {"paper, Table 12": "ablation"}
+    table = summary_tables.overall_table("ablation", caption, rows, labels, paper)
+    return Section("Ablation", [table])
 
 
-def transfer(
-    choices: Sequence[Measured],
-    apart: Mapping[str, Sequence[Sequence[PairedComparison]]],
-    folder: Path,
-) -> Section:
-    """Students on benchmarks that they were not trained on, and the models that they began from."""
+def transfer(selections: Rows, browser: ItemBrowser, draw: Callable) -> Section:
+    """Students on benchmarks that they were not trained on, and their bases."""
     section = Section("Transfer")
-    if not (abroad := transfers(choices)):
+    if not (transfers := transfer_benchmarks(selections)):
         return section
-    travelled = {(m.model, m.row.mode) for m in choices if m.benchmark in abroad}
-    told = [m for m in choices if (m.model, m.row.mode) in travelled]
-    names = zip(told, model_names(told), strict=True)
+    models = {(m.model, m.row.mode) for m in selections if m.benchmark in transfers}
+    rows = [m for m in selections if (m.model, m.row.mode) in models]
+    names = zip(rows, model_names(rows), strict=True)
     labels = [f"{name} ({m.row.mode})" for m, name in names]
     caption = "Transfer: accuracy over all items (%)"
-    reference = {"paper, Section 5.3 (answer mode)": paper.TRANSFER}
-    section.tables.append(shaped.overall_table("transfer", caption, told, labels, reference))
-    for benchmark, rows in by_items(choices).items():
-        if benchmark in abroad:
-            section.tables.append(shaped.selection_transfer(benchmark, rows))
-            # The paper's figures by family are of CLEVRER.
-            section.figures.append(_families(folder, "families", rows, False))
-            _add_apart(section, benchmark, apart)
+    paper = {"paper, Section 5.3 (answer mode)": "transfer"}
+    section.tables.append(summary_tables.overall_table("transfer", caption, rows, labels, paper))
+    for benchmark, rows in group_by_items(selections).items():
+        if benchmark in transfers:
+            caption = f"Transfer: selection accuracy (%) on {benchmark}"
+            paper = {"paper, Section 5.3 (MoVi-A, answer mode)": ["movi_a_by_family"]}
+            name = f"transfer-{benchmark}"
+            table = summary_tables.trained_selection_table(name, caption, rows, paper)
+            section.tables.append(table)
+            # The paper's accuracies by family are on CLEVRER.
+            section.figures.append(_family_figure(draw, "families", rows, with_paper=False))
+            _add_model_differences(section, benchmark, browser)
     return section
 
 
-def _add_apart(
-    section: Section, benchmark: str, apart: Mapping[str, Sequence[Sequence[PairedComparison]]]
-) -> None:
-    """Add what the benchmark's models are apart, and folded away the same by family."""
-    if found := apart.get(benchmark):
-        section.tables.append(_renamed(tables.apart_table(found), benchmark))
-        by_family = tables.paired_table([(benchmark, of) for of in found])
-        section.details.append(_renamed(by_family, benchmark))
+def _add_model_differences(section: Section, benchmark: str, browser: ItemBrowser) -> None:
+    """Add the differences between the benchmark's models, overall and, folded, by family."""
+    if comparisons := browser.comparisons.get(benchmark):
+        overall = tables.model_differences_table(comparisons)
+        by_family = tables.paired_table([(benchmark, pairs) for pairs in comparisons])
+        section.tables.append(_on_benchmark(overall, benchmark))
+        section.details.append(_on_benchmark(by_family, benchmark))
 
 
-def controls(choices: Sequence[Measured], runs: Sequence[Finished]) -> Section:
-    """What controls are apart from what they are held against, and the controls' own rows.
+def controls(selections: Rows, runs: Sequence[FinishedRun]) -> Section:
+    """The accuracies under controls, and their differences from the unchanged items.
 
     Raises:
-        UserError: what a run reports is of another version.
+        UserError: a report is of another version.
     """
     section = Section("Controls")
-    apart: dict[tuple[Path, str, str, str], list[PairedComparison]] = {}
+    groups: dict[tuple[Path, str, str, str], list[PairedComparison]] = {}
     for run in runs:
-        for told in run.report.get("controls", []):
-            try:
-                pair = PairedComparison(
-                    **{key: value for key, value in told.items() if key != "mode"}
-                )
-                ways = [told["mode"]] if run.kind == "similarity" else [_model(run), told["mode"]]
-            except (KeyError, TypeError) as error:
-                raise unreadable(run.folder) from error
-            way = ", ".join([run.report["rows"][0]["benchmark"], *ways])
-            apart.setdefault((run.folder, way, pair.left, pair.right), []).append(pair)
-    if apart:
-        ways = Counter(key[1:] for key in apart)
-        table = tables.paired_table(
-            [
-                (way if ways[way, left, right] == 1 else f"{way}, {folder.name}", of)
-                for (folder, way, left, right), of in apart.items()
-            ]
-        )
+        with reading(run.folder):
+            for entry in run.report.get("controls", []):
+                fields = {key: value for key, value in entry.items() if key != "mode"}
+                pair, row = PairedComparison(**fields), run.report["rows"][0]
+                model = [] if run.kind == "similarity" else [row["name"]]
+                label = ", ".join([row["benchmark"], *model, entry["mode"]])
+                groups.setdefault((run.folder, label, pair.left, pair.right), []).append(pair)
+    if groups:
+        counts = Counter(key[1:] for key in groups)
+        pairs = [
+            (label if counts[label, left, right] == 1 else f"{label}, {folder.name}", of)
+            for (folder, label, left, right), of in groups.items()
+        ]
         caption = "Controls: paired differences of accuracy (%)"
-        section.tables.append(replace(table, name="controls", caption=caption))
-    for benchmark, rows in by_items(choices).items():
-        name = f"control-{benchmark.replace(', ', '-')}"
-        caption = f"Controls: selection accuracy (%) on {benchmark}"
-        section.tables.append(shaped.selection_trained(name, caption, rows, {}))
+        section.tables.append(replace(tables.paired_table(pairs), name="controls", caption=caption))
+    for items, rows in group_by_items(selections).items():
+        name = f"control-{items.replace(', ', '-')}"
+        caption = f"Controls: selection accuracy (%) on {items}"
+        section.tables.append(summary_tables.trained_selection_table(name, caption, rows, {}))
     return section
 
 
-def _model(run: Finished) -> str:
-    return run.report["rows"][0]["name"]
-
-
-def study(run: Finished) -> Section:
+def human_study(run: FinishedRun) -> Section:
     """
     Raises:
-        UserError: what the study exported is of another version.
+        UserError: the study's report is of another version.
     """
-    try:
+    with reading(run.folder):
         table = tables.human_table(run.report)
-        caption = f"{table.caption}: study {run.name} on benchmark {run.report['benchmark']}"
-    except (KeyError, TypeError) as error:
-        raise unreadable(run.folder) from error
+        benchmark = run.report["benchmark"]
+    caption = f"{table.caption}: study {run.name} on benchmark {benchmark}"
     name = f"human-{run.name.replace('/', '-')}"
     return Section("Human study", [replace(table, name=name, caption=caption)])
 
 
-def choices_in_detail(
-    choices: Sequence[Measured], confusions: Mapping[str, Mapping[str, np.ndarray]], folder: Path
-) -> Section:
+def selection_details(selections: Rows, browser: ItemBrowser, draw: Callable) -> Section:
     """
     Raises:
-        UserError: what a run reports is of another version.
+        UserError: a report is of another version.
     """
     section = Section("Selection in detail")
-    abroad = transfers(choices)
-    for benchmark, rows in by_items(choices).items():
-        cells = _told(rows, "subtypes", _intervals)
-        horizons = {label: by for label, of in cells.items() if (by := plots.by_horizon(of))}
-        if horizons:
-            draw = partial(plots.horizon_figure, reference=rows[0].benchmark not in abroad)
-            drawn = _draw(folder, f"horizons-{benchmark}", draw, horizons)
-            section.figures.append(Figure(drawn, f"Accuracy by horizon on {benchmark}."))
-        if found := confusions.get(benchmark):
-            drawn = _draw(folder, f"positions-{benchmark}", plots.confusion_figure, found)
-            caption = f"What was chosen where each letter was right, on {benchmark} (% of a row)."
-            section.figures.append(Figure(drawn, caption))
-        section.details += [_renamed(table, benchmark) for table in _details(rows, cells)]
+    transfers = transfer_benchmarks(selections)
+    for benchmark, rows in group_by_items(selections).items():
+        subtypes = _read_details(rows, "subtypes", _read_intervals)
+        horizons = {label: figures.accuracy_by_horizon(of) for label, of in subtypes.items()}
+        if horizons := {label: of for label, of in horizons.items() if of}:
+            with_paper = rows[0].benchmark not in transfers
+            plot = partial(figures.horizon_figure, with_paper=with_paper)
+            caption = f"Accuracy by horizon on {benchmark}."
+            section.figures.append(draw(f"horizons-{benchmark}", plot, horizons, caption))
+        if confusions := browser.confusions.get(benchmark):
+            plot = figures.confusion_figure
+            caption = f"Chosen letters by correct letter on {benchmark} (% of a row)."
+            section.figures.append(draw(f"positions-{benchmark}", plot, confusions, caption))
+        details = tables.detail_tables(
+            subtypes,
+            _read_details(rows, "readings", dict),
+            _read_details(rows, "positions", lambda entry: PositionBias(**entry)),
+            _read_details(rows, "calibration", Calibration.from_dict),
+        )
+        section.details += [_on_benchmark(table, benchmark) for table in details]
     return section
 
 
-def _intervals(told: Mapping[str, Any]) -> dict[str, Interval]:
-    return {cell: Interval(**found) for cell, found in told.items()}
+def _read_intervals(entry: Mapping[str, Any]) -> dict[str, Interval]:
+    return {name: Interval(**share) for name, share in entry.items()}
 
 
-def _details(rows: Sequence[Measured], cells: Mapping[str, Mapping[str, Interval]]) -> list[Table]:
-    """The tables of what runs report of their models besides their rows."""
-    readings = _told(rows, "readings", dict)
-    letters = _told(rows, "positions", lambda of: PositionBias(**of))
-    sure = _told(rows, "calibration", Calibration.from_dict)
-    told = [tables.subtype_table(cells)] if cells else []
-    told += [tables.parsing_table(readings)] if readings else []
-    told += [tables.position_table(letters)] if letters else []
-    for k, (label, found) in enumerate(sure.items()):
-        table = tables.calibration_table(label, found)
-        told.append(replace(table, name=f"{table.name}-{k}"))
-    return told
-
-
-T = TypeVar("T")
-
-
-def _told(rows: Sequence[Measured], kind: str, read: Callable[[Any], T]) -> dict[str, T]:
-    """What runs report of one kind, by the label of the model; where they report of it."""
-    found = {}
+def _read_details(rows: Rows, kind: str, read: Callable[[Any], T]) -> dict[str, T]:
+    """One kind of details from the rows' reports, by the label of the model."""
+    details = {}
     for m in rows:
-        try:
-            if told := m.told(kind):
-                found[m.label] = read(told)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise unreadable(m.run.folder) from error
-    return found
+        with reading(m.run.folder):
+            if entry := m.run.report.get(kind, {}).get(m.report_key):
+                details[m.label] = read(entry)
+    return details
 
 
-def rankings_in_detail(ranks: Sequence[Measured], folder: Path) -> Section:
+def retrieval_details(retrievals: Rows, draw: Callable) -> Section:
     section = Section("Retrieval in detail")
-    for benchmark, rows in by_items(ranks).items():
-        of_all = [m.row for m in rows]
-        section.tables.append(_renamed(tables.cost_table(of_all), benchmark))
-        section.details.append(_renamed(tables.retrieval_table(of_all), benchmark, "widths"))
-        if any(row.width for row in of_all):
-            drawn = _draw(folder, f"widths-{benchmark}", figures.retrieval_figure, of_all)
-            section.figures.append(Figure(drawn, f"Recall by width on {benchmark}."))
+    for benchmark, rows in group_by_items(retrievals).items():
+        results = [m.row for m in rows]
+        section.tables.append(_on_benchmark(tables.cost_table(results), benchmark))
+        widths = replace(tables.retrieval_table(results), name="widths")
+        section.details.append(_on_benchmark(widths, benchmark))
+        if any(row.width for row in results):
+            caption = f"Recall by width on {benchmark}."
+            plot = figures.retrieval_figure
+            section.figures.append(draw(f"widths-{benchmark}", plot, results, caption))
         curves = {
             (m.row.name, m.run.folder): {**curve, "name": m.row.name}
             for m in rows
@@ -303,41 +306,41 @@ def rankings_in_detail(ranks: Sequence[Measured], folder: Path) -> Section:
             if curve["builder"] is None and curve["name"] == m.model
         }
         if curves:
-            drawn = _draw(folder, f"recall-{benchmark}", plots.recall_figure, [*curves.values()])
-            section.figures.append(Figure(drawn, f"Recall by k on {benchmark}, at the widest."))
+            caption = f"Recall by k on {benchmark}, at the largest width."
+            plot = figures.recall_figure
+            section.figures.append(draw(f"recall-{benchmark}", plot, [*curves.values()], caption))
     return section
 
 
-def training(runs: Sequence[Finished], folder: Path) -> Section:
+def training(runs: Sequence[FinishedRun], draw: Callable) -> Section:
     section = Section("Training")
-    if table := shaped.training_table(runs):
+    table = summary_tables.training_table(runs)
+    if table.groups:
         section.tables.append(table)
     for run in runs:
         if records := [*json_lines(run.folder / "metrics.jsonl")]:
-            name = f"{run.kind}-{run.name.replace('/', '-')}"
-            drawn = _draw(folder, f"training-{name}", curves_figure, records)
-            section.figures.append(Figure(drawn, f"Training of {run.kind}/{run.name}."))
+            name = f"training-{run.kind}-{run.name.replace('/', '-')}"
+            caption = f"Training of {run.kind}/{run.name}."
+            section.figures.append(draw(name, curves_figure, records, caption))
     return section
 
 
-def _renamed(table: Table, benchmark: str, name: str | None = None) -> Table:
+def _on_benchmark(table: Table, benchmark: str) -> Table:
     caption = f"{table.caption}, on {benchmark}"
-    return replace(table, name=f"{name or table.name}-{benchmark}", caption=caption)
+    return replace(table, name=f"{table.name}-{benchmark}", caption=caption)
 
 
-def _families(folder: Path, name: str, rows: Sequence[Measured], reference: bool) -> Figure:
-    benchmark, shown = rows[0].items, [m.row for m in rows]
-    draw = partial(figures.selection_figure, reference=reference)
-    drawn = _draw(folder, f"{name}-{benchmark}", draw, shown)
-    return Figure(drawn, f"Accuracy by family on {benchmark}, with 95% intervals.")
+def _family_figure(draw: Callable, name: str, rows: Rows, with_paper: bool = True) -> Figure:
+    plot = partial(figures.selection_figure, with_paper=with_paper)
+    caption = f"Accuracy by family on {rows[0].items}, with 95% intervals."
+    return draw(f"{name}-{rows[0].items}", plot, [m.row for m in rows], caption)
 
 
-def _draw(folder: Path, name: str, draw: Callable[..., None], what: Any) -> Path:
-    """An SVG file with its text as text, the same for the same figure."""
+def _draw(folder: Path, name: str, plot: Callable, data: Any, caption: str) -> Figure:
+    """Write a figure as SVG with its text as text; equal data give equal files."""
     import matplotlib
 
-    folder.mkdir(exist_ok=True)
     path = folder / f"{name}.svg"
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
-        draw(what, path)
-    return path
+        plot(data, path)
+    return Figure(path, caption)

@@ -1,5 +1,4 @@
-"""A table and the formats that it is written in, all from the same rows: aligned text, Markdown,
-LaTeX and HTML."""
+"""A table and its rendering as text, Markdown and LaTeX; the page's template writes HTML."""
 
 from __future__ import annotations
 
@@ -7,14 +6,12 @@ import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 
 NAME_WIDTH = 40
-"""Characters that text gives a head or a row's name."""
-ENDING = 14
-"""Of these, those that are kept of a longer name's end, which says how a model was asked."""
-LINE = 100
-"""Characters of a line of notes."""
+"""Longest row name in plain text, in characters."""
+SUFFIX_WIDTH = 14
+"""Characters that a shortened name keeps of its end, which names the mode."""
+NOTE_WIDTH = 100
 
 _LATEX = {
     **{c: f"\\{c}" for c in "&%$#_{}"},
@@ -29,67 +26,73 @@ _LATEX = {
 
 
 class Best(str):
-    """A cell that is the best of its column: bold, except in plain text."""
+    """A cell that holds the best value of its column: bold, except in plain text."""
 
     __slots__ = ()
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells as they are printed, as wide as the head each. A row whose name begins with two
-    spaces belongs to the one above it.
+    """Rows of formatted cells, each row as long as the head.
 
-    `name` is the stem of the files that it is written to. `parts` holds the rows by their part's
-    label, which is empty where a part needs none.
+    A row whose name begins with two spaces belongs to the row above it.
+
+    Attributes:
+        name: Stem of the files that the table is written to.
+        groups: Rows by the label of their group; an empty label is not printed, and neither is a
+            group without rows.
     """
 
     name: str
     caption: str
     head: Sequence[str]
-    parts: Mapping[str, Sequence[Sequence[str]]]
+    groups: Mapping[str, Sequence[Sequence[str]]]
     notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        groups = {label: rows for label, rows in self.groups.items() if rows}
+        object.__setattr__(self, "groups", groups)
 
     def __str__(self) -> str:
         return self.as_text()
 
     def as_text(self) -> str:
-        """Aligned columns, the first to the left, one part after the other under its label; names
-        that are too long lose their middle."""
-        head = [clipped(cell) for cell in self.head]
-        parts = {
-            label: [[clipped(name), *rest] for name, *rest in rows]
-            for label, rows in self.parts.items()
+        """Aligned columns, the first one to the left; long names lose their middle."""
+        head = [shorten(cell) for cell in self.head]
+        groups = {
+            label: [[shorten(name), *cells] for name, *cells in rows]
+            for label, rows in self.groups.items()
         }
-        cells = [head, *(row for rows in parts.values() for row in rows)]
+        cells = [head, *(row for rows in groups.values() for row in rows)]
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         rule = "-" * (sum(widths) + 2 * len(widths) - 2)
-        lines = [_line(head, widths)]
-        for label, rows in parts.items():
-            lines += [rule, *([label] if label else []), *(_line(row, widths) for row in rows)]
-        notes = [textwrap.fill(note, LINE) for note in self.notes]
+        lines = [_align(head, widths)]
+        for label, rows in groups.items():
+            lines += [rule, *([label] if label else []), *(_align(row, widths) for row in rows)]
+        notes = [textwrap.fill(note, NOTE_WIDTH) for note in self.notes]
         return "\n".join([*lines, rule, *notes])
 
     def as_markdown(self) -> str:
-        """A table of GitHub's Markdown under its caption."""
-        others = len(self.head) - 1
-        lines = [_piped(self.head), f"|:--{'|--:' * others}|"]
-        for label, rows in self.parts.items():
-            lines += [_piped([f"*{_plain(label)}*", *[""] * others], raw=1)] if label else []
-            lines += [_piped(row) for row in rows]
-        notes = [_plain(note) for note in self.notes]
-        return "\n\n".join([f"**{_plain(self.caption)}**", "\n".join(lines), *notes]) + "\n"
+        """A GitHub Markdown table below its caption."""
+        columns = len(self.head)
+        lines = [_markdown_row(self.head), f"|:--{'|--:' * (columns - 1)}|"]
+        for label, rows in self.groups.items():
+            lines += [f"| *{_markdown(label)}* |{'  |' * (columns - 1)}"] if label else []
+            lines += map(_markdown_row, rows)
+        notes = map(_markdown, self.notes)
+        return "\n\n".join([f"**{_markdown(self.caption)}**", "\n".join(lines), *notes]) + "\n"
 
     def as_latex(self) -> str:
-        """A float in the paper's shape; needs the packages booktabs and graphicx."""
+        """A float; requires the packages booktabs and graphicx."""
         columns = len(self.head)
-        body = [_ampersands(self.head)]
-        for label, rows in self.parts.items():
+        body = [_latex_row(self.head)]
+        for label, rows in self.groups.items():
             body.append(r"\midrule")
             if label:
                 body.append(rf"\multicolumn{{{columns}}}{{@{{}}l}}{{\emph{{{_latex(label)}}}}} \\")
             for row in rows:
                 indent = r"\quad " * (bool(label) + row[0].startswith("  "))
-                body.append(indent + _ampersands(row))
+                body.append(indent + _latex_row(row))
         caption = _latex(" ".join([f"{self.caption.rstrip('.')}.", *self.notes]))
         return "\n".join(
             [
@@ -109,64 +112,65 @@ class Table:
             ]
         )
 
-    def as_html(self) -> str:
-        """A `table` element with its caption, and its notes in paragraphs after it."""
-        lines = [f"<caption>{escape(self.caption)}</caption>", "<thead>"]
-        lines += [_tagged(self.head, 'th scope="col"'), "</thead>"]
-        for label, rows in self.parts.items():
-            lines.append("<tbody>")
-            if label:
-                spans = f'colspan="{len(self.head)}" scope="rowgroup"'
-                lines.append(f'<tr class="part"><th {spans}>{escape(label)}</th></tr>')
-            lines += [_tagged(row, "td", 'th scope="row"') for row in rows]
-            lines.append("</tbody>")
-        notes = [f'<p class="note">{escape(note)}</p>' for note in self.notes]
-        return "\n".join(["<table>", *lines, "</table>", *notes])
 
-
-def clipped(name: str) -> str:
-    """A name without its middle where it is longer than `NAME_WIDTH`."""
+def shorten(name: str) -> str:
+    """A name without its middle if it is longer than `NAME_WIDTH`."""
     if len(name) <= NAME_WIDTH:
         return name
-    return f"{name[: NAME_WIDTH - ENDING - 1]}…{name[-ENDING:]}"
+    return f"{name[: NAME_WIDTH - SUFFIX_WIDTH - 1]}…{name[-SUFFIX_WIDTH:]}"
 
 
-def _line(row: Iterable[str], widths: list[int]) -> str:
+def mark_best(
+    groups: Mapping[str, Sequence[Sequence[str]]],
+    head: Sequence[str],
+    best: Mapping[str, Callable[[Sequence[float]], float]],
+    skipped: Sequence[str] = (),
+) -> dict[str, list[list[str]]]:
+    """The rows of all groups with the best cells marked, if a column holds two values or more.
+
+    Args:
+        best: `max` or `min` for each column that has a best value.
+        skipped: Names of rows that do not compete.
+    """
+    groups = {label: [list(row) for row in rows] for label, rows in groups.items()}
+    rows = [row for group in groups.values() for row in group]
+    rows = [row for row in rows if not row[0].startswith("  ") and row[0] not in skipped]
+    for column, heading in enumerate(head):
+        filled = [row for row in rows if row[column] not in ("", "-")]
+        if heading in best and len(filled) > 1:
+            value = best[heading]([float(row[column]) for row in filled])
+            for row in filled:
+                if float(row[column]) == value:
+                    row[column] = Best(row[column])
+    return groups
+
+
+def _align(row: Iterable[str], widths: list[int]) -> str:
     first, *rest = row
     cells = [first.ljust(widths[0])]
     cells += [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
     return "  ".join(cells).rstrip()
 
 
-def _piped(row: Sequence[str], raw: int = 0) -> str:
-    """A line of a Markdown table; the first `raw` cells are Markdown already."""
-    cells = [*row[:raw], *_shown(row[raw:], _plain, "**{}**")]
-    return f"| {' | '.join(cells)} |"
+def _emphasize(row: Iterable[str], escape: Callable[[str], str], bold: str) -> list[str]:
+    """The escaped cells of a row, the best ones in the format `bold`."""
+    return [
+        bold.format(escape(cell.strip())) if isinstance(cell, Best) else escape(cell.strip())
+        for cell in row
+    ]
 
 
-def _shown(row: Iterable[str], written: Callable[[str], str], bold: str) -> list[str]:
-    """Each cell as a format has it written, the best ones in its way of bold."""
-    cells = ((cell, written(cell.strip())) for cell in row)
-    return [bold.format(text) if isinstance(cell, Best) else text for cell, text in cells]
+def _markdown_row(row: Sequence[str]) -> str:
+    return f"| {' | '.join(_emphasize(row, _markdown, '**{}**'))} |"
 
 
-def _plain(text: str) -> str:
-    """Text that Markdown shows as it is."""
+def _markdown(text: str) -> str:
     return re.sub(r"([\\`*_\[\]<>|~#&$])", r"\\\1", text.strip())
 
 
-def _ampersands(row: Sequence[str]) -> str:
-    return " & ".join(_shown(row, _latex, r"\textbf{{{}}}")) + r" \\"
+def _latex_row(row: Sequence[str]) -> str:
+    return " & ".join(_emphasize(row, _latex, r"\textbf{{{}}}")) + r" \\"
 
 
 def _latex(text: str) -> str:
     return re.sub(r"->|.", lambda found: _LATEX.get(found[0], found[0]), text)
-
-
-def _tagged(row: Sequence[str], tag: str, first: str | None = None) -> str:
-    """A line of an HTML table, its cells in elements of `tag`, the first one in that of `first`."""
-    tags = [first or tag, *[tag] * (len(row) - 1)]
-    told = zip(tags, _shown(row, escape, "<b>{}</b>"), strict=True)
-    cells = [f"<{t}>{cell}</{t.split()[0]}>" for t, cell in told]
-    under = ' class="under"' if row[0].startswith("  ") else ""
-    return f"<tr{under}>{''.join(cells)}</tr>"

@@ -1,124 +1,190 @@
-"""The tables that show what was measured beside the paper's."""
+"""The tables of single evaluations; their rows also fill the report's tables."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from data.records import FAMILIES, LETTERS
 from evaluation.metrics.calibration import Calibration, PositionBias
 from evaluation.metrics.intervals import Interval
 from evaluation.metrics.significance import PairedComparison
-from evaluation.reporting import reference as paper
+from evaluation.reporting.reference import SUITE, reference, reference_rows
 from evaluation.reporting.results import RECALLS, SIMILARITY, RetrievalResult, SelectionResult
 from evaluation.reporting.table import Table
 
-SELECTION_HEAD = (*(f.capitalize() for f in FAMILIES), "Macro", "Micro", "Parsed", "Items")
-_HEADS = (*(f"R@{k}" for k in RECALLS), "MRR", "Median", "Tied")
-RETRIEVAL_HEAD = ("Width", *_HEADS, "Queries", "Frames")
-PAPER = "paper (full benchmark)"
-
-
-def selection_table(rows: Sequence[SelectionResult], suite: str = paper.SUITE) -> Table:
-    """The rows, and below them, where the items are of the suite that the paper has by family, the
-    paper's; in percent."""
-    similar = paper.SELECTION_SIMILARITY if any(r.mode == SIMILARITY for r in rows) else ()
-    reference = (
-        paper.CHANCE,
-        *similar,
-        *paper.SELECTION_DISTILLED,
-        paper.HUMAN_MAJORITY,
-    )
-    own = {"": selection_cells(rows)}
-    return Table(
-        "selection",
-        "Selection accuracy (%)",
-        ["Selection accuracy, %", *SELECTION_HEAD],
-        own | {PAPER: selection_references(reference)} if suite == paper.SUITE else own,
-        (SELECTION_NOTE,),
-    )
-
+Rows = list[list[str]]
+FAMILY_COLUMNS = [family.capitalize() for family in FAMILIES]
+SELECTION_COLUMNS = [*FAMILY_COLUMNS, "Macro", "Micro", "Parsed", "Items"]
+MEASURE_COLUMNS = [*(f"R@{k}" for k in RECALLS), "MRR", "Median", "Tied"]
+RETRIEVAL_COLUMNS = ["Width", *MEASURE_COLUMNS, "Queries", "Frames"]
 
 SELECTION_NOTE = (
-    "Intervals are Wilson's, macro's bootstrapped over scenes; what cannot be parsed is wrong."
+    "Wilson 95% intervals; macro's is bootstrapped over scenes. Answers that cannot be parsed "
+    "count as wrong."
+)
+RETRIEVAL_NOTE = (
+    "95% intervals are bootstrapped over scenes. A target that is not ranked counts as last."
+)
+MCNEMAR_NOTE = (
+    "p: McNemar's exact test of these two counts, which treats the items of a scene as independent."
 )
 
 
-def selection_cells(rows: Sequence[SelectionResult]) -> list[list[str]]:
-    """Of each row, a line under `SELECTION_HEAD`, one with its intervals, and its time items by how
-    far ahead they ask."""
-    cells = []
-    for r in rows:
-        found = [*(r.families.get(f) for f in FAMILIES)]
-        shares = [*(i and i.value for i in found), r.macro, r.micro.value, r.parse_rate]
-        cells.append([f"{r.name} ({r.mode})", *map(_percent, shares), f"{r.n:,}"])
-        spans = map(interval_cell, (*found, r.macro_interval, r.micro))
-        cells.append(["  95% interval", *spans, "", ""])
-        for horizon, of in r.horizons.items():
-            label = f"  time, {horizon} ({interval_cell(of)})"
-            cells.append([label, "", _percent(of.value), "", "", "", "", f"{of.n:,}"])
-    return cells
+def selection_table(results: Sequence[SelectionResult], suite: str = SUITE) -> Table:
+    """The results above the paper's rows, if the items are of the paper's suite."""
+    groups = {"": selection_rows(results)}
+    if suite == SUITE:
+        similarity = any(result.mode == SIMILARITY for result in results)
+        names = ["chance", *(["selection_similarity"] if similarity else [])]
+        names += ["selection_distilled", "human_majority"]
+        rows = [row for name in names for row in reference_rows(name, SELECTION_COLUMNS)]
+        groups["paper (full benchmark)"] = rows
+    head = ["Selection accuracy, %", *SELECTION_COLUMNS]
+    return Table("selection", "Selection accuracy (%)", head, groups, (SELECTION_NOTE,))
 
 
-def selection_references(rows: Sequence[paper.SelectionReference]) -> list[list[str]]:
-    """The paper's rows under `SELECTION_HEAD`."""
-    cells = []
-    for r in rows:
-        shares = (r.event, r.time, r.window, r.macro, r.micro, r.parse_rate)
-        cells.append([r.name, *map(_printed, shares), ""])
-        if r in paper.SELECTION_DISTILLED:
-            for seconds, percent in paper.TIME_BY_HORIZON.get(r.name, {}).items():
-                cells.append([f"  time, {seconds} s", "", _printed(percent), *[""] * 5])
-    return cells
-
-
-def subtype_table(subtypes: dict[str, dict[str, Interval]]) -> Table:
-    """Accuracy of each subtype (`family/subtype`) in each mode, with its interval and items."""
-    modes = list(subtypes)
+def selection_rows(results: Iterable[SelectionResult]) -> Rows:
+    """For each result a row under `SELECTION_COLUMNS`, its intervals, and its time horizons."""
     rows = []
-    for cell in subtypes[modes[0]]:
-        found = [subtypes[mode][cell] for mode in modes]
-        shares = [f"{_percent(i.value)} [{interval_cell(i)}]" for i in found]
-        rows.append([cell, *shares, str(found[0].n)])
-    head = ["Accuracy by subtype, %", *modes, "Items"]
+    for r in results:
+        parsed = [percent(r.parse_rate)]
+        name = f"{r.name} ({r.mode})"
+        rows += _accuracy_rows(name, r.families, r.macro, r.micro, parsed, r.macro_interval)
+        for horizon, share in r.horizons.items():
+            label = f"  time, {horizon} ({interval_cell(share)})"
+            rows.append([label, "", percent(share.value), "", "", "", "", f"{share.n:,}"])
+    return rows
+
+
+def _accuracy_rows(
+    name: str,
+    families: Mapping[str, Interval],
+    macro: float,
+    micro: Interval,
+    parsed: Sequence[str] = (),
+    macro_interval: Interval | None = None,
+) -> Rows:
+    """A row of accuracies, the cells of `parsed` before the number of items, and its intervals."""
+    by_family = [families.get(family) for family in FAMILIES]
+    shares = [*(share and share.value for share in by_family), macro, micro.value]
+    intervals = map(interval_cell, (*by_family, macro_interval, micro))
+    return [
+        [name, *map(percent, shares), *parsed, f"{micro.n:,}"],
+        ["  95% interval", *intervals, *[""] * len(parsed), ""],
+    ]
+
+
+def detail_tables(
+    subtypes: Mapping[str, Mapping[str, Interval]],
+    readings: Mapping[str, Mapping[str, int]],
+    positions: Mapping[str, PositionBias],
+    calibrations: Mapping[str, Calibration],
+) -> list[Table]:
+    """The tables that detail selection results, each argument by the label of the model or mode."""
+    tables = [subtype_table(subtypes)] if subtypes else []
+    tables += [parsing_table(readings)] if readings else []
+    tables += [position_table(positions)] if positions else []
+    for k, (label, calibration) in enumerate(calibrations.items()):
+        tables.append(replace(calibration_table(label, calibration), name=f"calibration-{k}"))
+    return tables
+
+
+def subtype_table(subtypes: Mapping[str, Mapping[str, Interval]]) -> Table:
+    """Accuracy of each subtype (`family/subtype`), a column for each label."""
+    rows = []
+    for subtype, first in next(iter(subtypes.values())).items():
+        shares = [cells[subtype] for cells in subtypes.values()]
+        rows.append([subtype, *map(_share_cell, shares), str(first.n)])
+    head = ["Accuracy by subtype, %", *subtypes, "Items"]
     return Table("subtypes", "Selection accuracy by subtype (%)", head, {"": rows})
 
 
-def paired_table(found: Sequence[tuple[str, Sequence[PairedComparison]]]) -> Table:
-    """What two ways of answering the same items are apart, by how these were asked."""
-    parts = {
-        f"{way}: {of[0].left} (left) less {of[0].right} (right)": [
-            [p.of, *map(_percent, (p.left_accuracy, p.right_accuracy)), *_apart(p)] for p in of
+def parsing_table(readings: Mapping[str, Mapping[str, int]], head: str = "Answers") -> Table:
+    """Counts of parsed answers and of the reasons why others could not be parsed, by label."""
+    names = list(dict.fromkeys(name for counts in readings.values() for name in counts))
+    rows = [
+        [name, *(f"{counts[name]:,}" if name in counts else "-" for counts in readings.values())]
+        for name in names
+    ]
+    caption = "Parsed answers, and why others could not be parsed"
+    return Table("parsing", caption, [head, *readings], {"": rows})
+
+
+def position_table(positions: Mapping[str, PositionBias]) -> Table:
+    """By label: how often each letter was chosen and was correct, and the accuracy at each."""
+    rows = []
+    for label, bias in positions.items():
+        chosen, total = sum(bias.chosen.values()), sum(bias.right.values())
+        for name, counts, totals, answers in (
+            ("chosen", bias.chosen, dict.fromkeys(LETTERS, chosen), chosen),
+            ("correct", bias.right, dict.fromkeys(LETTERS, total), total),
+            ("accuracy", bias.hits, bias.right, total),
+        ):
+            shares = [percent(counts[x] / totals[x] if totals[x] else None) for x in LETTERS]
+            rows.append([f"{label}: {name}", *shares, f"{answers:,}"])
+        if bias.p is not None:
+            test = f"  chi-square {bias.chi_square:.1f}, p = {bias.p:.2g}"
+            rows.append([test, *[""] * (len(LETTERS) + 1)])
+    head = ["Letters, %", *LETTERS, "Answers"]
+    return Table("positions", "Chosen and correct letters (%)", head, {"": rows})
+
+
+def calibration_table(label: str, calibration: Calibration) -> Table:
+    """Accuracy of the answers by their reported confidence."""
+    rows = [
+        [
+            f"{b.low:.1f} to {b.high:.1f}",
+            f"{100 * b.confidence:.1f}",
+            percent(b.accuracy.value),
+            interval_cell(b.accuracy),
+            f"{b.accuracy.n:,}",
         ]
-        for way, of in found
-    }
-    head = ["Paired accuracy, %", "Left", "Right", "Apart", "95%", "Only left", "Only right"]
+        for b in calibration.bins
+    ]
+    head = [f"Reported confidence ({label}), %", "Mean", "Accuracy", "95%", "Answers"]
     note = (
-        "Apart: left less right, its interval bootstrapped over scenes. Only left, only right: "
-        f"items answered right that way alone; {_MCNEMAR}"
+        f"Expected calibration error {calibration.ece:.3f} and Brier score "
+        f"{calibration.brier:.3f} of {calibration.n:,} valid records."
+    )
+    return Table("calibration", "Accuracy by reported confidence", head, {"": rows}, (note,))
+
+
+def paired_table(comparisons: Sequence[tuple[str, Sequence[PairedComparison]]]) -> Table:
+    """Paired differences of accuracy by family, a group for each labelled comparison."""
+    groups = {
+        f"{label}: {of[0].left} (left) less {of[0].right} (right)": [
+            [p.of, percent(p.left_accuracy), percent(p.right_accuracy), *_difference_cells(p)]
+            for p in of
+        ]
+        for label, of in comparisons
+    }
+    head = ["Paired accuracy, %", "Left", "Right", "Difference", "95%", "Only left", "Only right"]
+    note = (
+        "Difference: left less right, its interval bootstrapped over scenes. Only left, only "
+        f"right: items that only this side answers correctly. {MCNEMAR_NOTE}"
     )
     caption = "Paired differences of accuracy"
-    return Table("paired", caption, [*head, "p", "Items"], parts, (note,))
+    return Table("paired", caption, [*head, "p", "Items"], groups, (note,))
 
 
-def apart_table(found: Sequence[Sequence[PairedComparison]]) -> Table:
-    """What models are apart over all items, a line each under the model it is held against."""
-    parts: dict[str, list[list[str]]] = {}
-    for of in found:
-        over_all = of[-1]
-        parts.setdefault(f"less {over_all.right}", []).append([over_all.left, *_apart(over_all)])
-    head = ["Apart over all items, %", "Apart", "95%", "Won", "Lost", "p", "Items"]
+def model_differences_table(comparisons: Sequence[Sequence[PairedComparison]]) -> Table:
+    """Differences between models over all items, grouped by the model that is subtracted."""
+    groups: dict[str, Rows] = {}
+    for *_, overall in comparisons:
+        group = groups.setdefault(f"less {overall.right}", [])
+        group.append([overall.left, *_difference_cells(overall)])
+    head = ["All items, %", "Difference", "95%", "Won", "Lost", "p", "Items"]
     note = (
-        "The interval is bootstrapped over scenes. Won, lost: items that the row's model, or the "
-        f"other one, alone has right; {_MCNEMAR}"
+        "Intervals are bootstrapped over scenes. Won, lost: items that only the row's model, or "
+        f"only the other one, answers correctly. {MCNEMAR_NOTE}"
     )
-    return Table("apart", "How far models are apart, item by item", head, parts, (note,))
+    caption = "Differences between models, item by item"
+    return Table("differences", caption, head, groups, (note,))
 
 
-_MCNEMAR = "p is McNemar's exact test of the two, which takes the items of a scene for independent."
-
-
-def _apart(p: PairedComparison) -> list[str]:
+def _difference_cells(p: PairedComparison) -> list[str]:
     return [
         f"{100 * p.difference:+.1f}",
         f"{100 * p.low:+.1f} to {100 * p.high:+.1f}",
@@ -128,272 +194,189 @@ def _apart(p: PairedComparison) -> list[str]:
     ]
 
 
-def position_table(found: dict[str, PositionBias]) -> Table:
-    """Of each mode: which letters were chosen, which were right, and how often the model was right
-    where each was."""
-    cells = []
-    for mode, of in found.items():
-        chosen, total = sum(of.chosen.values()), sum(of.right.values())
-        for name, counts, wholes, answers in (
-            ("chosen", of.chosen, dict.fromkeys(LETTERS, chosen), chosen),
-            ("right", of.right, dict.fromkeys(LETTERS, total), total),
-            ("accuracy", of.hits, of.right, total),
-        ):
-            shares = [_percent(counts[x] / wholes[x] if wholes[x] else None) for x in LETTERS]
-            cells.append([f"{mode}: {name}", *shares, f"{answers:,}"])
-        if of.p is not None:
-            told = f"  chi-square {of.chi_square:.1f}, p = {of.p:.2g}"
-            cells.append([told, *[""] * (len(LETTERS) + 1)])
-    caption = "Letters that were chosen and that were right (%)"
-    return Table("positions", caption, ["Letters, %", *LETTERS, "Answers"], {"": cells})
-
-
-def calibration_table(mode: str, found: Calibration) -> Table:
-    """How often answers of each reported confidence are right, and what that comes to."""
-    cells = [
-        [
-            f"{b.low:.1f} to {b.high:.1f}",
-            f"{100 * b.confidence:.1f}",
-            _percent(b.accuracy.value),
-            interval_cell(b.accuracy),
-            f"{b.accuracy.n:,}",
-        ]
-        for b in found.bins
-    ]
-    head = [f"Confidence reported ({mode}), %", "Mean", "Right", "95%", "Answers"]
-    note = (
-        f"Expected calibration error {found.ece:.3f}, Brier score {found.brier:.3f}, of "
-        f"{found.n:,} valid records."
-    )
-    caption = "How often answers of each reported confidence are right"
-    return Table("calibration", caption, head, {"": cells}, (note,))
-
-
-def parsing_table(reasons: dict[str, dict[str, int]], head: str = "Answers") -> Table:
-    """How the answers of each mode could be read: counts by reason."""
-    names = list(dict.fromkeys(name for counts in reasons.values() for name in counts))
-    cells = [
-        [name, *(f"{counts[name]:,}" if name in counts else "-" for counts in reasons.values())]
-        for name in names
-    ]
-    caption = "Answers that could be read, and why others could not"
-    return Table("readings", caption, [head, *reasons], {"": cells})
-
-
 def retrieval_table(
-    rows: Sequence[RetrievalResult],
-    reference: Sequence[paper.RetrievalReference] = paper.RETRIEVAL_DISTILLED,
+    results: Sequence[RetrievalResult], reference_group: str = "retrieval_distilled"
 ) -> Table:
-    """The rows over all queries by width, widest first, each width's untrained row on top; then the
-    paper's."""
-    every = [r for r in rows if r.builder is None]
-    ordered = sorted(every, key=lambda r: (-(r.width or 0), not r.untrained))
-    return Table(
-        "retrieval",
-        "Retrieval (recall in %)",
-        ["Retrieval", *RETRIEVAL_HEAD],
-        {"": retrieval_cells(ordered), PAPER: retrieval_references(reference)},
-        (RETRIEVAL_NOTE,),
-    )
+    """The results over all queries, widest first and untrained before trained, above the paper's
+    rows of `reference_group`."""
+    overall = [r for r in results if r.builder is None]
+    overall.sort(key=lambda r: (-(r.width or 0), not r.untrained))
+    groups = {
+        "": retrieval_rows(overall),
+        "paper (2,002 queries, 10,000 frames)": reference_rows(reference_group, RETRIEVAL_COLUMNS),
+    }
+    head = ["Retrieval", *RETRIEVAL_COLUMNS]
+    return Table("retrieval", "Retrieval (recall in %)", head, groups, (RETRIEVAL_NOTE,))
 
 
-RETRIEVAL_NOTE = "Intervals are bootstrapped over scenes; a target that is not found is last."
+def retrieval_rows(results: Iterable[RetrievalResult]) -> Rows:
+    """For each result a row under `RETRIEVAL_COLUMNS` and its intervals."""
+    rows = []
+    for r in results:
+        rows.append([r.name, _width(r), *_measures(r), f"{r.queries:,}", f"{r.frames:,}"])
+        rows.append(["  95% interval", "", *_measure_intervals(r), "", ""])
+    return rows
 
 
-def retrieval_cells(rows: Sequence[RetrievalResult]) -> list[list[str]]:
-    """Of each row, a line under `RETRIEVAL_HEAD` and one with its intervals."""
-    cells = []
-    for r in rows:
-        width = "-" if r.width is None else str(r.width)
-        cells.append([r.name, width, *_values(r), f"{r.queries:,}", f"{r.frames:,}"])
-        cells.append(["  95% interval", "", *_ranges(r), "", ""])
-    return cells
-
-
-def retrieval_references(rows: Sequence[paper.RetrievalReference]) -> list[list[str]]:
-    """The paper's rows under `RETRIEVAL_HEAD`."""
-    return [
+def cost_table(results: Sequence[RetrievalResult]) -> Table:
+    """Quality and cost of the results over all queries, the best first."""
+    overall = sorted((r for r in results if r.builder is None), key=lambda r: -r.mrr.value)
+    rows = [
         [
             r.name,
-            "",
-            *map(_printed, (r.recall_1, r.recall_10, r.recall_50)),
-            f"{r.mrr:.3f}",
-            str(r.median_rank),
-            "",
-            "2,002",
-            "10,000",
-        ]
-        for r in rows
-    ]
-
-
-def rank_differences_table(apart: Sequence[dict[str, Any]]) -> Table:
-    """What `evaluation.metrics.breakdown.compare_retrievers` gives: under the retrievers' names
-    two lines a width,
-    the second with the intervals."""
-    parts: dict[str, list[list[str]]] = {}
-    for of in apart:
-        gaps = [_rank_gap(name, measured) for name, measured in of["measures"].items()]
-        width = "-" if of["width"] is None else str(of["width"])
-        lines = parts.setdefault(f"{of['left']} less {of['right']}", [])
-        lines.append([f"at width {width}", *(value for value, _ in gaps)])
-        lines.append(["  95% interval", *(interval for _, interval in gaps)])
-    head = ["Recall apart, %", *(f"R@{k}" for k in RECALLS), "MRR"]
-    note = "Query by query; intervals are bootstrapped over scenes."
-    return Table(
-        "ranks-apart", "How far retrievers are apart, query by query", head, parts, (note,)
-    )
-
-
-def _rank_gap(measure: str, m: dict[str, float]) -> tuple[str, str]:
-    scale, form = (1, "+.3f") if measure == "mrr" else (100, "+.1f")
-    value, low, high = (f"{scale * m[key]:{form}}" for key in ("value", "low", "high"))
-    return value, f"{low} to {high}"
-
-
-def cost_table(rows: Sequence[RetrievalResult]) -> Table:
-    """What the rows over all queries cost beside what they give, those that give most first."""
-    every = [r for r in rows if r.builder is None]
-    cells = [
-        [
-            r.name,
-            "-" if r.width is None else str(r.width),
-            _percent(r.recall_10.value),
+            _width(r),
+            percent(r.recall_10.value),
             f"{r.mrr.value:.3f}",
             "-" if r.bytes is None else f"{r.bytes / 2**20:,.2f}",
             "-" if r.seconds is None else f"{r.seconds:,.2f}",
         ]
-        for r in sorted(every, key=lambda r: -r.mrr.value)
+        for r in overall
     ]
-    head = ["What it gives and costs", "Width", "R@10", "MRR", "MiB", "s"]
+    head = ["Quality and cost", "Width", "R@10", "MRR", "MiB", "s"]
     note = (
-        "MiB: of what stands for the database. s: to rank for all queries; an exact search ranks "
-        "at all widths at once."
+        "MiB: size of the database's embeddings. s: time to rank all queries; an exact search "
+        "ranks at all widths at once."
     )
-    return Table("costs", "What retrievers give and cost", head, {"": cells}, (note,))
+    return Table("costs", "Quality and cost of retrievers", head, {"": rows}, (note,))
 
 
-def builder_tables(rows: Sequence[RetrievalResult]) -> list[Table]:
-    """A table for each retriever: by builder, at every width, with the intervals."""
+def builder_tables(results: Sequence[RetrievalResult]) -> list[Table]:
+    """A table for each retriever: its measures and their intervals by builder and width."""
     tables = []
-    for name in dict.fromkeys(r.name for r in rows):
-        cells = []
-        for r in [r for r in rows if r.name == name]:
-            of = "all queries" if r.builder is None else f"builder {r.builder}"
-            pairs = zip(_values(r), _ranges(r), strict=True)
-            found = [f"{value} [{span}]" for value, span in pairs]
-            cells.append([of, str(r.width), *found, str(r.queries)])
-        head = [f"{name} by builder", "Width", *_HEADS, "Queries"]
-        tables.append(Table("builders", f"Retrieval by builder: {name}", head, {"": cells}))
+    for name in dict.fromkeys(r.name for r in results):
+        rows = []
+        for r in (r for r in results if r.name == name):
+            queries = "all queries" if r.builder is None else f"builder {r.builder}"
+            pairs = zip(_measures(r), _measure_intervals(r), strict=True)
+            cells = [f"{value} [{interval}]" for value, interval in pairs]
+            rows.append([queries, _width(r), *cells, str(r.queries)])
+        head = [f"{name} by builder", "Width", *MEASURE_COLUMNS, "Queries"]
+        tables.append(Table("builders", f"Retrieval by builder: {name}", head, {"": rows}))
     return tables
 
 
 def index_table(indexes: Sequence[dict[str, Any]]) -> Table:
-    """What is told of approximate indexes, as `evaluation.retrieval.faiss_index` gives it, each
-    with its `name`."""
-    cells = [
+    """Approximate indexes compared with an exact search, as `evaluation.retrieval.faiss_index`
+    describes them, each with a `name`."""
+    rows = [
         [
-            told["name"],
-            str(told["width"]),
-            *(_percent(told[f"recall@{k}"]) for k in RECALLS),
-            f"{told['bytes'] / 2**20:,.1f}",
-            f"{told['seconds']:.2f}",
+            index["name"],
+            str(index["width"]),
+            *(percent(index[f"recall@{k}"]) for k in RECALLS),
+            f"{index['bytes'] / 2**20:,.1f}",
+            f"{index['seconds']:.2f}",
         ]
-        for told in indexes
+        for index in indexes
     ]
-    recalls = [f"R@{k}" for k in RECALLS]
-    head = ["Index, held against exact", "Width", *recalls, "MiB", "s"]
-    note = "R@k: of the exact first k, what share the index has among its own first k."
-    return Table(
-        "indexes", "Approximate indexes held against exact ones", head, {"": cells}, (note,)
-    )
+    head = ["Index against exact search", "Width", *(f"R@{k}" for k in RECALLS), "MiB", "s"]
+    note = "R@k: share of the exact first k that the index also ranks among its first k."
+    caption = "Approximate indexes against exact search"
+    return Table("indexes", caption, head, {"": rows}, (note,))
 
 
-def majority_cells(name: str, found: dict[str, Any]) -> list[list[str]]:
-    """The majority vote of what `evaluation.study.agreement.summary` found, under
-    `SELECTION_HEAD`; nothing where there is none."""
-    if not found["majority"]:
-        return []
-    rows = _human_cells(name, found["majority"])
-    return [[*row[:-1], parsed, row[-1]] for row, parsed in zip(rows, ("-", ""), strict=True)]
+def rank_differences_table(differences: Sequence[dict[str, Any]]) -> Table:
+    """The differences of `evaluation.metrics.breakdown.compare_retrievers`, grouped by the pair of
+    retrievers: for each width a row, and a row of its intervals."""
+    groups: dict[str, Rows] = {}
+    for difference in differences:
+        values, intervals = [], []
+        for measure, found in difference["measures"].items():
+            scale, form = (1, "+.3f") if measure == "mrr" else (100, "+.1f")
+            value, low, high = (f"{scale * found[key]:{form}}" for key in ("value", "low", "high"))
+            values.append(value)
+            intervals.append(f"{low} to {high}")
+        width = "-" if difference["width"] is None else str(difference["width"])
+        rows = groups.setdefault(f"{difference['left']} less {difference['right']}", [])
+        rows += [[f"at width {width}", *values], ["  95% interval", *intervals]]
+    head = ["Difference of recall, %", *(f"R@{k}" for k in RECALLS), "MRR"]
+    note = "Intervals are bootstrapped over scenes."
+    caption = "Differences between retrievers, query by query"
+    return Table("rank-differences", caption, head, groups, (note,))
 
 
-def _human_cells(name: str, of: dict[str, Any]) -> list[list[str]]:
-    each = [Interval(**told) if (told := of["families"].get(f)) else None for f in FAMILIES]
-    micro = Interval(**of["micro"])
-    shares = [*(i and i.value for i in each), of["macro"], micro.value]
-    spans = [*map(interval_cell, each), "", interval_cell(micro)]
-    return [[name, *map(_percent, shares), str(micro.n)], ["  95% interval", *spans, ""]]
-
-
-def human_table(found: dict[str, Any]) -> Table:
-    """What `evaluation.study.agreement.summary` found, beside the paper's study."""
-    own = [row for name, of in found["accuracy"].items() for row in _human_cells(name, of)]
-    if found["majority"]:
-        own += _human_cells("Majority vote", found["majority"])
+def human_table(summary: dict[str, Any]) -> Table:
+    """The `evaluation.study.agreement.summary` of a study beside the paper's."""
+    rows = [
+        row for name, accuracy in summary["accuracy"].items() for row in _human_rows(name, accuracy)
+    ]
+    if summary["majority"]:
+        rows += _human_rows("Majority vote", summary["majority"])
     for clock in ("server", "client"):
-        times = [found["seconds"].get(f, {}).get(clock) for f in FAMILIES]
-        shown = ["-" if t is None else f"{t:.1f}" for t in times]
-        own.append([f"Median seconds, {clock}", *shown, "", "", ""])
-    reference = [
-        [r.name, *map(_printed, (r.event, r.time, r.window, r.macro)), "", items]
-        for r, items in [
-            *((r, "") for r in paper.HUMAN_ANNOTATORS),
-            (paper.HUMAN_MAJORITY, "59"),
-        ]
-    ]
-    seconds = [f"{paper.HUMAN_SECONDS[f]:.1f}" for f in FAMILIES]
-    reference.append(["Median seconds", *seconds, "", "", ""])
-    head = ["Human accuracy, %", *(f.capitalize() for f in FAMILIES), "Macro", "Micro", "Items"]
-    parts = {"": own, "paper, Table 11 (59 items of three simulators)": reference}
-    return Table("human", "Human accuracy (%)", head, parts, _human_notes(found))
+        times = [summary["seconds"].get(family, {}).get(clock) for family in FAMILIES]
+        cells = ["-" if time is None else f"{time:.1f}" for time in times]
+        rows.append([f"Median seconds, {clock}", *cells, "", "", ""])
+    columns = [*FAMILY_COLUMNS, "Macro", "Micro", "Items"]
+    groups = {
+        "": rows,
+        "paper, Table 11 (59 items of three simulators)": [
+            row
+            for name in ("human_annotators", "human_majority", "human_seconds")
+            for row in reference_rows(name, columns)
+        ],
+    }
+    head = ["Human accuracy, %", *columns]
+    return Table("human", "Human accuracy (%)", head, groups, _human_notes(summary))
 
 
-def _human_notes(found: dict[str, Any]) -> tuple[str, ...]:
-    depth = [f"{items} by {votes}" for votes, items in found["depth"].items()]
-    kappa, alpha = found["fleiss_kappa"], found["krippendorff_alpha"]
-    undecided = found["majority"]["undecided"] if found["majority"] else 0
+def majority_rows(name: str, summary: dict[str, Any]) -> Rows:
+    """The majority vote of a study's summary under `SELECTION_COLUMNS`; no row without votes."""
+    return _human_rows(name, summary["majority"], ["-"]) if summary["majority"] else []
+
+
+def _human_rows(name: str, accuracy: dict[str, Any], parsed: Sequence[str] = ()) -> Rows:
+    families = {family: Interval(**share) for family, share in accuracy["families"].items()}
+    return _accuracy_rows(name, families, accuracy["macro"], Interval(**accuracy["micro"]), parsed)
+
+
+def _human_notes(summary: dict[str, Any]) -> tuple[str, ...]:
+    depth = [f"{items} with {votes}" for votes, items in summary["depth"].items()]
+    kappa, alpha = summary["fleiss_kappa"], summary["krippendorff_alpha"]
+    undecided = summary["majority"]["undecided"] if summary["majority"] else 0
     return (
-        "Intervals are Wilson's, over items.",
-        f"{found['judgments']:,} judgments of {found['items']:,} items; items by how many answered "
-        f"them: {', '.join(depth)}.",
-        f"Majority is more than half of an item's votes; items without one, counted wrong: "
-        f"{undecided}.",
-        f"Fleiss' kappa {_agreed(kappa['value'])} on the {kappa['items']} items that all "
-        f"{len(found['annotators'])} answered (paper {paper.HUMAN_KAPPA:.2f} on 19).",
-        f"Krippendorff's alpha {_agreed(alpha['value'])} on the {alpha['items']} items of two "
-        "votes or more.",
-        "Seconds are of pages that were loaded once; the server's go on while it is away.",
+        "Wilson 95% intervals over items.",
+        f"{summary['judgments']:,} judgments of {summary['items']:,} items; items by their number "
+        f"of judgments: {', '.join(depth)}.",
+        f"A majority is more than half of an item's votes; {undecided} items have none and count "
+        "as wrong.",
+        f"Fleiss' kappa: {_agreement(kappa['value'])} on the {kappa['items']} items that all "
+        f"{len(summary['annotators'])} annotators answered (paper: {reference('human_kappa'):.2f} "
+        "on 19).",
+        f"Krippendorff's alpha: {_agreement(alpha['value'])} on the {alpha['items']} items with "
+        "two votes or more.",
+        "Seconds: only pages that were loaded once; the server's clock includes time in which the "
+        "server was down.",
     )
 
 
-def _agreed(value: float | None) -> str:
+def _agreement(value: float | None) -> str:
     return "undefined" if value is None else f"{value:.2f}"
 
 
-def _values(row: RetrievalResult) -> list[str]:
-    found = row.measures
-    recalls = [_percent(found[f"recall@{k}"].value) for k in RECALLS]
-    median, ties = f"{row.median_rank.value:g}", _percent(row.tie_rate.value)
-    return [*recalls, f"{row.mrr.value:.3f}", median, ties]
+def _width(result: RetrievalResult) -> str:
+    return "-" if result.width is None else str(result.width)
 
 
-def _ranges(row: RetrievalResult) -> list[str]:
-    found = row.measures
-    recalls = [interval_cell(found[f"recall@{k}"]) for k in RECALLS]
-    mrr = f"{row.mrr.low:.2f}-{row.mrr.high:.2f}"
-    median = f"{row.median_rank.low:.0f}-{row.median_rank.high:.0f}"
-    return [*recalls, mrr, median, interval_cell(row.tie_rate)]
+def _measures(result: RetrievalResult) -> list[str]:
+    recalls = [percent(result.measures[f"recall@{k}"].value) for k in RECALLS]
+    median, ties = f"{result.median_rank.value:g}", percent(result.tie_rate.value)
+    return [*recalls, f"{result.mrr.value:.3f}", median, ties]
 
 
-def _percent(share: float | None) -> str:
+def _measure_intervals(result: RetrievalResult) -> list[str]:
+    recalls = [interval_cell(result.measures[f"recall@{k}"]) for k in RECALLS]
+    mrr = f"{result.mrr.low:.2f}-{result.mrr.high:.2f}"
+    median = f"{result.median_rank.low:.0f}-{result.median_rank.high:.0f}"
+    return [*recalls, mrr, median, interval_cell(result.tie_rate)]
+
+
+def _share_cell(share: Interval) -> str:
+    return f"{percent(share.value)} [{interval_cell(share)}]"
+
+
+def percent(share: float | None) -> str:
     return "-" if share is None else f"{100 * share:.1f}"
 
 
-def _printed(percent: float | None) -> str:
-    return "-" if percent is None else f"{percent:.1f}"
-
-
-def interval_cell(found: Interval | None) -> str:
-    """An interval's ends in percent, nothing where there is none."""
-    return "" if found is None else f"{100 * found.low:.0f}-{100 * found.high:.0f}"
+def interval_cell(interval: Interval | None) -> str:
+    """Both ends of an interval in percent; empty for None."""
+    return "" if interval is None else f"{100 * interval.low:.0f}-{100 * interval.high:.0f}"

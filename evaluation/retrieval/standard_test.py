@@ -17,7 +17,7 @@ from data.records import FrameRef, RetrievalQuery
 from data.store import Store
 from data.tracks.retrieval.checks import check_test
 from evaluation.embedders.cache import EmbeddingCache
-from evaluation.reporting import figures, reference, tables
+from evaluation.reporting import figures, tables
 from evaluation.reporting.results import RetrievalResult
 from evaluation.reporting.table import Table
 from evaluation.retrieval.exact_search import Ranks, exact_ranks
@@ -77,12 +77,12 @@ def write_report(
     rows: Sequence[RetrievalResult],
     curves: Sequence[dict[str, Any]],
     told: Sequence[Table] = (),
-    reference: Sequence[reference.RetrievalReference] = reference.RETRIEVAL_DISTILLED,
+    reference_group: str = "retrieval_distilled",
     **also: Any,
 ) -> None:
     """Write report.txt, report.json and the figures of some rows; `told` are more tables and `also`
     more entries."""
-    table = f"{tables.retrieval_table(rows, reference)}\n\n{tables.cost_table(rows)}"
+    table = f"{tables.retrieval_table(rows, reference_group)}\n\n{tables.cost_table(rows)}"
     log.info("%s", table)
     page = "\n\n".join(map(str, [table, *told, *tables.builder_tables(rows)]))
     write_text(folder / "report.txt", page + "\n")

@@ -1,125 +1,129 @@
 "use strict";
 
-// Everything that a model said is set as text, never as markup.
+// Responses of models are set as text, never as markup.
 const { items, frames } = JSON.parse(document.getElementById("data").textContent);
 const PER_PAGE = 10;
 const ANY = "any";
 const form = document.getElementById("filters");
 const list = document.getElementById("list");
 const more = document.getElementById("more");
-let found = [];
+let matching = [];
 
-function made(tag, className, text) {
-  const element = document.createElement(tag);
-  if (className) element.className = className;
-  if (text !== undefined) element.textContent = text;
-  return element;
+function element(tag, className, text) {
+  const created = document.createElement(tag);
+  if (className) created.className = className;
+  if (text !== undefined) created.textContent = text;
+  return created;
 }
 
 function distinct(values) {
   return [...new Set(values)].sort();
 }
 
-function fill(name, values) {
+function fillOptions(name, values) {
   const select = form.elements[name];
-  const before = select.value;
+  const previous = select.value;
   select.replaceChildren(
     ...[ANY, ...values].map((value) => {
-      const option = made("option", "", value);
+      const option = element("option", "", value);
       option.value = value;
       return option;
     }),
   );
-  select.value = values.includes(before) ? before : ANY;
+  select.value = values.includes(previous) ? previous : ANY;
 }
 
-function fits(value, name) {
+function passes(value, name) {
   const wanted = form.elements[name].value;
   return wanted === ANY || wanted === value;
 }
 
 function fillSubtypes() {
-  const of = items.filter((item) => fits(item.family, "family"));
-  fill("subtype", distinct(of.map((item) => item.subtype)));
+  const ofFamily = items.filter((item) => passes(item.family, "family"));
+  fillOptions("subtype", distinct(ofFamily.map((item) => item.subtype)));
 }
 
-function answersShown(item) {
-  return item.said.filter((said) => fits(said.by, "by"));
+function visibleResponses(item) {
+  return item.responses.filter((response) => passes(response.model, "model"));
 }
 
 function matches(item) {
   return (
-    fits(item.benchmark, "benchmark") &&
-    fits(item.family, "family") &&
-    fits(item.subtype, "subtype") &&
-    answersShown(item).some((said) => fits(said.verdict, "verdict"))
+    passes(item.benchmark, "benchmark") &&
+    passes(item.family, "family") &&
+    passes(item.subtype, "subtype") &&
+    visibleResponses(item).some((response) => passes(response.verdict, "verdict"))
   );
 }
 
-function picture(name, caption, className) {
-  const figure = made("figure", className);
+function frameFigure(name, caption, className) {
+  const figure = element("figure", className);
   if (frames[name]) {
-    const image = made("img");
+    const image = element("img");
     image.src = frames[name];
     image.alt = caption;
     figure.append(image);
   } else {
-    figure.append(made("div", "gone", "frame is missing"));
+    figure.append(element("div", "gone", "frame is missing"));
   }
-  figure.append(made("figcaption", "", caption));
+  figure.append(element("figcaption", "", caption));
   return figure;
 }
 
-function answer(said) {
-  const block = made("div", "answer");
-  const verdict = said.letter ? `${said.letter}, ${said.verdict}` : `no letter (${said.reason})`;
-  const head = made("div");
-  head.append(made("span", "", `${said.by}: `), made("span", `verdict ${said.verdict}`, verdict));
-  if (said.cut) head.append(made("span", "", " (stopped before its end)"));
-  block.append(head, made("pre", "", said.text));
+function responseBlock(response) {
+  const { letter, verdict, reason } = response;
+  const block = element("div", "answer");
+  const head = element("div");
+  head.append(
+    element("span", "", `${response.model}: `),
+    element("span", `verdict ${verdict}`, letter ? `${letter}, ${verdict}` : `no letter (${reason})`),
+  );
+  if (response.truncated) head.append(element("span", "", " (truncated)"));
+  block.append(head, element("pre", "", response.text));
   return block;
 }
 
-function drawn(item) {
-  const article = made("article");
+function itemArticle(item) {
+  const article = element("article");
   article.dataset.id = item.id;
   article.append(
-    made("h3", "", `${item.family}, ${item.subtype}`),
-    made("div", "note", `${item.id}, ${item.benchmark}`),
-    made("p", "", item.question),
-    made("div", "note", `Observed: ${item.observed}`),
+    element("h3", "", `${item.family}, ${item.subtype}`),
+    element("div", "note", `${item.id}, ${item.benchmark}`),
+    element("p", "", item.question),
+    element("div", "note", `Observed: ${item.observed}`),
   );
-  const prefix = made("div", "frames");
-  prefix.append(...item.prefix.map((name) => picture(name, `frame ${name.split("/").pop()}`)));
-  const candidates = made("div", "frames candidates");
+  const prefix = element("div", "frames");
+  prefix.append(...item.prefix.map((name) => frameFigure(name, `frame ${name.split("/").pop()}`)));
+  const candidates = element("div", "frames candidates");
   candidates.append(
     ...item.candidates.map((c) =>
-      picture(c.frame, `${c.letter}: ${c.told}`, c.letter === item.answer ? "target" : ""),
+      frameFigure(c.frame, `${c.letter}: ${c.caption}`, c.letter === item.answer ? "target" : ""),
     ),
   );
-  article.append(prefix, made("div", "note", "Candidates, the right one framed:"), candidates);
-  article.append(...item.truth.map((sentence) => made("p", "truth", sentence)));
-  article.append(...answersShown(item).map(answer));
+  article.append(prefix, element("div", "note", "Candidates (the target is framed):"), candidates);
+  article.append(...item.truth.map((sentence) => element("p", "truth", sentence)));
+  article.append(...visibleResponses(item).map(responseBlock));
   return article;
 }
 
 function showMore() {
   const begin = list.childElementCount;
-  list.append(...found.slice(begin, begin + PER_PAGE).map(drawn));
-  more.hidden = list.childElementCount >= found.length;
+  list.append(...matching.slice(begin, begin + PER_PAGE).map(itemArticle));
+  more.hidden = list.childElementCount >= matching.length;
 }
 
 function show() {
-  found = items.filter(matches);
-  document.getElementById("count").textContent = `${found.length} of ${items.length} items`;
+  matching = items.filter(matches);
+  document.getElementById("count").textContent = `${matching.length} of ${items.length} items`;
   list.replaceChildren();
   showMore();
 }
 
-fill("benchmark", distinct(items.map((item) => item.benchmark)));
-fill("family", distinct(items.map((item) => item.family)));
-fill("by", distinct(items.flatMap((item) => item.said.map((said) => said.by))));
-fill("verdict", distinct(items.flatMap((item) => item.said.map((said) => said.verdict))));
+const responses = items.flatMap((item) => item.responses);
+fillOptions("benchmark", distinct(items.map((item) => item.benchmark)));
+fillOptions("family", distinct(items.map((item) => item.family)));
+fillOptions("model", distinct(responses.map((response) => response.model)));
+fillOptions("verdict", distinct(responses.map((response) => response.verdict)));
 fillSubtypes();
 form.addEventListener("change", (event) => {
   if (event.target.name === "family") fillSubtypes();
@@ -129,7 +133,7 @@ form.addEventListener("submit", (event) => event.preventDefault());
 more.addEventListener("click", () => {
   const begin = list.childElementCount;
   showMore();
-  // Whoever goes by keyboard goes on at the first new item.
+  // Keyboard focus moves to the first new item.
   const next = list.children[begin];
   next.tabIndex = -1;
   next.focus();

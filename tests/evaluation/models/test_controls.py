@@ -59,7 +59,7 @@ def test_a_prefix_is_worth_what_its_items_lose_without_it(
     assert metrics["answer_micro"] == rows[1].micro.value == control / 12
     whole = next(p for p in told["controls"] if p["of"] == "all")
     assert (whole["mode"], whole["left"], whole["right"]) == (
-        "answer", "as they are", "candidate_only",
+        "answer", "unchanged", "candidate_only",
     )  # fmt: skip
     assert (whole["only_left"], whole["only_right"], whole["n"]) == (plain, control, 12)
     assert whole["difference"] == pytest.approx((plain - control) / 12)

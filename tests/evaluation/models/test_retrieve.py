@@ -125,7 +125,7 @@ def test_it_is_measured_once_and_read_back(world, tmp_path, micro_store) -> None
     lines = (tmp_path / "one" / "ranks.jsonl").read_text().splitlines()
     kept = [json.loads(line) for line in lines]
     assert [k["query_id"] for k in kept] == 2 * [q.query_id for q in queries]
-    for k, of in enumerate(first["apart"]):
+    for k, of in enumerate(first["differences"]):
         sides = [every[of[side], of["width"]] for side in ("left", "right")]
         assert "untrained" not in of["left"]
         for name, found in of["measures"].items():
@@ -137,7 +137,7 @@ def test_it_is_measured_once_and_read_back(world, tmp_path, micro_store) -> None
         every_found = np.ones(len(own), bool)
         counted = ranking_metrics(before, tied, every_found, len(database), [1])
         assert counted["mrr"] == pytest.approx(sides[0]["mrr"]["value"])
-    assert [of["width"] for of in first["apart"]] == CFG.widths
+    assert [of["width"] for of in first["differences"]] == CFG.widths
     for picture in ("retrieval.png", "builders.png"):
         assert (tmp_path / "one" / picture).stat().st_size > 10_000
     text = (tmp_path / "one" / "report.txt").read_text()

@@ -1,4 +1,4 @@
-"""Finished runs as the commands leave them, of models that say what a test wants."""
+"""Finished runs as the commands write them, of models whose responses a test chooses."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def retrieve_run(
     told = {"build": store.identity, "curves": curves, "indexes": []}
     report = {"rows": [r.to_dict() for r in rows], **told}
     if kind == "retrieve":
-        report["apart"] = compare_retrievers(found, queries, 0)
+        report["differences"] = compare_retrievers(found, queries, 0)
     settings = RetrieveCommand(
         benchmark=benchmark, retriever=RetrieverConfig(name="small"),
         model=f"{root}/contrastive/{name}",
@@ -187,3 +187,8 @@ def reported(root: Path, store: Path, **settings) -> Path:
     cfg = ReportCommand(checkpoints=str(root), store=str(store), **settings)
     report.main.__wrapped__(cfg, Run("default", folder))
     return folder
+
+
+def read_table(folder: Path, name: str) -> str:
+    """A table of a report, in Markdown."""
+    return (folder / "tables" / f"{name}.md").read_text()

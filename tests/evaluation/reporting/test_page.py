@@ -1,5 +1,4 @@
-"""The page in a real Chromium, from its file alone: on a phone and a desk, light and dark, by its
-filters and by keyboard."""
+"""The page in Chromium, from its file alone: narrow and wide, light and dark, mouse and keys."""
 
 from __future__ import annotations
 
@@ -40,7 +39,7 @@ def chromium(tmp_path_factory) -> Iterator[webdriver.Chrome]:
 
 @pytest.fixture(scope="module")
 def page(measured, micro_store, tmp_path_factory) -> Path:
-    """The report's page alone, moved away from all that it was made of."""
+    """The page alone, moved away from the run folder."""
     folder = tmp_path_factory.mktemp("report")
     cfg = ReportCommand(checkpoints=str(measured), store=str(micro_store.folder.parent), items=60)
     report.main.__wrapped__(cfg, Run("default", folder))
@@ -58,7 +57,7 @@ def look(browser: webdriver.Chrome, page: Path, width: int, light: str = "light"
 
 
 def choose(browser: webdriver.Chrome, **values: str) -> list[str]:
-    """Set filters, and tell the ids of what is then shown, all of it."""
+    """Set filters, and return the ids of all items that match."""
     for name, value in values.items():
         Select(browser.find_element(By.NAME, name)).select_by_value(value)
     more = browser.find_element(By.ID, "more")
@@ -75,12 +74,14 @@ def items_of(browser: webdriver.Chrome) -> list[dict]:
 
 @pytest.mark.parametrize("width", [360, 1280])
 @pytest.mark.parametrize("light", ["light", "dark"])
-def test_it_fits_and_can_be_read(chromium, page, width, light):
+def test_page_fits_the_screen_and_has_contrast(chromium, page, width, light):
     look(chromium, page, width, light)
     for fold in chromium.find_elements(By.TAG_NAME, "summary"):
         fold.click()
     # A run may have a long name.
-    chromium.execute_script("document.getElementsByName('by')[0].add(new Option('run'.repeat(30)))")
+    chromium.execute_script(
+        "document.getElementsByName('model')[0].add(new Option('run'.repeat(30)))"
+    )
     assert not chromium.execute_script(OVERFLOW)
     for name in ("body", "td", "svg text"):
         part = chromium.find_element(By.CSS_SELECTOR, name)
@@ -91,28 +92,28 @@ def test_it_fits_and_can_be_read(chromium, page, width, light):
     assert behind < 0.2 if light == "dark" else behind > 0.9
 
 
-def test_it_asks_nobody_for_anything_and_complains_of_nothing(chromium, page):
+def test_page_sends_no_request_and_logs_no_error(chromium, page):
     chromium.get_log("browser")
     look(chromium, page, 1280)
     choose(chromium)
     assert chromium.execute_script(REQUESTED) == []
-    # What the page forbids itself would be told here, too.
+    # Violations of the page's content security policy would be logged here, too.
     assert chromium.get_log("browser") == []
     chromium.execute_script("new Image().src = 'http://127.0.0.1:9/x.png'")
     [refused] = chromium.get_log("browser")
     assert "Content Security Policy" in refused["message"]
 
 
-def test_what_a_model_said_is_text(chromium, page):
+def test_responses_are_text_not_markup(chromium, page):
     look(chromium, page, 1280)
     choose(chromium)
     assert chromium.title == "DynaPix report"
-    said = "return [...document.querySelectorAll('pre')].map((pre) => pre.textContent)"
-    assert HOSTILE in chromium.execute_script(said)
+    texts = "return [...document.querySelectorAll('pre')].map((pre) => pre.textContent)"
+    assert HOSTILE in chromium.execute_script(texts)
     assert chromium.find_elements(By.CSS_SELECTOR, "pre *") == []
 
 
-def test_an_item_shows_its_frames_and_which_is_right(chromium, page):
+def test_an_item_shows_its_frames_and_marks_the_target(chromium, page):
     look(chromium, page, 1280)
     item = next(i for i in items_of(chromium) if i["id"] == choose(chromium)[0])
     article = chromium.find_element(By.TAG_NAME, "article")
@@ -124,7 +125,7 @@ def test_an_item_shows_its_frames_and_which_is_right(chromium, page):
     assert item["question"] in article.text
 
 
-def test_filters_show_what_they_say(chromium, page):
+def test_filters_select_items(chromium, page):
     look(chromium, page, 1280)
     items = items_of(chromium)
     assert len(choose(chromium)) == len(items) == 60
@@ -137,18 +138,18 @@ def test_filters_show_what_they_say(chromium, page):
     assert choose(chromium, subtype=subtype) == [
         i["id"] for i in items if i["family"] == "window" and i["subtype"] == subtype
     ]
-    # Another family has other subtypes, so the choice of one is given up.
+    # Another family has other subtypes, so the filter of subtypes is reset.
     assert choose(chromium, family="time") == [i["id"] for i in items if i["family"] == "time"]
     label = "small base (record)"
-    of_base = {i["id"]: s["verdict"] for i in items for s in i["said"] if s["by"] == label}
-    for verdict in ("right", "wrong"):
+    of_base = {i["id"]: s["verdict"] for i in items for s in i["responses"] if s["model"] == label}
+    for verdict in ("correct", "wrong"):
         wanted = [name for name, given in of_base.items() if given == verdict]
-        assert choose(chromium, family="any", by=label, verdict=verdict) == wanted
-    assert choose(chromium, by="cot (reasoning)", verdict="wrong") == []
+        assert choose(chromium, family="any", model=label, verdict=verdict) == wanted
+    assert choose(chromium, model="cot (reasoning)", verdict="wrong") == []
     assert chromium.find_element(By.ID, "count").text == "0 of 60 items"
 
 
-def test_it_can_be_used_by_keyboard_alone(chromium, page):
+def test_page_works_by_keyboard(chromium, page):
     look(chromium, page, 1280)
     reached = []
     body = chromium.find_element(By.TAG_NAME, "body")
@@ -159,7 +160,7 @@ def test_it_can_be_used_by_keyboard_alone(chromium, page):
         reached.append(focused.get_attribute("name") or focused.get_attribute("id"))
         if reached[-1] == "more":
             break
-    assert {"benchmark", "family", "subtype", "by", "verdict", "more"} <= set(reached)
+    assert {"benchmark", "family", "subtype", "model", "verdict", "more"} <= set(reached)
     before = len(chromium.execute_script(SHOWN))
     chromium.switch_to.active_element.send_keys(Keys.ENTER)
     assert len(chromium.execute_script(SHOWN)) == 2 * before

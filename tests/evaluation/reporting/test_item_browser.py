@@ -1,0 +1,138 @@
+"""The items, frames and responses that the page shows."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from conf.errors import UserError
+from data.records import LETTERS
+from data.render.frame_cache import FrameReader
+from evaluation.reporting import item_browser
+from evaluation.reporting.page import script_json
+from evaluation.reporting.run_responses import SimilarityResponse, TextResponse
+
+
+@pytest.fixture(scope="module")
+def items(micro_store):
+    return micro_store.selection("train")
+
+
+@pytest.fixture(scope="module")
+def responses(items):
+    """Two models that answer at random."""
+    rng = np.random.default_rng(5)
+    return {
+        label: {i.item_id: TextResponse(f"Answer: {rng.choice([*LETTERS])}", False) for i in items}
+        for label in ("one", "other")
+    }
+
+
+def cells(items, responses):
+    """The ids by (family, subtype, model, correct)."""
+    found = defaultdict(set)
+    for item in items:
+        for label, of_model in responses.items():
+            correct = of_model[item.item_id].answer.letter == item.letter
+            found[item.family, item.subtype, label, correct].add(item.item_id)
+    return found
+
+
+def test_chosen_items_cover_correct_and_wrong_answers_of_every_subtype(items, responses):
+    one = {"one": responses["one"]}
+    expected = cells(items, one)
+    chosen = item_browser.choose_items(items, one, len(expected), 0)
+    assert len({i.item_id for i in chosen}) == len(chosen) == len(expected)
+    assert cells(chosen, one).keys() == expected.keys()
+    both = item_browser.choose_items(items, responses, len(expected), 0)
+    assert len(cells(both, responses)) > 0.8 * len(cells(items, responses))
+    assert item_browser.choose_items(items, responses, len(expected), 0) == both
+    assert item_browser.choose_items(items, responses, len(expected), 1) != both
+    everything = item_browser.choose_items(items, responses, 10**6, 0)
+    assert {i.item_id for i in everything} == {i.item_id for i in items}
+    assert item_browser.choose_items(items, responses, 0, 0) == []
+
+
+def test_every_frame_is_encoded_once_and_small(micro_store, items):
+    few = [*items[:6], items[0]]
+    frames, errors = item_browser.encode_frames(few, micro_store)
+    assert errors == []
+    entries = list(item_browser.page_entries(few, {}, micro_store))
+    names = {n for e in entries for n in (*e["prefix"], *(c["frame"] for c in e["candidates"]))}
+    assert names == frames.keys()
+    for url in frames.values():
+        kind, _, content = url.partition(",")
+        assert kind == "data:image/webp;base64"
+        image = Image.open(io.BytesIO(base64.b64decode(content)))
+        assert (image.format, image.width) == ("WEBP", item_browser.FRAME_WIDTH)
+        assert len(content) < 12_000
+    target = f"{micro_store.name}/{few[0].scene_id}/{few[0].target_frame}"
+    assert entries[0]["candidates"][few[0].answer]["frame"] == target
+
+
+def test_missing_frames_are_reported_and_the_others_stay(micro_store, items, monkeypatch):
+    lost = items[0].scene_id
+    read = FrameReader.stack
+
+    def partly(self, scene_id, frames):
+        if scene_id == lost:
+            raise UserError(f"the video of {scene_id} is missing")
+        return read(self, scene_id, frames)
+
+    monkeypatch.setattr(FrameReader, "stack", partly)
+    few = [items[0], next(i for i in items if i.scene_id != lost and i.family == "time")]
+    frames, errors = item_browser.encode_frames(few, micro_store)
+    assert errors == [f"the video of {lost} is missing"]
+    assert frames
+    assert not [name for name in frames if f"/{lost}/" in name]
+
+
+@pytest.mark.parametrize(
+    ("text", "verdict"),
+    [
+        ("Answer: {right}", "correct"),
+        ("Answer: {wrong}", "wrong"),
+        ("I cannot tell.", "unparsed"),
+        ("", "unparsed"),
+    ],
+)
+def test_a_response_has_the_verdict_of_its_parsed_answer(micro_store, items, text, verdict):
+    item = items[0]
+    wrong = next(letter for letter in LETTERS if letter != item.letter)
+    response = TextResponse(text.format(right=item.letter, wrong=wrong), False)
+    [entry] = item_browser.page_entries([item], {"one": {item.item_id: response}}, micro_store)
+    [shown] = entry["responses"]
+    assert (shown["model"], shown["verdict"]) == ("one", verdict)
+    assert (shown["letter"] is None) == (verdict == "unparsed")
+    assert entry["truth"][0].startswith(f"{item.letter} is correct: frame {item.target_frame}")
+
+
+def test_a_long_response_is_shortened_with_a_note(micro_store, items):
+    response = TextResponse("Answer: A\n" + "word " * 200_000, True)
+    by_label = {"one": {items[0].item_id: response}}
+    [entry] = item_browser.page_entries(items[:1], by_label, micro_store)
+    text = entry["responses"][0]["text"]
+    assert len(text) < item_browser.TEXT_LIMIT + 200
+    assert text.startswith("Answer: A\nword")
+    assert "1,000,010 characters" in text
+
+
+def test_tied_candidates_share_the_credit():
+    tie = SimilarityResponse(dict(zip(LETTERS, (0.5, None, 0.5, 0.25), strict=True)))
+    assert [tie.credit(x) for x in LETTERS] == [0.5, 0, 0.5, 0]
+    assert (tie.answer.letter, str(tie.answer.reason)) == (None, "several")
+    assert tie.text == "A 0.5000, B no score, C 0.5000, D 0.2500"
+    assert SimilarityResponse(dict.fromkeys(LETTERS)).credit("A") == 0
+
+
+def test_embedded_json_reads_back_and_closes_no_script():
+    value = {"text": "</script><script>alert(1)</script><!-- \u2028 & 'quotes' \"", "n": [1, None]}
+    text = str(script_json(value))
+    assert "<" not in text
+    assert json.loads(text) == value

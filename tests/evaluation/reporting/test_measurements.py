@@ -1,0 +1,77 @@
+"""The rows of the report's tables, and their names."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from conf.schema import ExportStudyCommand
+from data.records import FAMILIES
+from evaluation.study.agreement import summary
+from tests.evaluation.reporting.measured import (
+    finish,
+    read_table,
+    reported,
+    retrieve_run,
+    similarity_run,
+)
+from tests.evaluation.study.test_agreement import vote
+from tests.user_errors import raises_user_error
+
+
+def change_first_row(report: Path, **row: object) -> None:
+    content = json.loads(report.read_text())
+    content["rows"][0] |= row
+    report.write_text(json.dumps(content))
+
+
+def test_a_model_that_is_measured_twice_keeps_its_line(runs):
+    # Another seed gives another interval.
+    shutil.copytree(runs / "select" / "cot", runs / "select" / "again")
+    macro = {"value": 1.0, "low": 0.9, "high": 1.0, "n": 8}
+    change_first_row(runs / "select" / "again" / "report.json", macro_interval=macro)
+    shutil.copytree(runs / "select" / "cot", runs / "select" / "elsewhere")
+    change_first_row(runs / "select" / "elsewhere" / "report.json", benchmark="elsewhere")
+    folder = reported(runs, runs, items=1)
+    for name, line in (("transfer", "cot (reasoning)"), ("ablation", "full student (cot)")):
+        table = read_table(folder, name)
+        [row] = [row for row in table.splitlines() if row.startswith(f"| {line} |")]
+        assert "100.0" in row.split("|")[2]
+        assert "cot, cot" in table
+
+
+def test_runs_of_unknown_items_are_compared_by_limit_and_seed(runs, micro, micro_store) -> None:
+    for seed, name in enumerate(("one", "two")):
+        folder = similarity_run(runs, micro_store, micro, name, limit=9)
+        (folder / "scores.jsonl").unlink()
+        settings = OmegaConf.load(folder / "config.yaml")
+        settings.seed = seed
+        OmegaConf.save(settings, folder / "config.yaml")
+    with raises_user_error("different-items", contains=("(9, 0)", "(9, 1)")):
+        reported(runs, micro_store.folder.parent, runs=["similarity/one", "similarity/two"])
+
+
+def test_a_common_base_has_one_curve_and_two_runs_have_names(runs, micro, micro_store):
+    retrieve_run(runs, micro_store, micro, "other")
+    folder = reported(runs, micro_store.folder.parent, runs=["retrieve/*"], items=1)
+    svg = (folder / "figures" / "recall-micro.svg").read_text()
+    assert svg.count(">untrained small<") == 1
+    assert svg.count(">emb<") == svg.count(">other<") == 1
+
+
+def test_the_majority_vote_of_the_same_build_is_a_row_that_does_not_compete(runs, micro_store):
+    votes = [vote(name, k, 0, FAMILIES[k % 3]) for k in range(6) for name in ("A1", "A2")]
+    found = {"benchmark": "micro", "build": micro_store.identity, **summary(votes, 6, ["A1", "A2"])}
+    finish(runs / "export_study" / "pilot", ExportStudyCommand(run="pilot"), found)
+    folder = reported(runs, micro_store.folder.parent, items=0)
+    # Every vote is correct, and no cell is bold.
+    whole = " | ".join(["100.0"] * 5)
+    row = f"| Majority vote, pilot | {whole} | - | 6 |"
+    assert row in read_table(folder, "selection-micro")
+    for other in ({"benchmark": "elsewhere"}, {"build": "before"}):
+        (runs / "export_study" / "pilot" / "report.json").write_text(json.dumps({**found, **other}))
+        folder = reported(runs, micro_store.folder.parent, items=0)
+        assert "Majority vote, pilot" not in read_table(folder, "selection-micro")

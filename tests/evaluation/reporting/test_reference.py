@@ -1,0 +1,72 @@
+"""The paper's printed numbers are consistent with each other."""
+
+import pytest
+
+from evaluation.reporting.reference import COT_STUDENT, reference, reference_rows
+
+ITEMS = {"Event": 249, "Time": 374, "Window": 1585}
+HORIZON_ITEMS = {"1 s": 111, "2 s": 263}
+SELECTION = [
+    row
+    for group in ("chance", "human_majority", "selection_similarity", "selection_generative",
+                  "selection_distilled")
+    for row in reference(group)
+]  # fmt: skip
+RETRIEVAL = [
+    row
+    for group in ("retrieval_direct", "retrieval_two_stage", "retrieval_distilled")
+    for row in reference(group)
+]
+
+
+def named(group: str, name: str) -> dict:
+    return next(row for row in reference(group) if row["name"] == name)
+
+
+@pytest.mark.parametrize("row", SELECTION, ids=lambda row: row["name"])
+def test_macro_is_the_mean_of_the_families(row):
+    # Each printed number is within 0.05 of the true one.
+    assert row["Macro"] == pytest.approx(sum(row[f] for f in ITEMS) / 3, abs=0.1)
+
+
+@pytest.mark.parametrize("row", reference("selection_distilled"), ids=lambda row: row["name"])
+def test_pooled_accuracies_are_the_means_weighted_by_items(row):
+    pooled = sum(row[f] * n for f, n in ITEMS.items()) / sum(ITEMS.values())
+    assert row["Micro"] == pytest.approx(pooled, abs=0.1)
+    if "horizons" in row:
+        time = sum(row["horizons"][h] * n for h, n in HORIZON_ITEMS.items()) / ITEMS["Time"]
+        assert row["Time"] == pytest.approx(time, abs=0.1)
+
+
+def test_rows_that_the_paper_prints_twice_agree():
+    base = named("selection_distilled", "Zero-shot (base)")
+    released = named("selection_generative", "Qwen3-VL-8B (instruct)")
+    assert all(base[key] == released[key] for key in ("Event", "Time", "Window", "Macro"))
+    for one, other in (
+        (reference("retrieval_two_stage")[0], reference("retrieval_distilled")[0]),
+        (reference("retrieval_direct")[-1], reference("retrieval_distilled")[2]),
+    ):
+        assert all(one[key] == other[key] for key in one if key != "name")
+    assert reference("transfer")[0]["In domain"] == base["Micro"]
+    cot = named("selection_distilled", COT_STUDENT)
+    assert reference("ablation")[0]["In domain"] == cot["Micro"]
+
+
+@pytest.mark.parametrize("row", RETRIEVAL, ids=lambda row: row["name"])
+def test_retrieval_rows_are_possible(row):
+    assert 0 < row["R@1"] < row["R@10"] < row["R@50"] < 100
+    assert row["R@1"] / 100 < row["MRR"] < 1
+    assert (row["Median"] <= 10) == (row["R@10"] >= 50)
+    assert (row["Median"] <= 50) == (row["R@50"] >= 50)
+
+
+def test_cells_show_missing_values_and_horizons():
+    rows = reference_rows("selection_generative", ["Event", "Micro", "Parsed"])
+    assert rows[1] == ["Qwen3-VL-8B (instruct)", "64.7", "", "-"]
+    assert rows[2] == ["Qwen3-VL-8B (thinking)", "65.1", "", "66.4"]
+    assert reference_rows("selection_distilled", ["Time", "Micro"])[1] == [
+        "  time, 1 s",
+        "28.8",
+        "",
+    ]
+    assert reference_rows("retrieval_direct", ["MRR", "Median"])[0] == ["CLIP", "0.041", "404"]
