@@ -1,4 +1,4 @@
-"""Export scenes as CLEVRER's release has them, so that a loader written for it reads them."""
+"""Export scenes in the layout of CLEVRER's release, for loaders that were written for it."""
 
 from __future__ import annotations
 
@@ -21,20 +21,22 @@ from data.store import Store, load_scene, scene_path, write_atomically
 
 FIRST_VALIDATION, FIRST_TEST = 10_000, 15_000
 BLOCK = 1_000
-"""Scenes that share a folder."""
+"""Scenes per folder."""
 QUALITY = "6"
-"""x264's constant rate factor: no loss that is seen."""
+"""x264's constant rate factor; the loss is not visible."""
 
 
 def export_clevrer(store: Store, folder: Path, workers: Workers) -> int:
-    """Write every scene of a benchmark with all its frames as a release of CLEVRER, training scenes
-    as its train part and test scenes as its validation part; scenes that are there stay.
+    """Write every scene of a benchmark with all its frames as a release of CLEVRER.
+
+    Training scenes become the train part and test scenes the validation part. Existing scenes are
+    not written again.
 
     Returns:
-        How many scenes the release has.
+        The number of scenes of the release.
 
     Raises:
-        UserError: CLEVRER has no room for so many, or no scenes like these.
+        UserError: CLEVRER's layout has no place for so many scenes, or for such scenes.
     """
     indices = {
         name: first + k
@@ -61,7 +63,7 @@ def _export_one(cache: FrameCache, scene_id: str, folder: Path, index: int) -> N
 
 
 def annotation_path(folder: Path, index: int) -> Path:
-    """Where a release has the annotation of scene `index`."""
+    """Return the path of scene `index`'s annotation."""
     part = "train" if index < FIRST_VALIDATION else "validation"
     block = index // BLOCK * BLOCK
     span = f"{block:05d}-{block + BLOCK:05d}"
@@ -71,33 +73,34 @@ def annotation_path(folder: Path, index: int) -> Path:
 def write_clevrer(
     scene: Scene, images: dict[int, Image.Image], folder: Path, index: int
 ) -> tuple[Path, Path]:
-    """Write a scene and its frames as scene `index` of a release, so that a loader of CLEVRER reads
-    it; `index` says which split it is in: train below 10,000, validation below 15,000.
+    """Write a scene and its frames as scene `index` of a release.
 
-    An oracle does not say where two objects touched: the middle between their centres stands for
-    it.
+    The index determines the split: train below 10,000, validation below 15,000. The oracle does not
+    record where two objects touched, so a collision's location is the middle of their centres.
 
     Returns:
         The paths of the annotation and of the video.
 
     Raises:
-        UserError: CLEVRER has no such index, or no scene like this one.
+        UserError: CLEVRER's layout has no such index, or no place for such a scene.
     """
     if not 0 <= index < FIRST_TEST:
         raise UserError(
-            f"scene {scene.scene_id} cannot be number {index} of a release: annotations are "
-            f"numbered 0 to {FIRST_TEST - 1}"
+            f"scene {scene.scene_id} cannot be exported as number {index}: CLEVRER's annotations "
+            f"are numbered 0 to {FIRST_TEST - 1}, export fewer scenes",
+            code="too-many-scenes",
         )
     if scene.frames != FRAMES or sorted(images) != list(range(FRAMES)):
         raise UserError(
-            f"scene {scene.scene_id} has {scene.frames} frames and {len(images)} images: CLEVRER "
-            f"has {FRAMES} of each"
+            f"scene {scene.scene_id} has {scene.frames} frames and {len(images)} images: CLEVRER's "
+            f"scenes have {FRAMES} of each",
+            code="invalid-scene",
         )
     annotation = annotation_path(folder, index)
     beside = str(annotation.relative_to(folder)).replace("annotation", "video")
     video = (folder / beside).with_suffix(".mp4")
-    # The annotation last, for where it stands the scene is whole.
-    write_atomically(video, _encoded([images[frame] for frame in range(FRAMES)]))
+    # The annotation is written last: a scene with an annotation is complete.
+    write_atomically(video, _encode_video([images[frame] for frame in range(FRAMES)]))
     write_atomically(annotation, json.dumps(_annotation(scene, index, video.name)).encode())
     return annotation, video
 
@@ -142,24 +145,27 @@ def _annotation(scene: Scene, index: int, video: str) -> dict[str, Any]:
 
 
 def _angles(quaternions: np.ndarray) -> np.ndarray:
-    """(..., 4) quaternions in x y z w order -> (..., 3) radians, the inverse of
-    `clevrer.quaternions`."""
+    """Convert (..., 4) quaternions in x y z w order to (..., 3) radians, the inverse of
+    `clevrer.angles_to_quaternions`."""
     from scipy.spatial.transform import Rotation
 
-    turns = Rotation.from_quat(quaternions.reshape(-1, 4).astype(np.float64))
+    rotations = Rotation.from_quat(quaternions.reshape(-1, 4).astype(np.float64))
     with warnings.catch_warnings():
-        # On its side a cylinder's angles are not unique; any of them is the same rotation.
+        # At gimbal lock several angles give the same rotation; any of them is right.
         warnings.filterwarnings("ignore", "Gimbal lock")
-        return turns.as_euler(EULER).reshape(*quaternions.shape[:-1], 3)
+        return rotations.as_euler(EULER).reshape(*quaternions.shape[:-1], 3)
 
 
-def _encoded(images: list[Image.Image]) -> bytes:
-    """An mp4 of images of one size, both sides even."""
+def _encode_video(images: list[Image.Image]) -> bytes:
+    """An mp4 of images of one size, with even sides."""
     import av
 
     width, height = images[0].size
     if width % 2 or height % 2:
-        raise UserError(f"a video of {width} x {height} px cannot be written: both must be even")
+        raise UserError(
+            f"a video of {width} x {height} px cannot be written: both must be even",
+            code="invalid-size",
+        )
     target = io.BytesIO()
     with av.open(target, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=FPS, options={"crf": QUALITY})

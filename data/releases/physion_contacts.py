@@ -1,8 +1,8 @@
-"""Contacts and landings in Physion's raw trials, from what each frame lists.
+"""Contacts and landings of Physion's raw trials, from the contacts that each frame lists.
 
-`states` of collisions is absent from early files, and `env_collisions` mixes the walls with the
-floor. What `labels` tells is not used: `target_on_ground` says that the contacts with the floor
-changed, and `target_delta_position` accumulates.
+Early files have no `states` of collisions, and `env_collisions` mixes walls and floor. The `labels`
+are not used: `target_on_ground` is set when the contacts with the floor change, and
+`target_delta_position` accumulates.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data.records import Collision, Landing
-from data.releases import hdf5
+from data.releases.hdf5 import get_group, locate, read_floats, read_integers
 from data.releases.validation import RecordError
 from data.world.events import first_contacts
 
@@ -20,70 +20,78 @@ if TYPE_CHECKING:
     import h5py
 
 ABSENT_FRAMES = 5
-"""Without states, a pair that is first listed before this frame touched from the beginning."""
+"""Without states, a pair that is first listed before this frame is in contact from the start."""
 AIR_FRAMES = 5
-"""Least number of frames without any contact before a landing."""
+"""Least number of frames without contact before a landing."""
 UPRIGHT = 0.7
 """Least upward share of a floor contact's normal."""
 FLOOR = 0.05
-"""Contacts this near to height 0 may be the floor's, metres."""
+"""Greatest height of a contact with the floor, metres."""
 
 
-def collisions(moments: list[h5py.Group], ids: list[int]) -> tuple[Collision, ...]:
-    """First contacts of pairs that do not touch from the beginning: the first frame at which a pair
-    enters contact or, without states, is listed."""
-    begun, early = [], set()
-    for frame, moment in enumerate(moments):
-        for listed, state in _pairs(moment):
-            if not set(listed) <= set(ids) or listed[0] == listed[1]:
+def find_collisions(frames: list[h5py.Group], ids: list[int]) -> tuple[Collision, ...]:
+    """Return the first contacts of pairs that are not in contact from the start.
+
+    A contact begins at the first frame at which a pair enters it or, without states, is listed.
+    """
+    entered, from_start = [], set()
+    for k, frame in enumerate(frames):
+        for pair, state in _read_pairs(frame):
+            if not set(pair) <= set(ids) or pair[0] == pair[1]:
                 continue
-            one, two = sorted(ids.index(k) for k in listed)
+            first, second = sorted(ids.index(name) for name in pair)
             if state in (b"enter", None):
-                begun.append((frame, (one, two)))
-            if frame == 0 or (state is None and frame < ABSENT_FRAMES):
-                early.add((one, two))
-    return first_contacts((frame, pair) for frame, pair in begun if pair not in early)
+                entered.append((k, (first, second)))
+            if k == 0 or (state is None and k < ABSENT_FRAMES):
+                from_start.add((first, second))
+    return first_contacts((k, pair) for k, pair in entered if pair not in from_start)
 
 
-def _pairs(moment: h5py.Group) -> list[tuple[list[int], bytes | None]]:
-    """Pairs of object ids that touch or part at a frame, and the state of each, None where that is
-    not recorded."""
-    listed = hdf5.group(moment, "collisions")
-    pairs = hdf5.integers(listed, "object_ids", 2).tolist()
-    if "states" not in listed:
+def _read_pairs(frame: h5py.Group) -> list[tuple[list[int], bytes | None]]:
+    """The pairs of object ids that a frame lists, each with its state, None if not recorded."""
+    collisions = get_group(frame, "collisions")
+    pairs = read_integers(collisions, "object_ids", 2).tolist()
+    if "states" not in collisions:
         return [(pair, None) for pair in pairs]
-    states = [bytes(state) for state in listed["states"][()].reshape(-1)]
+    states = [bytes(state) for state in collisions["states"][()].reshape(-1)]
     if len(states) != len(pairs):
-        raise RecordError(f"{hdf5.where(listed)} has {len(states)} states of {len(pairs)} pairs")
+        raise RecordError(f"{locate(collisions)} has {len(states)} states of {len(pairs)} pairs")
     return list(zip(pairs, states, strict=True))
 
 
-def landings(
-    moments: list[h5py.Group], ids: list[int], positions: np.ndarray
+def find_landings(
+    frames: list[h5py.Group], ids: list[int], positions: np.ndarray
 ) -> tuple[Landing, ...]:
-    """Each object's first contact with the floor after some frames without any contact; `positions`
-    (F, N, 3) are in TDW's own axes."""
+    """Return each object's first contact with the floor after some frames without any contact.
+
+    Args:
+        positions: (F, N, 3) centres in TDW's axes.
+    """
     in_air = np.zeros(len(ids), int)
     landed: dict[int, int] = {}
-    for frame, moment in enumerate(moments):
-        room = hdf5.group(moment, "env_collisions")
-        listed = hdf5.integers(room, "object_ids")
-        at_room = [k for k, name in enumerate(ids) if name in listed]
-        for k in _on_floor(room, at_room, positions[frame]):
-            if in_air[k] >= AIR_FRAMES:
-                landed.setdefault(k, frame)
-        met = [k for pair, state in _pairs(moment) if state != b"exit" for k in pair]
-        in_air = np.where(np.isin(ids, [*met, *listed]), 0, in_air + 1)
-    return tuple(Landing(frame, k) for frame, k in sorted((f, k) for k, f in landed.items()))
+    for k, frame in enumerate(frames):
+        environment = get_group(frame, "env_collisions")
+        listed = read_integers(environment, "object_ids")
+        touching = [n for n, name in enumerate(ids) if name in listed]
+        for n in _find_on_floor(environment, touching, positions[k]):
+            if in_air[n] >= AIR_FRAMES:
+                landed.setdefault(n, k)
+        in_contact = [
+            name for pair, state in _read_pairs(frame) if state != b"exit" for name in pair
+        ]
+        in_air = np.where(np.isin(ids, [*in_contact, *listed]), 0, in_air + 1)
+    return tuple(Landing(k, n) for k, n in sorted((k, n) for n, k in landed.items()))
 
 
-def _on_floor(room: h5py.Group, at_room: list[int], positions: np.ndarray) -> set[int]:
-    """Which of the objects that touch walls or floor touch the floor. Points are not listed by
-    object: each goes to the nearest as seen from above."""
-    contacts = hdf5.array(room, "contacts", shape=(None, 2, 3))
+def _find_on_floor(environment: h5py.Group, touching: list[int], positions: np.ndarray) -> set[int]:
+    """Those of the objects touching walls or floor that touch the floor.
+
+    Points are not listed by object: each is assigned to the nearest object, seen from above.
+    """
+    contacts = read_floats(environment, "contacts", shape=(None, 2, 3))
     normals, points = contacts[:, 0], contacts[:, 1]
     floor = points[(normals[:, 1] > UPRIGHT) & (np.abs(points[:, 1]) < FLOOR)]
-    if not at_room:
+    if not touching:
         return set()
-    gaps = np.linalg.norm((floor[:, None] - positions[at_room])[..., [0, 2]], axis=-1)
-    return {at_room[k] for k in gaps.argmin(axis=1)}
+    distances = np.linalg.norm((floor[:, None] - positions[touching])[..., [0, 2]], axis=-1)
+    return {touching[n] for n in distances.argmin(axis=1)}

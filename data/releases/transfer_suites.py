@@ -1,10 +1,10 @@
-"""How items of the transfer suites are made, for scenes of MoVi-A and Physion.
+"""The items of the transfer suites, which are built from scenes of MoVi-A and Physion.
 
-`TRANSFER_SUITES[suite][family]` offers what a module of `data.tracks.selection` does: `CELLS` and
-`make_item`. The questions are the same. An event item's prefix ends some frames before the
-event, whose frame is the target; a time item's prefix is the scene's first second, and its target
-is so many seconds after the prefix's last frame. CLEVRER's scenes take the recipes of
-`data.tracks.selection` themselves.
+`TRANSFER_SUITES[suite][family]` has `CELLS` and `make_item`, as the modules of
+`data.tracks.selection` do, and asks their questions. The prefix of an event item ends some frames
+before the event, which is the target. The prefix of a time item is the scene's first second, and
+its target is one or two seconds after the prefix's last frame. CLEVRER's scenes have the items of
+the dynapix suite.
 """
 
 from __future__ import annotations
@@ -21,69 +21,64 @@ from data.tracks.selection.distractors import DistractorPicker, new_item, scene_
 from data.tracks.selection.event import EventTiming
 from data.world.events import find_motion_onsets
 
-MOVI_A_STEP, MOVI_A_GAP = 10, 5
-"""Frames from an event item's prefix's start to its end, and on to the event: at 12 fps nearly the
-times that the dynapix suite has at 25."""
-PHYSION_STEP, PHYSION_GAP = 20, 10
-"""The same in Physion, whatever its frame rate."""
 LEAST_PREFIX = 5
-"""Frames that a prefix has at least, where the scene's beginning cuts it short."""
-ELSEWHERE = 8
-"""Other scenes looked at for cross-scene distractors."""
+"""Least number of frames of a prefix that the start of the scene cuts short."""
+CROSS_SCENES = 8
+"""Other scenes sampled for cross-scene distractors."""
 
 
 @dataclass(frozen=True)
-class Cell:
+class TransferCell:
+    """A construction cell: its question, and the timings of a scene's items in order."""
+
     question: str
-    moments: Callable[[Scene], list[EventTiming]]
-    """The moments of a scene that the cell can ask about, in order of time."""
+    timings: Callable[[Scene], list[EventTiming]]
 
 
 @dataclass(frozen=True)
-class Recipe:
+class TransferFamily:
     """A family of a suite's items.
 
-    Of the three distractors `same` are other moments of the scene that the prefix does not show (if
-    `later`, only such as follow the target); the rest are other scenes of its scenario, at such a
-    moment of their own.
+    Attributes:
+        same: Number of distractors from the item's own scene, at frames after the prefix. The
+            others are targets of other scenes of the same scenario.
+        later: Whether distractors of the scene must follow the target.
     """
 
     suite: str
     family: str
     same: int
     later: bool
-    CELLS: dict[str, Cell]
+    CELLS: dict[str, TransferCell]
 
     def make_item(
         self, subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
     ) -> SelectionItem | None:
-        """An item of the cell at one of the scene's moments, tried in a random order."""
+        """Make an item of a cell at one of the scene's timings, tried in a random order."""
         cell = self.CELLS[subtype]
-        found = cell.moments(scene)
-        for k in rng.permutation(len(found)):
-            moment = found[k]
-            unseen = np.arange((moment.target if self.later else moment.stop) + 1, scene.frames)
-            wrong = rng.permutation(unseen[unseen != moment.target])
+        timings = cell.timings(scene)
+        for k in rng.permutation(len(timings)):
+            timing = timings[k]
+            frames = np.arange((timing.target if self.later else timing.stop) + 1, scene.frames)
+            wrong = rng.permutation(frames[frames != timing.target])
             picked = picker.pick_each(
-                FrameRef(scene.scene_id, moment.target),
+                FrameRef(scene.scene_id, timing.target),
                 (scene_candidates(scene, wrong, "same_time"), self.same),
-                (elsewhere(cell, scene, rng, picker), 3 - self.same),
+                (cross_scene_candidates(cell, scene, rng, picker), 3 - self.same),
             )
             if picked is None:
                 continue
-            gap = moment.target - moment.stop
-            axes = (
-                {"event_frame": moment.event, "framing": "future", "gap": gap}
-                if self.family == "event"
-                else {"horizon": gap}
-            )
+            gap = timing.target - timing.stop
+            axes = {"horizon": gap}
+            if self.family == "event":
+                axes = {"event_frame": timing.event, "framing": "future", "gap": gap}
             return new_item(
                 scene,
                 self.family,
                 subtype,
                 cell.question,
-                (moment.start, moment.stop),
-                moment.target,
+                (timing.start, timing.stop),
+                timing.target,
                 picked,
                 suite=self.suite,
                 distractors="mixed",
@@ -92,85 +87,90 @@ class Recipe:
         return None
 
 
-def elsewhere(
-    cell: Cell, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
+def cross_scene_candidates(
+    cell: TransferCell, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
 ) -> Iterator[Candidate]:
-    """The first such moment of some other scenes of the scenario, those that share most of the
-    scene's looks first."""
-    # Read one after the other until there are enough: a scenario is a small part of all scenes.
-    drawn = (picker.scene_of(str(name)) for name in rng.permutation(picker.scene_ids))
-    kin = (s for s in drawn if s.scene_id != scene.scene_id and s.scenario == scene.scenario)
-    such = islice(((other, m[0]) for other in kin if (m := cell.moments(other))), ELSEWHERE)
+    """Yield the first target of other scenes of the scenario, those with most shared objects
+    first."""
+    # Scenes are loaded one by one until there are enough: a scenario has few of all scenes.
+    scenes = (picker.scene_of(str(name)) for name in rng.permutation(picker.scene_ids))
+    similar = (s for s in scenes if s.scene_id != scene.scene_id and s.scenario == scene.scenario)
+    targets = ((s, timings[0].target) for s in similar if (timings := cell.timings(s)))
     looks = set(scene.objects)
-    for other, there in sorted(such, key=lambda pair: -len(looks & set(pair[0].objects))):
-        yield Candidate(other.scene_id, there.target, "cross_scene")
+    sample = list(islice(targets, CROSS_SCENES))
+    for other, target in sorted(sample, key=lambda pair: -len(looks & set(pair[0].objects))):
+        yield Candidate(other.scene_id, target, "cross_scene")
 
 
-def around(events: Callable[[Scene], list[int]], step: int, gap: int) -> Cell:
-    """Asks for the frame of an event, `gap` frames after a prefix of `step` frames and one."""
+def event_cell(events: Callable[[Scene], list[int]], step: int, gap: int) -> TransferCell:
+    """Return a cell whose target is the frame of an event, `gap` frames after a prefix that spans
+    `step` frames."""
 
-    def moments(scene: Scene) -> list[EventTiming]:
-        found = []
-        for frame in sorted(set(events(scene))):
-            stop = frame - gap
-            start = max(stop - step, 0)
-            if stop - start + 1 >= LEAST_PREFIX:
-                found.append(EventTiming(frame, start, stop, frame))
-        return found
+    def timings(scene: Scene) -> list[EventTiming]:
+        stops = [frame - gap for frame in sorted(set(events(scene)))]
+        return [
+            EventTiming(stop + gap, max(stop - step, 0), stop, stop + gap)
+            for stop in stops
+            if stop + 1 >= LEAST_PREFIX
+        ]
 
-    return Cell(event.QUESTION, moments)
+    return TransferCell(event.QUESTION, timings)
 
 
-def ahead(seconds: int) -> Cell:
-    """Asks for the frame so many seconds after the scene's first."""
+def time_cell(seconds: int) -> TransferCell:
+    """Return a cell whose prefix is the first second and whose target is `seconds` after it."""
 
-    def moments(scene: Scene) -> list[EventTiming]:
+    def timings(scene: Scene) -> list[EventTiming]:
         second = round(scene.fps)
         target = second - 1 + second * seconds
         return [EventTiming(target, 0, second - 1, target)] if target < scene.frames else []
 
-    return Cell(time.question(seconds), moments)
+    return TransferCell(time.question(seconds), timings)
 
 
-def contacts(scene: Scene) -> list[int]:
-    """Frames at which two objects first touch."""
-    return [c.frame for c in scene.collisions]
+def contact_frames(scene: Scene) -> list[int]:
+    """Return the frames at which two objects first touch."""
+    return [collision.frame for collision in scene.collisions]
 
 
-def motions(scene: Scene) -> list[int]:
-    """Frames at which an object at rest is set in motion."""
+def onset_frames(scene: Scene) -> list[int]:
+    """Return the frames at which an object at rest starts to move."""
     return [frame for frame, _ in find_motion_onsets(scene)]
 
 
-def landings(scene: Scene) -> list[int]:
-    """Frames at which an object comes down on the ground."""
+def landing_frames(scene: Scene) -> list[int]:
+    """Return the frames at which an object lands on the ground."""
     return [landing.frame for landing in scene.landings]
 
 
-MOVI_A_EVENTS = {"contact": around(contacts, MOVI_A_STEP, MOVI_A_GAP)}
-MOVI_A_TIMES = {"in_1s": ahead(1)}
-"""A scene's 24 frames are the first second and one more."""
-PHYSION_EVENTS = {
-    "A1_contact": around(contacts, PHYSION_STEP, PHYSION_GAP),
-    "A2_motion": around(motions, PHYSION_STEP, PHYSION_GAP),
-    "A3_landing": around(landings, PHYSION_STEP, PHYSION_GAP),
+# At MoVi-A's 12 fps, nearly the times of the dynapix suite at 25 fps; a scene has two seconds.
+MOVI_A_CELLS = {
+    "event": {"contact": event_cell(contact_frames, step=10, gap=5)},
+    "time": {"in_1s": time_cell(1)},
 }
-PHYSION_TIMES = {"in_1s": ahead(1), "in_2s": ahead(2)}
-
+# Physion counts frames, at any frame rate.
+PHYSION_CELLS = {
+    "event": {
+        "A1_contact": event_cell(contact_frames, step=20, gap=10),
+        "A2_motion": event_cell(onset_frames, step=20, gap=10),
+        "A3_landing": event_cell(landing_frames, step=20, gap=10),
+    },
+    "time": {"in_1s": time_cell(1), "in_2s": time_cell(2)},
+}
 TRANSFER_SUITES = {
     "movi_a": {
-        "event": Recipe("movi_a", "event", same=1, later=False, CELLS=MOVI_A_EVENTS),
-        "time": Recipe("movi_a", "time", same=1, later=False, CELLS=MOVI_A_TIMES),
+        family: TransferFamily("movi_a", family, same=1, later=False, CELLS=cells)
+        for family, cells in MOVI_A_CELLS.items()
     },
     "physion": {
-        "event": Recipe("physion", "event", same=2, later=True, CELLS=PHYSION_EVENTS),
-        "time": Recipe("physion", "time", same=2, later=True, CELLS=PHYSION_TIMES),
+        family: TransferFamily("physion", family, same=2, later=True, CELLS=cells)
+        for family, cells in PHYSION_CELLS.items()
     },
 }
+# Stand-in scenes have the items of the suite under its stand-in's name.
 TRANSFER_SUITES |= {
     f"standin_{suite}": {
-        family: replace(recipe, suite=f"standin_{suite}") for family, recipe in by.items()
+        name: replace(family, suite=f"standin_{suite}") for name, family in families.items()
     }
-    for suite, by in TRANSFER_SUITES.items()
+    for suite, families in TRANSFER_SUITES.items()
 }
-"""Scenes that stand in for a suite's take its recipe under a name of their own."""

@@ -1,5 +1,4 @@
-"""What the readers of other simulators' releases share: naming scenes, and refusing a record that
-is not as published in one sentence."""
+"""Checks that the readers of releases share: a record without the published layout is refused."""
 
 from __future__ import annotations
 
@@ -16,86 +15,108 @@ from conf.errors import UserError
 
 
 class RecordError(UserError):
-    """A record of a release that is not as published. Its sentence names the file, what was found
-    and what was expected; a caller leaves the record out and counts it, or stops."""
+    """A record that does not have the published layout, or cannot be read.
+
+    The message names the file, its content and what was expected. A caller leaves the record out
+    and counts it, or stops.
+    """
+
+    def __init__(self, message: str, code: str = "invalid-record") -> None:
+        super().__init__(message, code)
 
 
 def scene_id(suite: str, *parts: str) -> str:
-    """A scene's id, safe as a file name."""
+    """Return a scene's id, which is safe as a file name."""
     return "-".join([suite, *(re.sub(r"[^A-Za-z0-9_.-]+", "_", part) for part in parts)])
 
 
 def check_unique_scenes(
-    folder: Path, found: Sequence[Path], id_of: Callable[[Path], str], layout: str
+    folder: Path, paths: Sequence[Path], id_of: Callable[[Path], str], layout: str
 ) -> list[Path]:
-    """`found` as it is, where it names scenes and none of them twice.
+    """Return `paths`, which must contain a scene and no scene twice.
 
     Raises:
-        UserError: there is no such folder, it holds no scene, or one scene twice.
+        UserError: The folder is missing, or contains no scene or a scene twice.
     """
     if not folder.is_dir():
-        raise UserError(f"there is no folder {folder}: name the folder that holds {layout}")
-    if not found:
-        raise UserError(f"{folder} holds no scene: expected {layout} in it")
+        raise UserError(
+            f"folder {folder} does not exist: name the folder that contains {layout}",
+            code="missing-folder",
+        )
+    if not paths:
+        raise UserError(f"{folder} contains no scene: expected {layout}", code="empty-release")
     first: dict[str, Path] = {}
-    for path in found:
+    for path in paths:
         other = first.setdefault(id_of(path), path)
         if other is not path:
             raise UserError(
-                f"{folder} holds scene {id_of(path)} twice, as {other} and as {path}: name a "
-                "folder that holds each scene once"
+                f"{folder} contains scene {id_of(path)} twice, as {other} and as {path}: name a "
+                "folder that contains each scene once",
+                code="duplicate-scene",
             )
-    return list(found)
+    return list(paths)
 
 
 def get_field(record: Any, key: str, kind: type, where: str) -> Any:
-    """`record[key]`, which must be of `kind`; `where` says whose key it is.
+    """Return `record[key]`, which must be of type `kind`; `where` names the record in errors.
 
     Raises:
-        RecordError: it is not there, or something else.
+        RecordError: The key is missing or its value has another type.
     """
     if not isinstance(record, dict) or key not in record:
-        raise RecordError(f"{where} lacks the key {key!r} that the release has")
+        raise RecordError(f"{where} has no key {key!r}, which the release has")
     if not isinstance(record[key], kind):
         raise RecordError(
-            f"{where} has a {type(record[key]).__name__} under {key!r}, expected a {kind.__name__}"
+            f"{where} has a {type(record[key]).__name__} at {key!r}, expected a {kind.__name__}"
         )
     return record[key]
 
 
-def finite_array(values: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
-    """`values` as float32 of `shape`, where None stands for any length.
+def check_choice(value: str, choices: Sequence[str], where: str) -> str:
+    """Return `value`, which must be one of `choices`.
 
     Raises:
-        RecordError: they are of another shape, or not all finite numbers.
+        RecordError: It is not.
+    """
+    if value not in choices:
+        raise RecordError(f"{where} is {value!r}, expected {', '.join(choices)}")
+    return value
+
+
+def finite_array(values: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
+    """Return `values` as a float32 array of `shape`, in which None is any length.
+
+    Raises:
+        RecordError: The values have another shape or are not all finite numbers.
     """
     try:
         array = np.asarray(values, np.float64)
     except (TypeError, ValueError) as error:
-        raise RecordError(f"{where} are not numbers of shape {_spelled(shape)}") from error
+        raise RecordError(f"{where}: expected numbers of shape {_format(shape)}") from error
     if array.shape == (0,) and shape[0] in (None, 0):
         array = array.reshape(0, *(n or 0 for n in shape[1:]))
-    agrees = len(array.shape) == len(shape) and all(
-        wanted in (None, found) for wanted, found in zip(shape, array.shape, strict=True)
-    )
-    if not agrees:
-        raise RecordError(f"{where} have shape {_spelled(array.shape)}, expected {_spelled(shape)}")
+    if array.ndim != len(shape) or any(
+        n not in (None, size) for n, size in zip(shape, array.shape, strict=True)
+    ):
+        raise RecordError(f"{where}: shape {_format(array.shape)}, expected {_format(shape)}")
     if not np.isfinite(array).all():
-        raise RecordError(f"{where} are not all finite numbers")
+        raise RecordError(f"{where}: non-finite values (NaN or Inf)")
     return array.astype(np.float32)
 
 
-def _spelled(shape: Sequence[int | None]) -> str:
+def _format(shape: Sequence[int | None]) -> str:
     return f"({', '.join('any' if n is None else str(n) for n in shape)})"
 
 
 def decode_image(data: bytes, where: str) -> Image.Image:
-    """An encoded image as RGB; transparency is dropped, not blended in.
+    """Return an encoded image as RGB; transparency is dropped, not blended.
 
     Raises:
-        RecordError: it cannot be decoded.
+        RecordError: The image cannot be decoded.
     """
     try:
         return Image.open(io.BytesIO(data)).convert("RGB")
     except (OSError, SyntaxError, ValueError) as error:
-        raise RecordError(f"{where} cannot be decoded as an image: {error}") from error
+        raise RecordError(
+            f"{where} cannot be decoded as an image: {error}", "damaged-file"
+        ) from error

@@ -1,5 +1,4 @@
-"""CLEVRER's release is read as published, what only looks like it is refused, and what is exported
-is read back."""
+"""CLEVRER's release is read as published, other files are refused, and exports are read back."""
 
 from __future__ import annotations
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from conf.errors import UserError
 from conf.schema import BenchmarkConfig
 from data.publish.clevrer_format import write_clevrer
 from data.records import Collision
@@ -21,9 +19,10 @@ from data.render import get_renderer
 from data.world.sampling import simulate_scene
 from data.world.shapes import rotation_matrix
 from tests.data.releases.clevrer_files import clevrer_annotation, write_clevrer_scene
+from tests.user_errors import raises_user_error
 
 
-def test_a_scene_is_as_its_annotation_says(tmp_path: Path) -> None:
+def test_a_scene_has_the_values_of_its_annotation(tmp_path: Path) -> None:
     write_clevrer_scene(tmp_path, clevrer_annotation(7), 7)
     (path,) = clevrer.list_scenes(tmp_path)
     scene = clevrer.read_scene(path, tmp_path, "test")
@@ -39,7 +38,7 @@ def test_a_scene_is_as_its_annotation_says(tmp_path: Path) -> None:
     assert (scene.visible_fraction[:, 0] == 1).sum() < 128
 
 
-def test_angles_turn_about_fixed_axes_x_first(tmp_path: Path) -> None:
+def test_angles_are_rotations_about_fixed_axes_x_first(tmp_path: Path) -> None:
     path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
     turn = rotation_matrix(clevrer.read_scene(path, tmp_path, "test").quaternions[0, 0])
     (a, b, c) = (0.3, -0.5, 1.1)
@@ -49,7 +48,7 @@ def test_angles_turn_about_fixed_axes_x_first(tmp_path: Path) -> None:
     np.testing.assert_allclose(turn, np.array(z) @ y @ x, atol=1e-6)
 
 
-def test_frames_are_those_asked_for(tmp_path: Path) -> None:
+def test_images_are_the_requested_frames(tmp_path: Path) -> None:
     path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
     scene = clevrer.read_scene(path, tmp_path, "test")
     shown = clevrer.load_images(scene, tmp_path, [100, 5, 127])
@@ -69,89 +68,87 @@ def four_numbers(record: dict) -> None:
             state["orientation"] = [0.0, 0.0, 0.0, 1.0]
 
 
-TRAPS: dict[str, tuple[Callable[[dict], object], str]] = {
-    "another generator's key": (rename, "'collisions' where .* 'collision'"),
-    "quaternions": (four_numbers, "orientations of four numbers"),
+DEFECTS: dict[str, tuple[Callable[[dict], object], str]] = {
+    "another generator's key": (rename, "'collisions'"),
+    "quaternions": (four_numbers, "orientations"),
     "no velocity": (
-        lambda r: r["motion_trajectory"][3]["objects"][1].pop("velocity"),
-        "frame 3 lacks the key 'velocity'",
+        lambda r: r["motion_trajectory"][3]["objects"][1].pop("velocity"), "'velocity'"
     ),
     "no view flag": (
         lambda r: r["motion_trajectory"][3]["objects"][1].pop("inside_camera_view"),
-        "frame 3 lacks the key 'inside_camera_view'",
+        "'inside_camera_view'",
     ),
-    "a flat location": (
+    "locations of two numbers": (
         lambda r: [m["objects"][0].update(location=[0, 0]) for m in r["motion_trajectory"]],
-        "'location' are not numbers of shape",
+        "location",
     ),
-    "an object that is left out": (
-        lambda r: r["motion_trajectory"][9]["objects"].pop(0),
-        r"frame 9 lists objects \[1\], expected \[0, 1\]",
+    "a frame without an object": (
+        lambda r: r["motion_trajectory"][9]["objects"].pop(0), "frame 9"
     ),
-    "a frame too few": (lambda r: r["motion_trajectory"].pop(), "127 frames, expected 0 to 127"),
-    "an unknown shape": (
-        lambda r: r["object_property"][0].update(shape="cone"),
-        "shape 'cone', expected cube",
+    "a frame less": (lambda r: r["motion_trajectory"].pop(), "127"),
+    "an unknown shape": (lambda r: r["object_property"][0].update(shape="cone"), "'cone'"),
+    "a collision with an unknown object": (
+        lambda r: r["collision"][0].update(object_ids=[0, 5]), "[0, 5]"
     ),
-    "a collision with nobody": (
-        lambda r: r["collision"][0].update(object_ids=[0, 5]),
-        r"objects \[0, 5\] at frame 20, expected two of \[0, 1\]",
-    ),
-}
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("trap", TRAPS)
-def test_what_only_looks_like_a_release_is_refused(tmp_path: Path, trap: str) -> None:
-    spoil, said = TRAPS[trap]
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_an_annotation_without_the_published_layout_is_refused(tmp_path: Path, defect: str) -> None:
+    change, named = DEFECTS[defect]
     record = clevrer_annotation()
-    spoil(record)
+    change(record)
     path, _ = write_clevrer_scene(tmp_path, record)
-    with pytest.raises(RecordError, match=said) as refusal:
+    with raises_user_error("invalid-record", contains=(str(path), named)):
         clevrer.read_scene(path, tmp_path, "test")
-    assert str(refusal.value).startswith(str(path))
 
 
-@pytest.mark.parametrize("text", ["", "[]", json.dumps(clevrer_annotation())[:4000]])
-def test_a_broken_annotation_is_refused(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("", "damaged-file"),
+        ("[]", "invalid-record"),
+        (json.dumps(clevrer_annotation())[:4000], "damaged-file"),
+    ],
+)
+def test_a_broken_annotation_is_refused(tmp_path: Path, text: str, code: str) -> None:
     path, _ = write_clevrer_scene(tmp_path, text, 10800)
-    with pytest.raises(RecordError, match=r"annotation_10800.json (is not whole|holds a list)"):
+    with raises_user_error(code, contains="annotation_10800.json"):
         clevrer.read_scene(path, tmp_path, "test")
 
 
-def test_a_video_that_is_not_whole_is_refused(tmp_path: Path) -> None:
+def test_an_incomplete_video_is_refused(tmp_path: Path) -> None:
     path, video = write_clevrer_scene(tmp_path, clevrer_annotation(), video_frames=120)
-    with pytest.raises(RecordError, match=r"video_00000.mp4 has 120 frames, expected 128"):
+    with raises_user_error("invalid-record", contains=("video_00000.mp4", "120")):
         clevrer.read_scene(path, tmp_path, "test")
     whole = video.read_bytes()
     for damaged in (whole[: len(whole) // 2], b"no video at all"):
         video.write_bytes(damaged)
-        with pytest.raises(
-            RecordError, match=r"video_00000.mp4 (cannot be decoded|has [0-9]+ frames)"
-        ):
+        with pytest.raises(RecordError, match=r"video_00000.mp4"):
             clevrer.read_scene(path, tmp_path, "test")
     video.unlink()
-    with pytest.raises(RecordError, match=r"video_00000.mp4 is missing"):
+    with raises_user_error("missing-file", contains="video_00000.mp4"):
         clevrer.read_scene(path, tmp_path, "test")
 
 
-def test_a_folder_without_scenes_is_refused_with_the_layout(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds no scene: expected annotation_train/"):
+def test_a_folder_without_scenes_is_refused(tmp_path: Path) -> None:
+    with raises_user_error("empty-release", contains="annotation_train/"):
         clevrer.list_scenes(tmp_path)
-    with pytest.raises(UserError, match="there is no folder"):
+    with raises_user_error("missing-folder", contains="nowhere"):
         clevrer.list_scenes(tmp_path / "nowhere")
 
 
-def test_scenes_come_in_order_and_once(tmp_path: Path) -> None:
+def test_scenes_are_listed_in_order_and_once(tmp_path: Path) -> None:
     for index in (1200, 3, 10):
         write_clevrer_scene(tmp_path / "here", clevrer_annotation(index), index, 1)
     names = [path.stem for path in clevrer.list_scenes(tmp_path / "here")]
     assert names == ["annotation_00003", "annotation_00010", "annotation_01200"]
     write_clevrer_scene(tmp_path / "copy", clevrer_annotation(3), 3, 1)
-    with pytest.raises(UserError, match="holds scene clevrer-00003 twice"):
+    with raises_user_error("duplicate-scene", contains="clevrer-00003"):
         clevrer.list_scenes(tmp_path)
 
 
-def test_what_is_exported_is_read_back(tmp_path: Path) -> None:
+def test_an_exported_scene_is_read_back(tmp_path: Path) -> None:
     scene = simulate_scene(0, 0, "train", BenchmarkConfig(name="export"))
     assert not scene.in_view.all()
     drawn = {f: get_renderer("bullet", 192, 128).render(scene, f) for f in range(scene.frames)}
@@ -175,12 +172,12 @@ def test_what_is_exported_is_read_back(tmp_path: Path) -> None:
         assert 10 * np.log10(255**2 / error) > 35
 
 
-def test_only_what_clevrer_has_is_exported(tmp_path: Path) -> None:
+def test_scenes_that_clevrer_cannot_hold_are_not_exported(tmp_path: Path) -> None:
     path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
     scene = clevrer.read_scene(path, tmp_path, "test")
     drawn = clevrer.load_images(scene, tmp_path, range(128))
-    with pytest.raises(UserError, match="numbered 0 to 14999"):
+    with raises_user_error("too-many-scenes", contains="15000"):
         write_clevrer(scene, drawn, tmp_path / "new", 15_000)
-    with pytest.raises(UserError, match="128 frames and 127 images"):
+    with raises_user_error("invalid-scene", contains="127"):
         write_clevrer(scene, {f: drawn[f] for f in range(127)}, tmp_path / "new", 0)
     assert not (tmp_path / "new").exists()

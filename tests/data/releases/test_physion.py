@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from data.records import Collision, Landing, Scene
 from data.releases import physion
-from data.releases.validation import RecordError
+from data.releases.hdf5 import open_hdf5
 from data.world.events import find_motion_onsets
 from tests.data.releases.physion_files import IDS, physion_trial, write_physion
+from tests.user_errors import raises_user_error
 
 A, B, C = IDS
 
@@ -25,18 +26,18 @@ def read(folder: Path, trial: dict, **version: object) -> Scene:
     return physion.read_scene(path, folder, "test")
 
 
-def test_a_trial_is_as_its_file_says(tmp_path: Path) -> None:
+def test_a_scene_has_the_values_of_its_trial(tmp_path: Path) -> None:
     scene = read(tmp_path, physion_trial())
     assert (scene.scene_id, scene.scenario) == ("physion-Collide-Collide_box_0003", "Collide")
     assert (scene.frames, scene.fps, scene.image_size) == (60, 30, (48, 32))
     assert [o.phrase for o in scene.objects] == ["bowl", "cone", "bowl"]
     assert np.isnan(scene.visible_fraction).all()
     assert scene.footage == "Collide/box/0003.hdf5"
-    shown = physion.load_images(scene, tmp_path, [59, 0])
-    assert {f: image.getpixel((1, 1))[0] for f, image in shown.items()} == {0: 60, 59: 119}
+    images = physion.load_images(scene, tmp_path, [59, 0])
+    assert {f: image.getpixel((1, 1))[0] for f, image in images.items()} == {0: 60, 59: 119}
 
 
-def test_the_frame_rate_is_the_callers(tmp_path: Path) -> None:
+def test_the_caller_sets_the_frame_rate(tmp_path: Path) -> None:
     path = write_physion(tmp_path / "drop" / "0000.hdf5", physion_trial())
     assert physion.read_scene(path, tmp_path, "test", fps=100).fps == 100
 
@@ -53,9 +54,8 @@ def test_up_is_z_and_a_fall_is_down(tmp_path: Path) -> None:
     np.testing.assert_allclose(moved, scene.velocities[1:-1, 0], atol=1e-4)
 
 
-def test_rotations_turn_as_their_velocities_say_and_as_the_object_does(tmp_path: Path) -> None:
-    """A turn about TDW's axes stays the same turn of the same points, seen from other axes; its
-    angular velocity moves a point at the velocity w x r in both."""
+def test_rotations_agree_with_angular_velocities(tmp_path: Path) -> None:
+    """A rotation in TDW's axes moves the same points in ours, at the velocity w x r."""
     trial = physion_trial()
     spin = np.array([0.3, -0.8, 0.5])
     turns = Rotation.from_rotvec(np.outer(np.arange(60) / 30, spin))
@@ -72,7 +72,7 @@ def test_rotations_turn_as_their_velocities_say_and_as_the_object_does(tmp_path:
     np.testing.assert_allclose(moved, expected, atol=1e-3)
 
 
-def test_centres_are_seen_where_the_camera_says(tmp_path: Path) -> None:
+def test_centres_are_projected_by_the_recorded_camera(tmp_path: Path) -> None:
     trial = physion_trial()
     looking = np.diag([1.0, 1.0, -1.0, 1.0])
     looking[:3, 3] = [0, -1, -4]
@@ -85,14 +85,14 @@ def test_centres_are_seen_where_the_camera_says(tmp_path: Path) -> None:
     assert np.isfinite(seen).all()
 
 
-def test_an_object_is_in_view_where_its_colour_is(tmp_path: Path) -> None:
+def test_an_object_is_in_view_if_its_colour_is_visible(tmp_path: Path) -> None:
     trial = physion_trial()
     trial["hidden"] = {4: (1,), 5: (0, 1, 2)}
     in_view = read(tmp_path, trial).in_view
     assert in_view[3:7].tolist() == [[1, 1, 1], [1, 0, 1], [0, 0, 0], [1, 1, 1]]
 
 
-def test_later_versions_name_cameras_and_begin_at_frame_one(tmp_path: Path) -> None:
+def test_camera_suffixes_and_first_frames_of_later_versions_are_read(tmp_path: Path) -> None:
     trial = physion_trial()
     trial["pairs"][30], trial["states"][30] = [[A, B]], [b"enter"]
     early = read(tmp_path / "early", trial)
@@ -100,22 +100,22 @@ def test_later_versions_name_cameras_and_begin_at_frame_one(tmp_path: Path) -> N
     assert late.collisions == early.collisions == (Collision(30, (0, 1)),)
     for name in ("positions", "image_positions", "in_view"):
         np.testing.assert_array_equal(getattr(late, name), getattr(early, name))
-    shown = physion.load_images(late, tmp_path / "late", [0])
-    assert shown[0].getpixel((1, 1)) == (60, 60, 60)
+    images = physion.load_images(late, tmp_path / "late", [0])
+    assert images[0].getpixel((1, 1)) == (60, 60, 60)
 
 
 # A1
 
 
 def touch(trial: dict, first: int, last: int, pair: list[int], enters: bool = True) -> None:
-    """A pair that touches from one frame to another, then parts."""
+    """Add a contact of a pair from frame `first` to `last`."""
     for frame in range(first, last + 2):
         state = b"enter" if enters and frame == first else b"stay" if frame <= last else b"exit"
         trial["pairs"][frame].append(pair)
         trial["states"][frame].append(state)
 
 
-def test_a_contact_is_the_first_frame_that_a_pair_enters(tmp_path: Path) -> None:
+def test_a_collision_is_the_first_contact_that_a_pair_enters(tmp_path: Path) -> None:
     trial = physion_trial()
     touch(trial, 20, 24, [C, A])
     touch(trial, 40, 44, [A, C])
@@ -126,7 +126,7 @@ def test_a_contact_is_the_first_frame_that_a_pair_enters(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("enters", [True, False])
-def test_pairs_that_touch_at_first_are_left_out(tmp_path: Path, enters: bool) -> None:
+def test_pairs_in_contact_from_the_start_are_left_out(tmp_path: Path, enters: bool) -> None:
     trial = physion_trial()
     touch(trial, 0, 10, [A, B], enters)
     touch(trial, 30, 35, [B, A])
@@ -134,9 +134,9 @@ def test_pairs_that_touch_at_first_are_left_out(tmp_path: Path, enters: bool) ->
     assert read(tmp_path, trial).collisions == (Collision(33, (1, 2)),)
 
 
-def test_without_states_a_contact_is_a_first_listing_after_some_frames(tmp_path: Path) -> None:
+def test_without_states_a_collision_is_a_pair_first_listed_later(tmp_path: Path) -> None:
     trial = physion_trial()
-    # In the first frame the physics may not have begun: what rests is listed a little later.
+    # The physics may start after the first frame, so contacts at rest are listed a little later.
     touch(trial, 1, 50, [A, B])
     touch(trial, 20, 22, [B, C])
     touch(trial, 30, 32, [C, B])
@@ -151,20 +151,20 @@ def at_rest(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return read(tmp_path_factory.mktemp("rest"), physion_trial())
 
 
-def onset_of(scene: Scene, way: np.ndarray) -> list[tuple[int, int]]:
-    """Onsets where the second object goes so far from its place."""
+def onset_of(scene: Scene, offset: np.ndarray) -> list[tuple[int, int]]:
+    """Motion onsets of the scene with the second object moved by `offset` per frame."""
     positions = scene.positions.copy()
-    positions[:, 1, 0] += np.float32(way)
+    positions[:, 1, 0] += np.float32(offset)
     return find_motion_onsets(replace(scene, positions=positions))
 
 
-def test_motion_sets_in_where_an_object_leaves_its_place_for_good(at_rest: Scene) -> None:
+def test_a_motion_onset_is_the_first_frame_away_from_the_initial_position(at_rest: Scene) -> None:
     f = np.arange(60)
     assert onset_of(at_rest, np.maximum(f - 20, 0) * 0.004) == [(23, 1)]
     assert onset_of(at_rest, np.where(f >= 30, 0.02, 0.0)) == [(30, 1)]
 
 
-def test_jitter_and_what_never_rested_set_nothing_off(at_rest: Scene) -> None:
+def test_jitter_and_objects_that_never_rest_have_no_onset(at_rest: Scene) -> None:
     f = np.arange(60)
     assert onset_of(at_rest, 0.004 * (f % 2)) == []
     assert onset_of(at_rest, np.where((f == 20) | (f == 21), 0.5, 0)) == []
@@ -177,7 +177,7 @@ def test_jitter_and_what_never_rested_set_nothing_off(at_rest: Scene) -> None:
 UP, SIDE = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
 
 
-def test_a_landing_is_the_first_touch_of_the_floor_after_a_flight(tmp_path: Path) -> None:
+def test_a_landing_is_the_first_floor_contact_after_a_flight(tmp_path: Path) -> None:
     trial = physion_trial()
     for frame in range(60):
         if frame >= 25:
@@ -195,7 +195,7 @@ def test_a_landing_is_the_first_touch_of_the_floor_after_a_flight(tmp_path: Path
     ("normal", "point"),
     [(SIDE, (-1.0, 0.0, 0.0)), (UP, (-1.0, 0.4, 0.0)), ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0))],
 )
-def test_walls_shelves_and_ceilings_are_no_ground(tmp_path: Path, normal, point) -> None:
+def test_walls_shelves_and_ceilings_are_not_the_ground(tmp_path: Path, normal, point) -> None:
     trial = physion_trial()
     trial["room"][30], trial["points"][30] = [A], [(normal, point)]
     assert read(tmp_path, trial).landings == ()
@@ -209,90 +209,51 @@ def test_any_contact_ends_a_flight(tmp_path: Path) -> None:
     assert read(tmp_path, trial).landings == (Landing(40, 0),)
 
 
-def test_a_point_belongs_to_the_nearest_that_touches_the_room(tmp_path: Path) -> None:
-    """Walls and floor are mixed and points are not listed by object: A lands while C, also after a
-    flight, meets a wall high above."""
+def test_a_contact_point_is_assigned_to_the_nearest_object(tmp_path: Path) -> None:
+    """A lands while C, also after a flight, touches a wall high above the floor."""
     trial = physion_trial()
     trial["room"][30] = [C, A]
     trial["points"][30] = [(SIDE, (1.2, 0.9, 0.0)), (UP, (-0.9, 0.0, 0.1))]
     assert read(tmp_path, trial).landings == (Landing(30, 0),)
 
 
-# What is refused
+# Refused files
 
 
-def spoil(change: Callable[[h5py.File], object]) -> Callable[[Path], None]:
-    def spoiled(path: Path) -> None:
-        with h5py.File(path, "r+") as file:
-            change(file)
-
-    return spoiled
+def delete(path: str) -> Callable[[h5py.File], None]:
+    return lambda file: file.__delitem__(path)
 
 
-TRAPS: dict[str, tuple[Callable[[Path], None], str]] = {
-    "no velocities": (
-        spoil(lambda f: f.__delitem__("frames/0007/objects/velocities")),
-        "/frames/0007/objects/velocities is missing, expected a dataset",
-    ),
-    "no segmentation": (
-        spoil(lambda f: f.__delitem__("frames/0007/images/_id")),
-        "/frames/0007/images/_id is missing",
-    ),
-    "no image": (
-        spoil(lambda f: f.__delitem__("frames/0007/images/_img")),
-        "/frames/0007/images/_img is missing",
-    ),
-    "no camera": (
-        spoil(lambda f: f.__delitem__("frames/0007/camera_matrices")),
-        "/frames/0007/camera_matrices is missing, expected a group",
-    ),
-    "a frame that is left out": (
-        spoil(lambda f: f.__delitem__("frames/0007")),
-        "has 0008, expected 0007 there",
-    ),
-    "no frames": (spoil(lambda f: f.__delitem__("frames")), "/frames is missing"),
-    "an object less in a frame": (
-        spoil(
-            lambda f: (
-                f.__delitem__("frames/0007/objects/positions"),
-                f.create_dataset("frames/0007/objects/positions", data=np.zeros((2, 3))),
-            )
-        ),
-        r"positions have shape \(2, 3\), expected \(3, 3\)",
-    ),
-    "a place that is no number": (
-        spoil(lambda f: f["frames/0007/objects/positions"].write_direct(np.full((3, 3), np.nan))),
-        "positions are not all finite",
-    ),
-    "half a pair": (
-        spoil(
-            lambda f: (
-                f.__delitem__("frames/0007/collisions/object_ids"),
-                f.create_dataset("frames/0007/collisions/object_ids", data=[3]),
-            )
-        ),
-        r"collisions/object_ids are int64 of shape \(1,\), expected whole numbers",
-    ),
-    "a name less": (
-        spoil(
-            lambda f: (
-                f.__delitem__("static/model_names"),
-                f.create_dataset("static/model_names", data=[b"bowl"]),
-            )
-        ),
-        "names 1 models of 3 objects",
-    ),
+def put(path: str, data: object) -> Callable[[h5py.File], None]:
+    def change(file: h5py.File) -> None:
+        del file[path]
+        file.create_dataset(path, data=data)
+
+    return change
+
+
+DEFECTS: dict[str, tuple[Callable[[h5py.File], None], str]] = {
+    "no velocities": (delete("frames/0007/objects/velocities"), "frames/0007/objects/velocities"),
+    "no segmentation": (delete("frames/0007/images/_id"), "/frames/0007/images/_id"),
+    "no image": (delete("frames/0007/images/_img"), "/frames/0007/images/_img"),
+    "no camera": (delete("frames/0007/camera_matrices"), "/frames/0007/camera_matrices"),
+    "a missing frame": (delete("frames/0007"), "0007"),
+    "no frames": (delete("frames"), "/frames"),
+    "an object less": (put("frames/0007/objects/positions", np.zeros((2, 3))), "(2, 3)"),
+    "NaN positions": (put("frames/0007/objects/positions", np.full((3, 3), np.nan)), "positions"),
+    "half a pair": (put("frames/0007/collisions/object_ids", [3]), "collisions/object_ids"),
+    "a model less": (put("static/model_names", [b"bowl"]), "1 models"),
 }
 
 
-@pytest.mark.parametrize("trap", TRAPS)
-def test_a_trial_that_is_nearly_right_is_refused(tmp_path: Path, trap: str) -> None:
-    change, said = TRAPS[trap]
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_a_trial_without_the_published_layout_is_refused(tmp_path: Path, defect: str) -> None:
+    change, named = DEFECTS[defect]
     path = write_physion(tmp_path / "roll" / "0000.hdf5", physion_trial(12))
-    change(path)
-    with pytest.raises(RecordError, match=said) as refusal:
+    with h5py.File(path, "r+") as file:
+        change(file)
+    with raises_user_error("invalid-record", contains=(str(path), named)):
         physion.read_scene(path, tmp_path, "test")
-    assert str(refusal.value).startswith(str(path))
 
 
 @pytest.mark.parametrize("kept", [0, 0.01, 0.3, 0.6, 0.99])
@@ -300,8 +261,26 @@ def test_a_file_that_is_cut_off_is_refused(tmp_path: Path, kept: float) -> None:
     path = write_physion(tmp_path / "roll" / "0000.hdf5", physion_trial(12))
     whole = path.read_bytes()
     path.write_bytes(whole[: int(kept * len(whole))])
-    with pytest.raises(RecordError, match=r"0000\.hdf5 is no HDF5 file, damaged or cut off"):
+    with raises_user_error("damaged-file", contains="0000.hdf5"):
         physion.read_scene(path, tmp_path, "test")
+
+
+def test_a_file_with_damaged_objects_is_refused(tmp_path: Path) -> None:
+    """HDF5 raises a KeyError for an object whose header is overwritten."""
+    path = write_physion(tmp_path / "roll" / "0000.hdf5", physion_trial(12))
+    with h5py.File(path) as file:
+        header = h5py.h5o.get_info(file["frames/0007"].id).addr
+    damaged = bytearray(path.read_bytes())
+    damaged[header : header + 16] = b"\xff" * 16
+    path.write_bytes(damaged)
+    with raises_user_error("damaged-file", contains="0000.hdf5"):
+        physion.read_scene(path, tmp_path, "test")
+
+
+def test_a_key_error_of_our_own_code_is_not_a_damaged_file(tmp_path: Path) -> None:
+    path = write_physion(tmp_path / "roll" / "0000.hdf5", physion_trial(12))
+    with pytest.raises(KeyError, match="no such scenario"), open_hdf5(path):
+        {}["no such scenario"]
 
 
 @pytest.mark.parametrize(
@@ -315,7 +294,7 @@ def test_a_file_that_is_cut_off_is_refused(tmp_path: Path, kept: float) -> None:
         ("clothSagging", "", "Drape"),
     ],
 )
-def test_the_scenario_is_in_the_path_or_the_name(
+def test_the_scenario_is_in_the_path_or_the_stimulus_name(
     tmp_path: Path, folder: str, stimulus: str, scenario: str
 ) -> None:
     path = tmp_path / folder / "0000.hdf5"
@@ -325,7 +304,7 @@ def test_the_scenario_is_in_the_path_or_the_name(
     assert scene.scene_id == f"physion-{scenario}-{folder}_0000"
 
 
-def test_a_trial_of_no_known_scenario_is_refused(tmp_path: Path) -> None:
+def test_a_trial_of_an_unknown_scenario_is_refused(tmp_path: Path) -> None:
     path = write_physion(tmp_path / "0" / "0.hdf5", {**physion_trial(12), "stimulus_name": "x"})
-    with pytest.raises(RecordError, match="tells one of Dominoes, Support"):
+    with raises_user_error("invalid-record", contains="Dominoes"):
         physion.read_scene(path, tmp_path, "test")

@@ -102,7 +102,7 @@ def items(cell: tuple[str, str, str]) -> list[SelectionItem]:
 
 
 @cells()
-def test_items_are_of_their_suite_and_ask_the_same_questions(suite: str, items: list) -> None:
+def test_items_have_their_suite_and_the_questions_of_dynapix(suite: str, items: list) -> None:
     assert len(items) == 24
     assert {i.suite for i in items} == {suite}
     (question,) = {i.question for i in items}
@@ -113,9 +113,7 @@ def test_items_are_of_their_suite_and_ask_the_same_questions(suite: str, items: 
 
 
 @cells()
-def test_candidates_can_be_told_apart_and_are_no_frame_of_the_prefix(
-    suite: str, items: list
-) -> None:
+def test_candidates_differ_and_are_not_in_the_prefix(suite: str, items: list) -> None:
     scenes = SCENES[suite]
     for item in items:
         gaps = [
@@ -129,9 +127,7 @@ def test_candidates_can_be_told_apart_and_are_no_frame_of_the_prefix(
 
 
 @cells()
-def test_wrong_frames_are_of_the_scene_and_of_others_as_the_suite_has_them(
-    suite: str, items: list
-) -> None:
+def test_distractors_are_of_the_scene_and_of_other_scenes(suite: str, items: list) -> None:
     for item in items:
         wrong = [c for c in item.candidates if c.source != "target"]
         same = [c.frame for c in wrong if c.scene_id == item.scene_id]
@@ -141,7 +137,7 @@ def test_wrong_frames_are_of_the_scene_and_of_others_as_the_suite_has_them(
 
 
 @cells("physion")
-def test_physions_wrong_frames_are_later_or_of_the_same_scenario(suite: str, items: list) -> None:
+def test_physions_distractors_are_later_or_of_the_same_scenario(suite: str, items: list) -> None:
     for item in items:
         own = [c.frame for c in item.candidates if c.scene_id == item.scene_id]
         assert min(own) == item.target_frame
@@ -172,7 +168,7 @@ def test_an_event_items_prefix_ends_before_its_event(suite: str, items: list) ->
 
 
 @cells("time")
-def test_a_time_items_clock_is_its_scenes(suite: str, items: list) -> None:
+def test_a_time_item_has_the_frame_rate_of_its_scene(suite: str, items: list) -> None:
     second = 12 if suite.endswith("movi_a") else 30
     for item in items:
         seconds = int(item.subtype[3])
@@ -183,26 +179,26 @@ def test_a_time_items_clock_is_its_scenes(suite: str, items: list) -> None:
         }
 
 
-def test_faster_trials_have_longer_seconds_and_the_same_events() -> None:
+def test_the_frame_rate_changes_time_items_and_not_event_items() -> None:
     fast = {k: scene_of_suite("physion", k, 120, 100) for k in range(30)}
     scenes = {s.scene_id: s for s in fast.values()}
     assert items_of("physion", "time", "in_1s", scenes) == []
     assert {i.gap for i in items_of("physion", "event", "A1_contact", scenes)} == {10}
 
 
-def test_what_cannot_be_told_apart_gives_no_item() -> None:
+def test_scenes_without_motion_give_no_item() -> None:
     still = {name: pickle.loads(pickle.dumps(scene)) for name, scene in SCENES["physion"].items()}
     for scene in still.values():
         scene.image_positions[:] = scene.image_positions[0]
     assert items_of("physion", "event", "A1_contact", still) == []
 
 
-def test_readers_and_refusals_can_be_sent_to_processes(tmp_path: Path) -> None:
+def test_readers_and_their_errors_can_be_pickled(tmp_path: Path) -> None:
     for release in READERS.values():
         job = pickle.loads(pickle.dumps(partial(release.read_scene, tmp_path, tmp_path, "test")))
         assert job.func is release.read_scene
         for name in ("list_scenes", "check_frames", "load_images"):
             assert callable(getattr(release, name))
-    refused = pickle.loads(pickle.dumps(RecordError("a file: what differs")))
-    assert isinstance(refused, RecordError)
-    assert str(refused) == "a file: what differs"
+    error = pickle.loads(pickle.dumps(RecordError("a file: difference", "damaged-file")))
+    assert (str(error), error.code) == ("a file: difference", "damaged-file")
+    assert isinstance(error, RecordError)
