@@ -9,7 +9,7 @@ from omegaconf import MISSING
 
 from conf.schema.checks import check_minimum, check_options, check_positive, check_share
 
-RENDERERS = ("bullet", "egl", "blender")
+RENDERERS = ("bullet", "blender")
 SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
 STANDINS = ("movi_a", "physion")
 WINDOW_FAMILIES = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
@@ -112,8 +112,8 @@ class BenchmarkConfig:
     max_collisions: int = 3
     """Maximum number of collisions in a scene."""
     renderer: str = "bullet"
-    """bullet (software, runs on every machine), egl (Bullet on a GPU driver) or blender (the look
-    of CLEVRER, needs the extra `blender`)."""
+    """bullet (software, runs on every machine) or blender (the look of CLEVRER, needs the extra
+    `blender`)."""
     width: int = 480
     """Width of a frame (px)."""
     height: int = 320
@@ -167,7 +167,7 @@ class BenchmarkConfig:
         if self.renderer == "blender":
             problems.append(
                 f"{typed} with benchmark.renderer=blender: Blender only renders the standard look; "
-                "set benchmark.renderer=bullet or egl"
+                "set benchmark.renderer=bullet"
             )
         if self.max_objects > STANDIN_OBJECTS:
             problems.append(

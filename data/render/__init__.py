@@ -1,8 +1,7 @@
 """Renderers of scenes, with one interface.
 
-`bullet` runs on every machine, `egl` renders similar images with a graphics driver, and `blender`
-renders images in the style of CLEVRER's videos. The renderer is a part of a benchmark, because each
-one gives different pixels.
+`bullet` runs on every machine, and `blender` renders images in the style of CLEVRER's videos. The
+renderer is a part of a benchmark, because the two give different pixels.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from PIL import Image
 
 from conf.errors import UserError
 from data.records import Scene
-from data.render import blender, bullet, egl
+from data.render import blender, bullet
 from data.render.appearance import STANDARD_VIEW, View
 
 
@@ -34,7 +33,6 @@ class Renderer(Protocol):
 
 RENDERERS: dict[str, type[Renderer]] = {
     "bullet": bullet.BulletRenderer,
-    "egl": egl.EglRenderer,
     "blender": blender.BlenderRenderer,
 }
 
@@ -57,7 +55,7 @@ def check_renderer(name: str) -> None:
     """Check that a renderer can run on this machine.
 
     Raises:
-        UserError: a driver or a package is missing, or the name is unknown.
+        UserError: a package is missing, or the name is unknown.
     """
     renderer_version(name)
     RENDERERS[name].check()

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
@@ -20,9 +19,6 @@ from data.render.appearance import RGB, STANDARD_VIEW, View, mesh, texture
 from data.render.floor import Floor
 from data.world.camera import Camera
 from data.world.physics import connect
-
-if TYPE_CHECKING:
-    from pybullet_utils.bullet_client import BulletClient
 
 VERSION = "bullet-1"
 
@@ -37,7 +33,7 @@ class BulletRenderer:
 
     def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
         self._scene_view = view
-        self._bullet, self._rasteriser = self._connect()
+        self._bullet = connect()
         self._fine = view.camera.sized(width * OVERSAMPLING, height * OVERSAMPLING)
         self._view_matrix = self._bullet.computeViewMatrix(self._fine.eye, [0, 0, 0], [0, 0, 1])
         self._projection = _projection(self._fine)
@@ -97,67 +93,43 @@ class BulletRenderer:
             lightAmbientCoeff=0.45,
             lightDiffuseCoeff=0.6,
             lightSpecularCoeff=0.6,
-            renderer=self._rasteriser,
+            renderer=self._bullet.ER_TINY_RENDERER,
         )
         return pixels, mask
 
-    def _connect(self) -> tuple[BulletClient, int]:
-        """A Bullet client, and the id of its rasteriser."""
-        bullet = connect()
-        return bullet, bullet.ER_TINY_RENDERER
-
     def _load_textures(self) -> dict[str, int]:
         with tempfile.TemporaryDirectory() as folder:
-            paths = save_textures(Path(folder))
+            # Bullet reads textures only from files.
+            paths = {material: Path(folder) / f"{material}.png" for material in MATERIALS}
+            for material, path in paths.items():
+                Image.fromarray(texture(material)).save(path)
             return {m: self._bullet.loadTexture(str(path)) for m, path in paths.items()}
 
     def _load(self, scene: Scene) -> None:
-        self._clear()
+        # resetSimulation would leak megabytes each time.
+        for handle in self._handles:
+            self._bullet.removeBody(handle)
         self._handles = [self._add(look) for look in scene.objects]
         self._shadows = self._floor.shadows(scene.positions)
         self._scene_id = scene.scene_id
 
-    def _clear(self) -> None:
-        # resetSimulation would leak megabytes each time.
-        for handle in self._handles:
-            self._bullet.removeBody(handle)
-        self._handles, self._scene_id = [], None
-
     def _add(self, look: SceneObject) -> int:
-        handle = self._new_body(look)
-        texture_id = self._textures[look.material]
-        self._bullet.changeVisualShape(handle, -1, textureUniqueId=texture_id)
-        return handle
-
-    def _new_body(self, look: SceneObject) -> int:
         bullet = self._bullet
         if look not in self._visuals:
+            vertices, normals, uvs, triangles = mesh(look.shape)
             shine = 1.0 if look.material == "metal" else 0.05
             self._visuals[look] = bullet.createVisualShape(
                 bullet.GEOM_MESH,
-                **self._mesh(look),
+                vertices=vertices.tolist(),
+                normals=normals.tolist(),
+                uvs=uvs.tolist(),
+                indices=triangles.ravel().tolist(),
                 rgbaColor=[*(np.array(RGB[look.color]) / 255), 1],
                 specularColor=[shine] * 3,
             )
-        return bullet.createMultiBody(0, -1, self._visuals[look])
-
-    def _mesh(self, look: SceneObject) -> dict[str, Any]:
-        """Arguments of createVisualShape for an object's mesh."""
-        vertices, normals, uvs, triangles = mesh(look.shape)
-        return {
-            "vertices": vertices.tolist(),
-            "normals": normals.tolist(),
-            "uvs": uvs.tolist(),
-            "indices": triangles.ravel().tolist(),
-        }
-
-
-def save_textures(folder: Path) -> dict[str, Path]:
-    """Write each material's texture as a PNG, because Bullet reads textures only from files."""
-    paths = {material: folder / f"{material}.png" for material in MATERIALS}
-    for material, path in paths.items():
-        Image.fromarray(texture(material)).save(path)
-    return paths
+        handle = bullet.createMultiBody(0, -1, self._visuals[look])
+        bullet.changeVisualShape(handle, -1, textureUniqueId=self._textures[look.material])
+        return handle
 
 
 def _average(pixels: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 from collections import defaultdict
 from functools import partial
 
 from data.parallel import Workers
-from data.records import POOLS, FrameRef, sample_prefix_frames
+from data.records import POOLS, sample_prefix_frames
 from data.render import check_renderer
 from data.render.frame_cache import FrameCache, load_frames, save_frames
 from data.store import DATABASES, FRAMES_FOLDER, Store, write_atomically
@@ -36,17 +35,13 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
     config = store.manifest["config"]
     if which != "none" and config["simulator"] == "bullet":
         check_renderer(config["renderer"])
-    databases = {name: set(store.database(name)) for name in DATABASES}
-    ranked = set().union(*databases.values())
     cache = FrameCache.of(store)
     jobs = {
-        scene: partial(
-            _render_scene, cache, scene, frames, [f for f in frames if FrameRef(scene, f) in ranked]
-        )
+        scene: partial(_render_scene, cache, scene, frames)
         for scene, frames in frames_to_render(store, which).items()
     }
-    total, rendered, hashes = 0.0, 0, {}
-    for scene, (size, pixel_hashes) in workers.run(jobs, "rendering scenes", "scene"):
+    total, rendered = 0.0, 0
+    for scene, size in workers.run(jobs, "rendering scenes", "scene"):
         if limit_gb is not None and total + size > limit_gb * GB:
             cache.path(scene).unlink()
             log.info(
@@ -55,9 +50,7 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
             )  # fmt: skip
             break
         total, rendered = total + size, rendered + 1
-        hashes |= {FrameRef(scene, frame): digest for frame, digest in pixel_hashes.items()}
-    twins = _count_twins(databases, hashes)
-    record = {**options, "scenes": rendered, "bytes": total, "pixel_twins": twins}
+    record = {**options, "scenes": rendered, "bytes": total}
     write_atomically(path, json.dumps(record, indent=1).encode())
 
 
@@ -93,30 +86,11 @@ def referenced_frames(store: Store) -> dict[str, set[int]]:
     return frames
 
 
-def _render_scene(
-    cache: FrameCache, scene_id: str, frames: list[int], ranked: list[int]
-) -> tuple[int, dict[int, str]]:
-    """Render the frames that an archive lacks.
-
-    Returns:
-        The archive's size in bytes, and hashes of the pixels of the frames in databases.
-    """
+def _render_scene(cache: FrameCache, scene_id: str, frames: list[int]) -> int:
+    """Render the frames that an archive lacks, and return its size in bytes."""
     path = cache.path(scene_id)
     pixels = load_frames(path)
     missing = cache.render(scene_id, [f for f in frames if f not in pixels])
     if missing:
-        pixels |= missing
-        save_frames(pixels, path)
-    hashes = {f: hashlib.sha256(pixels[f].tobytes()).hexdigest() for f in ranked}
-    return path.stat().st_size, hashes
-
-
-def _count_twins(databases: dict[str, set[FrameRef]], hashes: dict[FrameRef, str]) -> int:
-    """Count frames of databases with equal pixels, which the oracle should have excluded."""
-    total = 0
-    for name, frames in databases.items():
-        ranked = [hashes[f] for f in frames if f in hashes]
-        if twins := len(ranked) - len(set(ranked)):
-            log.warning("%d frames of database %s have the pixels of another frame", twins, name)
-        total += twins
-    return total
+        save_frames(pixels | missing, path)
+    return path.stat().st_size

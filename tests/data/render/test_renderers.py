@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,17 +12,13 @@ import psutil
 import pytest
 from PIL import Image
 
-from conf.errors import UserError
 from conf.schema import BenchmarkConfig
 from data.records import Scene
-from data.render import RENDERERS, blender, check_renderer, get_renderer
+from data.render import blender, get_renderer
 from data.render.appearance import STANDARD_VIEW
 from data.render.bullet import BulletRenderer, _average
-from data.render.egl import EglRenderer
 from data.render.floor import Floor
-from data.world.camera import Camera
 from data.world.sampling import simulate_scene
-from data.world.shapes import intersect_rays
 from tests.user_errors import raises_user_error
 
 LIMITS = BenchmarkConfig(name="renderers")
@@ -42,15 +37,14 @@ def test_versions_need_no_renderer_package() -> None:
         "assert not {'pybullet', 'bpy'} & set(sys.modules)"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    bullet, egl, blender_version = run.stdout.splitlines()
+    bullet, blender_version = run.stdout.splitlines()
     assert bullet == "bullet-1"
-    assert len({bullet, egl, blender_version}) == len(RENDERERS)
     assert blender.BPY in blender_version
     assert str(blender.SAMPLES) in blender_version
 
 
 def test_unknown_renderer_is_refused() -> None:
-    with raises_user_error("unknown-option", contains=("blendr", "bullet, egl, blender")):
+    with raises_user_error("unknown-option", contains=("blendr", "bullet, blender")):
         get_renderer("blendr", 192, 128)
 
 
@@ -94,80 +88,6 @@ def test_rendering_many_scenes_does_not_leak_memory(scene: Scene) -> None:
             renderer.render(others[k % 3], 0)
         used.append(psutil.Process().memory_info().rss)
     assert used[1] - used[0] < 10 << 20
-
-
-def egl_error() -> UserError | None:
-    """The error of a machine without EGL."""
-    try:
-        check_renderer("egl")
-    except UserError as error:
-        return error
-    return None
-
-
-def test_egl_mask_agrees_with_ray_casting_or_reports_a_missing_driver(scene: Scene) -> None:
-    if error := egl_error():
-        assert error.code == "missing-driver"
-        return
-    for frame in (0, 60):
-        mask, _ = objects_of(EglRenderer(240, 160), scene, frame)
-        hit = nearest_objects(scene, frame, Camera())
-        for k in range(len(scene.objects)):
-            if (hit == k).sum() > 100:
-                overlap = ((hit == k) & (mask == k)).sum() / ((hit == k) | (mask == k)).sum()
-                assert overlap > 0.98, (frame, k)
-
-
-def test_egl_objects_have_the_colors_of_bullet(scene: Scene) -> None:
-    """The scene has a metal cube among rubber ones; another scene is rendered before it."""
-    if egl_error():
-        return
-    egl, bullet = EglRenderer(240, 160), BulletRenderer(240, 160)
-    egl.render(simulate_scene(7, 2, "train", LIMITS), 60)
-    actual, expected = (objects_of(r, scene, 60) for r in (egl, bullet))
-    for k, look in enumerate(scene.objects):
-        colors = [picture[mask == k].mean(axis=0) for mask, picture in (actual, expected)]
-        assert np.abs(colors[0] - colors[1]).max() < 30, look
-
-
-def objects_of(renderer: BulletRenderer, scene: Scene, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) the object at each pixel, -1 for none, and (H, W, 3) its colour."""
-    handles = renderer.pose(scene, frame)
-    pixels, mask = renderer.capture()
-    index = np.full(mask.shape, -1)
-    for k, handle in enumerate(handles):
-        index[mask == handle] = k
-    return index, pixels[..., :3].astype(float)
-
-
-def nearest_objects(scene: Scene, frame: int, camera: Camera) -> np.ndarray:
-    """(H, W) the first object on each pixel's ray, -1 for none."""
-    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = camera.rays(columns.ravel().astype(float), rows.ravel().astype(float))
-    depths = np.stack(
-        [
-            intersect_rays(look.shape, place, turn, np.asarray(camera.eye), rays)
-            for look, place, turn in zip(
-                scene.objects, scene.positions[frame], scene.quaternions[frame], strict=True
-            )
-        ]
-    )
-    nearest = np.where(np.isfinite(depths).any(axis=0), depths.argmin(axis=0), -1)
-    return nearest.reshape(camera.height, camera.width)
-
-
-def test_egl_without_a_driver_is_an_error() -> None:
-    code = (
-        "from conf.errors import UserError\n"
-        "from data.render import get_renderer\n"
-        "try: get_renderer('egl', 48, 32)\n"
-        "except UserError as error: print(error.code)"
-    )
-    no_driver = {**os.environ, "__EGL_VENDOR_LIBRARY_FILENAMES": os.devnull}
-    run = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=no_driver
-    )
-    assert run.stdout.split() == ["missing-driver"]
 
 
 def test_blender_without_its_module_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
