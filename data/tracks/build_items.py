@@ -23,7 +23,7 @@ from data.records import RetrievalQuery, Scene, SelectionItem
 from data.releases.transfer_suites import TRANSFER_SUITES
 from data.store import PARTS, load_scene, scene_path, write_atomically
 from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
-from data.tracks.quota import fill_quota
+from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.retrieval import counterfactual, future
 from data.tracks.selection import event, time, window
 from data.tracks.selection.distractors import BUILDERS_VERSION
@@ -45,7 +45,7 @@ def make_items_and_queries(
 
     Returns:
         Items; queries, more than the quotas by `QUERY_RESERVE`; and how many of each were dropped
-        because their candidates cannot be told apart.
+        because too few candidates differ enough.
     """
     quotas = _job_quotas(cfg)
     paths = {name: _part_path(folder, cfg, scene_ids, name, quotas[name]) for name in quotas}
@@ -139,18 +139,23 @@ def _run_job(
     def scene_of(scene_id: str) -> Scene:
         return _load(scene_path(folder, scene_id))
 
-    track, group, cell = name.split("/")
-    seed, least = cfg.seed, cfg.selection.min_displacement
-    negatives = cfg.retrieval.hard_negatives
+    track, group, subtype = name.split("/")
+    cell = CellInputs(
+        scene_ids,
+        scene_of,
+        quota,
+        cfg.seed,
+        least=cfg.selection.min_displacement,
+        hard_negatives=cfg.retrieval.hard_negatives,
+    )
     if track == "selection":
-        make_item = partial(item_families(cfg)[group].make_item, cell)
-        made, dropped = fill_quota(cell, make_item, scene_ids, scene_of, quota, seed, least)
+        make_item = partial(item_families(cfg)[group].make_item, subtype)
+        made, dropped = fill_quota(subtype, make_item, cell)
     elif track == "controls":
-        made, dropped = fill_pairs(scene_ids, scene_of, quota, seed, least)
+        made, dropped = fill_pairs(cell)
+    elif group == "future":
+        made, dropped = future.make_queries(int(subtype), cell)
     else:
-        make = counterfactual.make_queries
-        if group == "future":
-            make = partial(future.make_queries, int(cell))
-        made, dropped = make(scene_ids, scene_of, quota, negatives, least, seed)
+        made, dropped = counterfactual.make_queries(cell)
     part: dict[str, Any] = {"rows": [row.to_row() for row in made], "dropped": dropped}
     write_atomically(path, json.dumps(part).encode())

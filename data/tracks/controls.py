@@ -8,14 +8,13 @@ prefix of an existing item: they remove it or shuffle its frames.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from conf.schema import Quota
 from data.records import SELECTION_SECOND, Scene, SelectionItem, sample_prefix_frames
-from data.tracks.quota import fill_quota
+from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.selection import event, time
 from data.tracks.selection.distractors import DistractorPicker, new_item
 from data.tracks.selection.event import EventTiming
@@ -67,15 +66,9 @@ def make_item(
     return None
 
 
-def fill_pairs(
-    scene_ids: dict[str, list[str]],
-    scene_of: Callable[[str], Scene],
-    quota: Quota,
-    seed: int,
-    least: float,
-) -> tuple[list[SelectionItem], int]:
+def fill_pairs(cell: CellInputs) -> tuple[list[SelectionItem], int]:
     """Make pairs up to the quota, as two items in a row; see `data.tracks.quota.fill_quota`."""
-    items, dropped = fill_quota(MATCHED_ANCHOR, make_item, scene_ids, scene_of, quota, seed, least)
+    items, dropped = fill_quota(MATCHED_ANCHOR, make_item, cell)
     return [each for item in items for each in _pair(item)], dropped
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -19,19 +19,29 @@ ItemMaker = Callable[[Scene, np.random.Generator, DistractorPicker], SelectionIt
 """Makes at most one item of a cell from a scene, with the target as its first candidate."""
 
 
+@dataclass(frozen=True)
+class CellInputs:
+    """Inputs of the items or queries of one cell.
+
+    Attributes:
+        scene_ids: Scene ids by split.
+        scene_of: Loads a scene by its id.
+        least: Smallest displacement between two candidates, px at 336 x 336.
+        hard_negatives: Number of hard negatives of a query.
+    """
+
+    scene_ids: dict[str, list[str]]
+    scene_of: Callable[[str], Scene]
+    quota: Quota
+    seed: int
+    least: float
+    hard_negatives: int = 0
+
+
 def fill_quota(
-    subtype: str,
-    make_item: ItemMaker,
-    scene_ids: dict[str, list[str]],
-    scene_of: Callable[[str], Scene],
-    quota: Quota,
-    seed: int,
-    least: float,
+    subtype: str, make_item: ItemMaker, cell: CellInputs
 ) -> tuple[list[SelectionItem], int]:
     """Make the items of one cell, at most one a scene, from scenes in a seeded order.
-
-    Args:
-        least: Smallest displacement between two candidates, px at 336 x 336.
 
     Returns:
         Items of each split up to its quota, and the number of targets that were dropped because
@@ -39,13 +49,14 @@ def fill_quota(
     """
     items, dropped = [], 0
     for split in SPLITS:
-        picker = DistractorPicker(least, scene_ids[split], scene_of)
-        rng = named_rng(seed, subtype, split)
+        scene_ids = cell.scene_ids[split]
+        picker = DistractorPicker(cell.least, scene_ids, cell.scene_of)
+        rng = named_rng(cell.seed, subtype, split)
         made: list[SelectionItem] = []
-        for index in rng.permutation(len(scene_ids[split])):
-            if len(made) == getattr(quota, split):
+        for index in rng.permutation(len(scene_ids)):
+            if len(made) == getattr(cell.quota, split):
                 break
-            item = make_item(scene_of(scene_ids[split][index]), rng, picker)
+            item = make_item(cell.scene_of(scene_ids[index]), rng, picker)
             if item is not None:
                 made.append(item)
         # Each letter is the answer equally often. The remainder starts at a random letter, because

@@ -86,8 +86,7 @@ def _add_body(
     goal: int,
     most: int,
 ) -> tuple[list[Body], Motion] | None:
-    """Add a body that collides with another while there are fewer than `goal` collisions, then one
-    that collides with none.
+    """Add a body that collides with another, or with none once the motion has `goal` collisions.
 
     Returns:
         All bodies and their motion, or None where no attempt succeeded.

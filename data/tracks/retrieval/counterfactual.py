@@ -6,14 +6,12 @@ that scene. The prefix is the factual one and ends before the object's first con
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from conf.schema import Quota
 from data.records import FPS, FrameRef, RetrievalQuery, Scene
-from data.tracks.quota import named_rng
+from data.tracks.quota import CellInputs, named_rng
 from data.tracks.retrieval import queries
 from data.tracks.retrieval.future import spell_seconds
 from data.world.displacement import DIAGONAL, cross_scene_displacement, on_screen_positions
@@ -81,14 +79,7 @@ def removal_displacement(scene: Scene, absent: Scene, removed: int) -> np.ndarra
     return np.minimum(np.where(on_screen | other_on_screen, distance, 0.0).max(axis=-1), DIAGONAL)
 
 
-def make_queries(
-    scene_ids: dict[str, list[str]],
-    scene_of: Callable[[str], Scene],
-    quota: Quota,
-    hard_negatives: int,
-    least: float,
-    seed: int,
-) -> tuple[list[RetrievalQuery], int]:
+def make_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
     """Make the counterfactual queries, and count the dropped ones; see `queries.fill_quota`.
 
     The first hard negative is the factual scene at the target's frame; the others are wrong-time
@@ -96,20 +87,24 @@ def make_queries(
     """
 
     def absent_of(scene: Scene) -> tuple[Scene, int] | None:
-        removed = removed_object(scene, seed)
-        return None if removed is None else (scene_of(absent_id(scene.scene_id, removed)), removed)
+        removed = removed_object(scene, cell.seed)
+        if removed is None:
+            return None
+        return cell.scene_of(absent_id(scene.scene_id, removed)), removed
 
     def timings_of(scene: Scene) -> list[CounterfactualTiming]:
         absent = absent_of(scene)
-        return [] if absent is None else counterfactual_timings(scene, *absent, least)
+        return [] if absent is None else counterfactual_timings(scene, *absent, cell.least)
 
     def make_query(
         scene: Scene, timing: CounterfactualTiming, rng: np.random.Generator
     ) -> RetrievalQuery | None:
         absent, removed = absent_of(scene)
-        wrong = queries.pick_hard_negatives(absent, timing.target, hard_negatives - 1, least, rng)
+        count = cell.hard_negatives - 1
+        wrong = queries.pick_hard_negatives(absent, timing.target, count, cell.least, rng)
         if wrong is None or any(
-            cross_scene_displacement(scene, timing.target, absent, frame) < least for frame in wrong
+            cross_scene_displacement(scene, timing.target, absent, frame) < cell.least
+            for frame in wrong
         ):
             return None
         phrase = scene.objects[removed].phrase
@@ -134,6 +129,4 @@ def make_queries(
             removed_object=phrase,
         )
 
-    return queries.fill_quota(
-        "counterfactual", scene_ids, scene_of, quota, seed, timings_of, make_query
-    )
+    return queries.fill_quota("counterfactual", cell, timings_of, make_query)

@@ -35,21 +35,20 @@ class UniqueFrames:
     scene_of: Callable[[str], Scene]
     frames: dict[FrameRef, None] = field(default_factory=dict)
     left_out: int = 0
-    _seen: dict[tuple, list[np.ndarray]] = field(default_factory=lambda: defaultdict(list))
+    _positions: dict[tuple, list[np.ndarray]] = field(default_factory=lambda: defaultdict(list))
 
     def add(self, frame: FrameRef) -> bool:
         """Add a frame unless it or a twin of it is present, and return whether it was added."""
         if frame in self.frames:
             return False
-        looks = list(_appearances(self.scene_of(frame.scene_id), frame.frame))
-        for shown, places in looks:
-            if any(
-                np.abs(other - places).max(initial=0) < TWIN_DISTANCE for other in self._seen[shown]
-            ):
+        appearances = list(_appearances(self.scene_of(frame.scene_id), frame.frame))
+        for objects, positions in appearances:
+            others = self._positions[objects]
+            if any(np.abs(other - positions).max(initial=0) < TWIN_DISTANCE for other in others):
                 self.left_out += 1
                 return False
-        for shown, places in looks:
-            self._seen[shown].append(places)
+        for objects, positions in appearances:
+            self._positions[objects].append(positions)
         self.frames[frame] = None
         return True
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from conf.schema import Quota
 from data.records import FPS, FrameRef, RetrievalQuery, Scene
+from data.tracks.quota import CellInputs
 from data.tracks.retrieval import queries
 
 EVENTS_PER_SCENE = 3
@@ -104,45 +104,31 @@ BUILDERS: dict[int, Callable[[Scene], Iterator[FutureQuestion]]] = {
 """Each builder yields all questions that it can ask about a scene."""
 
 
-def make_queries(
-    builder: int,
-    scene_ids: dict[str, list[str]],
-    scene_of: Callable[[str], Scene],
-    quota: Quota,
-    hard_negatives: int,
-    least: float,
-    seed: int,
-) -> tuple[list[RetrievalQuery], int]:
+def make_queries(builder: int, cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
     """Make the queries of one builder, and count the dropped ones; see `queries.fill_quota`."""
 
     def make_query(
-        scene: Scene, asked: FutureQuestion, rng: np.random.Generator
+        scene: Scene, timing: FutureQuestion, rng: np.random.Generator
     ) -> RetrievalQuery | None:
-        negatives = queries.pick_hard_negatives(scene, asked.target, hard_negatives, least, rng)
+        negatives = queries.pick_hard_negatives(
+            scene, timing.target, cell.hard_negatives, cell.least, rng
+        )
         if negatives is None:
             return None
-        start, stop = asked.prefix
+        start, stop = timing.prefix
         return RetrievalQuery(
-            query_id=f"future-{builder}-{scene.scene_id}-{start}-{stop}-{asked.target}",
+            query_id=f"future-{builder}-{scene.scene_id}-{start}-{stop}-{timing.target}",
             split=scene.split,
             pool="future",
             builder=builder,
-            anchor=asked.anchor,
-            question=asked.question,
+            anchor=timing.anchor,
+            question=timing.question,
             scene_id=scene.scene_id,
             prefix_start=start,
             prefix_stop=stop,
-            target=FrameRef(scene.scene_id, asked.target),
+            target=FrameRef(scene.scene_id, timing.target),
             hard_negatives=tuple(FrameRef(scene.scene_id, frame) for frame in negatives),
         )
 
-    return queries.fill_quota(
-        str(builder),
-        scene_ids,
-        scene_of,
-        quota,
-        seed,
-        lambda scene: list(BUILDERS[builder](scene)),
-        make_query,
-        one_a_scene=builder in ONE_PER_SCENE,
-    )
+    once = builder in ONE_PER_SCENE
+    return queries.fill_quota(str(builder), cell, BUILDERS[builder], make_query, once)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
 import numpy as np
 
-from conf.schema import Quota
 from data.records import SPLITS, RetrievalQuery, Scene
-from data.tracks.quota import named_rng, round_robin
+from data.tracks.quota import CellInputs, named_rng, round_robin
 from data.world.displacement import frame_displacements
 
 OFFSETS = (16, 32, 48)
@@ -22,13 +21,10 @@ Timing = TypeVar("Timing")
 
 def fill_quota(
     builder: str,
-    scene_ids: dict[str, list[str]],
-    scene_of: Callable[[str], Scene],
-    quota: Quota,
-    seed: int,
-    timings_of: Callable[[Scene], Sequence[Timing]],
+    cell: CellInputs,
+    timings_of: Callable[[Scene], Iterable[Timing]],
     make_query: Callable[[Scene, Timing, np.random.Generator], RetrievalQuery | None],
-    one_a_scene: bool = False,
+    one_per_scene: bool = False,
 ) -> tuple[list[RetrievalQuery], int]:
     """Make the queries of one builder up to its quota in each split.
 
@@ -39,28 +35,28 @@ def fill_quota(
         The queries, and the number of timings that were dropped because too few distinguishable
         hard negatives exist.
     """
+
+    def attempts(
+        scene_id: str, timings: list[Timing], rng: np.random.Generator
+    ) -> Iterator[RetrievalQuery | None]:
+        for timing in timings:
+            query = make_query(cell.scene_of(scene_id), timing, rng)
+            yield query
+            if query is not None and one_per_scene:
+                return
+
     queries: list[RetrievalQuery] = []
     dropped = 0
     for split in SPLITS:
-        rng = named_rng(seed, "retrieval", builder, split)
-        wanted = getattr(quota, split)
-        timings: dict[str, list[Timing]] = {}
-        for index in rng.permutation(len(scene_ids[split])) if wanted else ():
-            scene = scene_of(scene_ids[split][index])
-            every = timings_of(scene)
-            timings[scene.scene_id] = [every[k] for k in rng.permutation(len(every))]
-
-        def attempts(
-            scene_id: str, remaining: list[Timing], rng: np.random.Generator = rng
-        ) -> Iterator[RetrievalQuery | None]:
-            while remaining:
-                query = make_query(scene_of(scene_id), remaining.pop(), rng)
-                if query is not None and one_a_scene:
-                    remaining.clear()
-                yield query
-
+        rng = named_rng(cell.seed, "retrieval", builder, split)
+        scene_ids, wanted = cell.scene_ids[split], getattr(cell.quota, split)
+        queues = []
+        for index in rng.permutation(len(scene_ids)) if wanted else ():
+            timings = list(timings_of(cell.scene_of(scene_ids[index])))
+            order = rng.permutation(len(timings))[::-1]
+            queues.append(attempts(scene_ids[index], [timings[k] for k in order], rng))
         made: list[RetrievalQuery] = []
-        for query in round_robin(attempts(*entry) for entry in timings.items()):
+        for query in round_robin(queues):
             if query is None:
                 dropped += 1
                 continue

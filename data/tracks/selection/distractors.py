@@ -1,4 +1,4 @@
-"""Distractors that can be told apart, and the items that families make of them.
+"""Distractors that differ visibly from the target, and items made of them.
 
 A family's module has `CELLS`, its cells by subtype, and `make_item(subtype, scene, ...)`, which
 makes at most one item of a cell from a scene.
@@ -156,7 +156,7 @@ def new_item(
 def visible_objects(scene: Scene, prefix: tuple[int, int]) -> tuple[int, ...]:
     """Indices of the objects on screen in a prefix.
 
-    Only these may tell candidates apart: where another object enters cannot be predicted.
+    Only these may distinguish candidates, because the entry of another object is unpredictable.
     """
     start, stop = prefix
     return tuple(

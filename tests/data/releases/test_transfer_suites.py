@@ -16,7 +16,7 @@ from data.records import Collision, Landing, Scene, SceneObject, SelectionItem
 from data.releases.readers import READERS
 from data.releases.transfer_suites import TRANSFER_SUITES
 from data.releases.validation import RecordError
-from data.tracks.quota import fill_quota
+from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.selection import event, time
 from data.world.displacement import cross_scene_displacement
 from data.world.events import find_motion_onsets
@@ -72,9 +72,9 @@ def items_of(
     suite: str, family: str, subtype: str, scenes: dict[str, Scene]
 ) -> list[SelectionItem]:
     make_item = partial(TRANSFER_SUITES[suite][family].make_item, subtype)
-    names = {"train": [], "test": list(scenes)}
-    found, _ = fill_quota(subtype, make_item, names, scenes.__getitem__, Quota(0, 24), 0, LEAST)
-    return found
+    scene_ids = {"train": [], "test": list(scenes)}
+    cell = CellInputs(scene_ids, scenes.__getitem__, Quota(0, 24), seed=0, least=LEAST)
+    return fill_quota(subtype, make_item, cell)[0]
 
 
 CELLS = [
