@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -70,6 +70,10 @@ def ensure_items(cfg: BenchmarkConfig, root: Path, workers: Workers, strict: boo
         build(cfg, folder, workers, strict)
     store = open_store(folder)
     _check_same_settings(store, cfg)
+    if cfg.folder is not None:
+        # The release may have moved since the build.
+        config = store.manifest["config"] | {"folder": cfg.folder}
+        store = replace(store, manifest=store.manifest | {"config": config})
     return store
 
 
@@ -143,7 +147,6 @@ def check_names(cfg: BenchmarkConfig) -> None:
 
 
 def _check_same_settings(store: Store, cfg: BenchmarkConfig) -> None:
-    # The folder of a release may move.
     if change := find_change(store.manifest["config"], asdict(cfg), ignored={"folder"}):
         key, built, requested = change
         raise UserError(

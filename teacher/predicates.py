@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from data.records import FPS, LETTERS, Candidate, Collision, Scene, SelectionItem
+from data.records import LETTERS, Candidate, Collision, Scene, SelectionItem
 
 CUT_MARGIN = 12
 """Frames between the cut and the first collision (paper, Rationale construction)."""
@@ -275,7 +275,7 @@ def find_collision_courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
             continue
         gap, closing = ground[cut, j] - ground[cut, i], step[j] - step[i]
         speed = float(np.linalg.norm(closing))
-        if speed * FPS < STATIONARY or np.dot(gap, closing) >= 0:
+        if speed * scene.fps < STATIONARY or np.dot(gap, closing) >= 0:
             continue
         time = min(-float(np.dot(gap, closing)) / speed**2, COURSE_HORIZON)
         if np.linalg.norm(gap + time * closing) < CONTACT + COURSE_MARGIN:
@@ -325,7 +325,8 @@ def _cell(scene: Scene, point: np.ndarray) -> str:
 def _sight(scene: Scene, frame: int, index: int) -> str:
     if not scene.in_view[frame, index]:
         return OUT_OF_VIEW
-    return "shown" if scene.visible_fraction[frame, index] > MIN_VISIBLE else "hidden"
+    # NaN: the simulator's record has no visible fraction, so an object in view is shown.
+    return "hidden" if scene.visible_fraction[frame, index] <= MIN_VISIBLE else "shown"
 
 
 def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFacts:

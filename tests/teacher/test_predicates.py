@@ -3,6 +3,7 @@
 import json
 import math
 from collections import Counter
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -77,6 +78,21 @@ def test_meeting_after_the_last_frame_is_unseen():
     assert not scene.collisions
     assert find_collision_courses(scene, 50) == [(0, 1)]
     assert extract_facts(scene, 20, 50, 55).courses[0].when == "unseen"
+
+
+def test_a_course_is_measured_by_the_frame_rate_of_the_scene():
+    """Two objects that close at 0.04 units/s are stationary, at any frame rate."""
+    scene = synthetic.scene([(-0.3, 0), (0.3, 0)], [(0.02, 0), (-0.02, 0)])
+    assert find_collision_courses(scene, 10) == []
+    faster = replace(scene, fps=100, velocities=scene.velocities * 4)
+    assert find_collision_courses(faster, 10) == [(0, 1)]
+
+
+def test_an_object_without_a_recorded_visible_fraction_is_visible_in_view():
+    scene = synthetic.scene([(0, 0), (0, -1)], [(0, 0), (0, 0)])
+    unknown = replace(scene, visible_fraction=np.full_like(scene.visible_fraction, np.nan))
+    sights = {(o.sight, o.target_sight) for o in extract_facts(unknown, 20, 40, 90).objects}
+    assert sights == {("shown", "shown")}
 
 
 def test_parallel_and_separating_pairs_are_not_on_a_course():

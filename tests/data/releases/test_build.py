@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -67,6 +68,17 @@ def test_an_invalid_record_stops_a_strict_build(movi, tmp_path) -> None:
     with raises_user_error("invalid-record", contains=("00007", "strict=false")):
         ensure_items(config(movi), tmp_path, Workers(1), strict=True)
     assert not (tmp_path / "movi").exists()
+
+
+def test_a_release_may_move_after_the_build(movi, tmp_path) -> None:
+    release = shutil.copytree(movi, tmp_path / "release")
+    built = ensure_items(config(release), tmp_path, Workers(1))
+    moved = release.rename(tmp_path / "moved")
+    store = ensure_items(config(moved), tmp_path, Workers(1))
+    assert store.identity == built.identity
+    candidate = store.selection("test")[0].candidates[0]
+    frame = FrameReader(store).array(candidate.scene_id, candidate.frame)
+    np.testing.assert_array_equal(frame, np.asarray(picture(candidate.frame, (256, 256))))
 
 
 def test_a_release_must_be_named_and_exist(tmp_path) -> None:
