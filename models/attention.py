@@ -26,17 +26,14 @@ SHORT = 2048
 """Tokens up to which the scores of all pairs are kept for the backward pass."""
 
 
-def choose_attention(
-    model: PreTrainedModel, precision: str, max_length: int, masks: bool = False
-) -> None:
+def choose_attention(model: PreTrainedModel, precision: str, max_length: int) -> None:
     """Let a Qwen3-VL attend in the fastest way that there is for the machine, for passes in
-    `precision` (bf16 or fp32) over up to `max_length` tokens, and with `masks` in a way that takes
-    a mask of any shape, which flash attention does not; other models are left as they are.
+    `precision` (bf16 or fp32) over up to `max_length` tokens; other models are left as they are.
     """
     if model.config.model_type != "qwen3_vl":
         return
     flash = flash_attention(precision)
-    if flash is not None and not masks:
+    if flash is not None:
         model.set_attn_implementation(flash)
         return
     products = not torch.cuda.is_available() and precision == "bf16" and max_length <= SHORT

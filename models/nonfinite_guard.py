@@ -1,4 +1,4 @@
-"""What to tell a user whose model gives no numbers any more."""
+"""Refuses embeddings that are not finite."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ from conf.errors import UserError
 
 
 def check_finite(embedded: torch.Tensor, names: Callable[[], Sequence[str]]) -> None:
-    """Raises UserError where one of embeddings (rows, ...) is no number; `names` names the rows."""
+    """Raise UserError if one of embeddings (rows, ...) has a NaN or an Inf; `names` names the
+    rows."""
     whole = torch.isfinite(embedded).flatten(1).all(dim=1)
     if not whole.all():
         first = int((~whole).nonzero()[0])
         raise UserError(
-            f"the embedding of {names()[first]} is no number: a lower train.lr or "
-            "train.precision=fp32 may help; what was trained up to the last checkpoint is kept"
+            f"non-finite embedding (NaN or Inf) for {names()[first]}: lower train.lr or set "
+            "train.precision=fp32; the checkpoints written so far are kept",
+            code="non-finite-embedding",
         )

@@ -1,16 +1,15 @@
-"""Write a trained student or retriever for others to load: merged into its base, or its adapters
-alone.
+"""Export a trained student or retriever: merged into its base, or its adapters alone.
 
     checkpoints/export_<product>/<run>/<format>/<product>/
-        config.json, model.safetensors                 what the standard classes load, or
-        adapter_config.json, adapter_model.safetensors what peft lays over the base
+        config.json, model.safetensors         for the standard classes, or
+        adapter_config.json, adapter_model.safetensors      for peft
         modules.json and the modules' folders, of a retriever
         tokenizer and processor files
         README.md      the model card
-        config.yaml, resolved.yaml, run.json, metrics.json    the training run's own
-        export.json    what was exported, and how far what it gives is from what was trained
+        config.yaml, run.json, metrics.json    from the training run; resolved.yaml with adapters
+        export.json    what was exported, and how far it differs from what was trained
 
-The folder is written beside and renamed when it is whole.
+The folder is written under another name and renamed when it is complete.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from pathlib import Path
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import lock_folder, resolve_run_name, runs_folder, write_json, write_text
+from conf.runs import lock_folder, resolve_run_name, runs_folder, write_json
 from conf.schema import (
     ContrastiveCommand,
     ExportModelCommand,
@@ -35,21 +34,25 @@ from conf.schema import (
 
 log = logging.getLogger(__name__)
 
-KEPT = ("config.yaml", "run.json", "metrics.json")
-"""The training run's files that go with an export."""
-TRAINED_BY = {"student": SftCommand, "retriever": ContrastiveCommand}
-LOADED_BY = {
+RECORDS = ("config.yaml", "run.json", "metrics.json")
+"""Files of the training run that belong to its export."""
+COMMANDS = {"student": SftCommand, "retriever": ContrastiveCommand}
+LOADERS = {
     "student": "the standard classes and vLLM load",
     "retriever": "SentenceTransformer loads",
 }
 
-Measured = dict[str, float]
-
 
 @dataclass(frozen=True)
-class Trained:
-    """A finished run of a trainer: its name, its folder, what it trained (student, retriever), and
-    its settings."""
+class TrainedRun:
+    """A finished training run.
+
+    Attributes:
+        name: The run.
+        folder: Its folder.
+        product: What it trained: student or retriever.
+        settings: Its settings.
+    """
 
     name: str
     folder: Path
@@ -66,17 +69,21 @@ class Trained:
 
 
 @command("train.export", ExportModelCommand)
-def main(cfg: ExportModelCommand, run: Run) -> Measured:
-    trained = find(cfg)
+def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
+    trained = find_run(cfg.run, cfg.product, cfg.checkpoints)
 
     from data.store import hash_file
-    from models.resolved import check_base
+    from models.resolved import RESOLVED, check_base
     from models.trained_runs import EXPORT, export_record
-    from train.common.model_card import text
+    from train.common.merge import write_merged
+    from train.common.model_card import model_card
 
     adapters = trained.saved / "adapter_model.safetensors"
     if not adapters.exists():
-        raise UserError(f"{trained.saved} holds no adapters: delete the run and train again")
+        raise UserError(
+            f"{trained.saved} holds no adapters: delete the run and train again",
+            code="missing-adapters",
+        )
     check_base(trained.folder, trained.preset)
     weights = hash_file(adapters)
     folder = run.folder / trained.product
@@ -85,52 +92,69 @@ def main(cfg: ExportModelCommand, run: Run) -> Measured:
         if record["weights"] != weights:
             raise UserError(
                 f"{folder} is an export of other adapters than {trained.saved} holds now: "
-                "delete it to export these"
+                "delete it to export these",
+                code="other-adapters",
             )
-        log.info("%s is exported already; delete it to export anew", folder)
+        log.info("%s is exported already; delete it to export again", folder)
         return record["measured"]
-    with renamed_when_whole(folder) as partial:
+    measured: dict[str, float] = {}
+    with renamed_when_complete(folder) as partial:
         if cfg.format == "adapter":
-            measured = write_adapter(trained, partial)
+            shutil.copytree(trained.saved, partial, dirs_exist_ok=True)
+            if (resolved := trained.folder / RESOLVED).exists():
+                shutil.copy(resolved, partial)
         else:
-            measured = write_merged(trained, cfg, partial)
-        for name in KEPT:
+            store = Path(cfg.store) if cfg.verify else None
+            measured = write_merged(product_merge(trained), partial, cfg.format, store, cfg.workers)
+        for name in RECORDS:
             shutil.copy(trained.folder / name, partial)
-        card = text(trained.name, trained.settings, trained.folder, cfg.format, measured)
-        write_text(partial / "README.md", card)
-        noted = {"run": trained.name, "format": cfg.format, "weights": weights}
-        write_json(partial / EXPORT, {**noted, "measured": measured})
+        card = model_card(trained.name, trained.settings, trained.folder, cfg.format, measured)
+        card.save(partial / "README.md")
+        record = {"run": trained.name, "format": cfg.format, "weights": weights}
+        write_json(partial / EXPORT, {**record, "measured": measured})
     for name, value in measured.items():
         log.info("%s: %.4g", name.replace("_", " "), value)
     log.info("the exported %s is in %s", trained.product, folder)
     return measured
 
 
-def find(cfg: ExportModelCommand) -> Trained:
-    """The run that is to be exported.
+def find_run(run: str, product: str, checkpoints: str) -> TrainedRun:
+    """Find the run to export.
 
     Raises:
-        UserError: there is none of that name, it is not finished, or it trained the whole model.
+        UserError: No run has this name, it is not finished, or it trained the whole model.
     """
     from models.trained_runs import trained_settings
 
-    runs = runs_folder(cfg.checkpoints, cfg.product)
-    name = resolve_run_name(cfg.run, runs)
+    runs = runs_folder(checkpoints, product)
+    name = resolve_run_name(run, runs)
     folder = Path(runs) / name
-    settings = trained_settings(folder, TRAINED_BY[cfg.product], cfg.product, "run")
-    trained = Trained(name, folder, cfg.product, settings)
+    settings = trained_settings(folder, COMMANDS[product], product, "run")
+    trained = TrainedRun(name, folder, product, settings)
     if trained.preset.lora.rank == 0:
         raise UserError(
-            f"run={folder} trained the whole model ({cfg.product}.lora.rank=0), so there are no "
-            f"adapters to merge: {trained.saved} is what {LOADED_BY[cfg.product]}"
+            f"run={folder} trained the whole model ({product}.lora.rank=0), so it has no adapters "
+            f"to merge: {trained.saved} is what {LOADERS[product]}",
+            code="nothing-to-merge",
         )
     return trained
 
 
+def product_merge(trained: TrainedRun):
+    """The merge of a run's student or retriever."""
+    if trained.product == "student":
+        from train.student.merge import StudentMerge
+
+        return StudentMerge(trained.settings, trained.saved)
+    from train.retriever.merge import RetrieverMerge
+
+    return RetrieverMerge(trained.settings, trained.saved)
+
+
 @contextmanager
-def renamed_when_whole(folder: Path) -> Iterator[Path]:
-    """A folder beside `folder` to write into. It takes that name in the end; what a kill or a full
-    disk left of an earlier one is thrown away."""
+def renamed_when_complete(folder: Path) -> Iterator[Path]:
+    """Yield a folder to write into, and rename it to `folder` at the end. Leftovers of an
+    interrupted export are deleted."""
     partial = folder.with_name(f".{folder.name}.partial")
     partial.mkdir(exist_ok=True)
     with lock_folder(partial, f"{folder} is being written by another process"):
@@ -142,26 +166,6 @@ def renamed_when_whole(folder: Path) -> Iterator[Path]:
             shutil.rmtree(partial)
             raise
         partial.rename(folder)
-
-
-def write_adapter(trained: Trained, folder: Path) -> Measured:
-    """Copy the adapters and the processor, and the hash of the base that they were trained over."""
-    from models.resolved import RESOLVED
-
-    shutil.copytree(trained.saved, folder, dirs_exist_ok=True)
-    if (trained.folder / RESOLVED).exists():
-        shutil.copy(trained.folder / RESOLVED, folder)
-    return {}
-
-
-def write_merged(trained: Trained, cfg: ExportModelCommand, folder: Path) -> Measured:
-    """Write the merged model, and measure how far what it gives is from what was trained."""
-
-    from train.retriever import merge as retriever_merge
-    from train.student import merge as student_merge
-
-    write = {"student": student_merge, "retriever": retriever_merge}[trained.product].write_merged
-    return write(trained.settings, trained.saved, cfg, folder)
 
 
 if __name__ == "__main__":

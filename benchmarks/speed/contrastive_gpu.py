@@ -28,37 +28,25 @@ import torch
 from PIL import Image
 
 from benchmarks.speed import hours
-from benchmarks.speed.contrastive_runs import repeated, trained
+from benchmarks.speed.contrastive_runs import trained
 from benchmarks.speed.sft_gpu import CONFIGS, random_model
 from benchmarks.speed.sft_runs import SEED, device_name
 from conf.compose import compose
 from conf.schema import ArchitectureConfig, ContrastiveCommand
 from data.records import FPS, FRAMES, FrameRef, RetrievalQuery
 from models import memory, parameter_counts
-from models.attention import choose_attention
 from models.retriever import embedder
-from train.retriever import mini_batches
-from train.retriever.inputs import RetrieverInputs
-from train.retriever.loss import RankingLoss
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "plain sentence-transformers": {"plain": True},
-    "plain, by tokens": {"plain": True, "mini_batch_tokens": 16384},
-    "ours, nothing shared": {},
-    "  each frame once": {"distinct_frames": True},
-    "  shared prefixes once": {"shared_prefixes": True},
-    "  the tower's features reused": {"reuse_features": True},
-    "  by tokens": {"mini_batch_tokens": 16384},
-    "  inputs made ahead": {"workers": 2},
-    "ours, as it comes": {"distinct_frames": True, "shared_prefixes": True},
-    "ours, all of it": {
-        "distinct_frames": True, "shared_prefixes": True, "reuse_features": True,
-        "mini_batch_tokens": 16384, "workers": 2,
-    },
-}  # fmt: skip
-PRESET = "ours, as it comes"
-"""The line whose rate benchmarks.speed.hours goes by."""
-ALONE = {"distinct_frames": False, "shared_prefixes": False}
+    "plain, by tokens": {"plain": True, "plain_tokens": 16384},
+    "ours": {},
+    "  with reused vision features": {"reuse_features": True},
+    "  with inputs loaded ahead": {"workers": 2},
+    "ours, with both": {"reuse_features": True, "workers": 2},
+}
+PRESET = "ours"
+"""The variant whose rate benchmarks.speed.hours uses."""
 
 
 def main() -> None:
@@ -82,39 +70,28 @@ def measure(name: str, base: str, batch: int, steps: int) -> None:
     noise = Noise(cfg.retriever.image_size)
     with tempfile.TemporaryDirectory() as folder:
         model = built(name, cfg, queries, Path(folder))
-        # As the trainer settles it, for all lines alike.
-        inputs = RetrieverInputs(model, noise, cfg.retriever, cfg.train.precision)
-        cfg.train = mini_batches.settle(
-            cfg.train, Path(folder), model, inputs, RankingLoss, queries
-        )
     recomputed = "recomputed" if cfg.train.gradient_checkpointing else "kept"
     print(f"activations {recomputed}, mini-batches of {cfg.train.mini_batch}")
     print(f"{name} over {base} on {device_name()}, batches of {batch} queries")
     print(parameter_counts.tower_table(parameter_counts.count_towers(model)))
     print(f"{'':<40}{'queries/s':>11}{'peak GiB':>10}{'loss':>10}", flush=True)
     kept = {n: p.detach().clone() for n, p in model.named_parameters() if p.requires_grad}
-    for number, (line, switches) in enumerate(VARIANTS.items()):
-        told = {name: value for name, value in (ALONE | switches).items() if name != "plain"}
-        variant = replace(cfg, train=replace(cfg.train, **told))
+    for line, switches in VARIANTS.items():
+        options = dict(switches)
+        plain, tokens = options.pop("plain", False), options.pop("plain_tokens", None)
+        variant = replace(cfg, train=replace(cfg.train, **options))
         for parameter_name, parameter in model.named_parameters():
             if parameter_name in kept:
                 parameter.data = kept[parameter_name].clone()
-        # What shares prefixes needs masks, which the library alone does not.
-        shares = "plain" not in switches
-        choose_attention(model[0].model, "bf16", cfg.retriever.max_length, masks=shares)
         gc.collect()
         try:
             with tempfile.TemporaryDirectory() as folder:
                 figures = trained(
-                    variant, model, queries, noise, None, steps + 1,
-                    "plain" in switches, Path(folder),
-                )  # fmt: skip
+                    variant, model, queries, noise, steps + 1, plain, Path(folder), tokens
+                )
         except torch.OutOfMemoryError:
             print(f"{line:<40}out of memory", flush=True)
             continue
-        if not number:
-            rates = repeated(figures.batches)
-            print(f"repeated: {rates['frames']:.0%} of frames, {rates['prefixes']:.0%} of prefixes")
         rate = batch / statistics.median(figures.seconds)
         print(
             f"{line:<40}{rate:>11.2f}{figures.peak:>10.2f}{figures.losses[-1]:>10.4f}", flush=True
@@ -127,7 +104,7 @@ def settings(name: str, base: str, batch: int) -> ContrastiveCommand:
     preset = "qwen3_vl_emb_8b" if name == "tiny" else name.replace("vl_", "vl_emb_")
     cfg = compose("train.contrastive", ContrastiveCommand, [f"retriever={preset}"])
     cfg.retriever.quantization = "nf4" if base == "nf4" else "none"
-    cfg.train.batch, cfg.train.batches = batch, "scenes"
+    cfg.train.batch = batch
     if name == "tiny":
         cfg.retriever.image_size, cfg.retriever.widths = 128, [192, 64]
     return cfg

@@ -213,6 +213,9 @@ class ExportModelCommand(CommandConfig):
     format: str = "bf16"
     """bf16 or fp32 merges the adapters into the dequantised base and writes the weights in that
     precision; adapter writes only the adapters."""
+    verify: bool = True
+    """Compare the merged model with the trained one on held-out items of the run's benchmark; false
+    needs no benchmark."""
 
     def check(self) -> list[str]:
         options = {"product": tuple(TRAINER_FOLDERS), "format": EXPORT_FORMATS}

@@ -128,48 +128,26 @@ class SftTrainConfig(TrainConfig):
 
 @dataclass
 class ContrastiveTrainConfig(TrainConfig):
+    gradient_checkpointing: bool = False
+    """Recompute activations in the backward pass: less memory, about a quarter more time."""
     batch: int = 512
     """Queries per optimizer step, over all ranks; each is contrasted with every target and hard
-    negative of the batch."""
-    batches: str = "random"
-    """Composition of a batch: random; scenes (groups of train.scene_queries queries of one scene);
-    or spread (as few queries of one scene as possible)."""
-    scene_queries: int = 4
-    """Queries per scene in a batch of train.batches=scenes."""
-    mini_batch: int | str = 8
-    """Prefixes or frames per forward pass; changes memory and speed, not the gradient. auto uses
-    the fastest size at which the longest prefixes fit into memory."""
-    mini_batch_tokens: int | None = None
-    """Tokens per forward pass, instead of train.mini_batch."""
+    negative of the batch except the frame of its own target."""
+    mini_batch: int = 8
+    """Queries or frames per forward pass; changes memory and speed, not the gradient."""
     hard_negatives: int = 1
     """Hard negatives per query: wrong-time frames of the query's own scene."""
     mine_every: int = 0
     """Steps between two minings of hard negatives, which replace a query's hard negatives by the
-    wrong frames that the retriever ranks highest; 0 keeps those of the benchmark. Mining masks
-    identical frames, like train.mask_identical=true."""
+    wrong frames that the retriever ranks highest; 0 keeps those of the benchmark."""
     mine_margin: float = 24.0
     """Minimum displacement (px at 336 x 336) of a mined frame from the target in the same scene."""
     scale: float = 50.0
     """Inverse temperature: factor of the cosine similarities, or of their sum for
     retriever.late."""
-    distinct_frames: bool = True
-    """Embed a frame once when several queries on a rank refer to it; does not change the
-    gradient."""
-    shared_prefixes: bool = True
-    """Encode a prefix once when several queries on a rank share it; does not change the
-    gradient."""
     reuse_features: bool = False
     """Keep the frozen vision tower's features between the two passes of a step, about 30 MB per
     query with an 8B model; does not change the gradient."""
-    mask_identical: bool = False
-    """Exclude the target's frame from a query's negatives where another query of the batch refers
-    to it; changes the objective."""
-    mask_near: float = 0.0
-    """Exclude frames of the target's scene within this displacement (px at 336 x 336) of the target
-    from a query's negatives; above 0 this changes the objective."""
-    hard_weight: float = 1.0
-    """Weight of a query's own hard negatives relative to other negatives; other than 1 this changes
-    the objective."""
     width_weights: list[float] | None = None
     """Weight of the loss at each width of retriever.widths; null weights them equally."""
     validation_queries: int = 128
@@ -180,38 +158,22 @@ class ContrastiveTrainConfig(TrainConfig):
             "batch": 1,
             "hard_negatives": 0,
             "validation_queries": 1,
-            "scene_queries": 1,
-            "mini_batch_tokens": 1,
-            "mask_near": 0,
             "mine_every": 0,
             "mine_margin": 0,
         }
         problems = super().check() + check_minimum(self, "train.", least)
-        problems += check_positive(self, "train.", ["scale", "hard_weight"])
-        problems += check_options(self, "train.", {"batches": ("random", "scenes", "spread")})
+        problems += check_positive(self, "train.", ["scale"])
         if self.batch < 2 and not self.hard_negatives:
             problems.append(
                 f"train.batch={self.batch} with train.hard_negatives=0 leaves no negatives: set "
                 "train.batch to 2 or more, or train.hard_negatives to 1 or more"
-            )
-        if self.batches == "scenes" and self.scene_queries > self.batch:
-            problems.append(
-                f"train.scene_queries={self.scene_queries} must be at most train.batch={self.batch}"
             )
         if self.mine_every and not self.hard_negatives:
             problems.append(
                 f"train.mine_every={self.mine_every} with train.hard_negatives=0 mines nothing: "
                 "set train.hard_negatives to 1 or more, or train.mine_every=0"
             )
-        if self.mini_batch == "auto":
-            if self.mini_batch_tokens is not None:
-                problems.append(
-                    f"train.mini_batch=auto with train.mini_batch_tokens={self.mini_batch_tokens}: "
-                    "set only one of them"
-                )
-        elif isinstance(self.mini_batch, str):
-            problems.append(f"train.mini_batch={self.mini_batch}: give a number or auto")
-        elif not 1 <= self.mini_batch <= self.batch:
+        if not 1 <= self.mini_batch <= self.batch:
             problems.append(
                 f"train.mini_batch={self.mini_batch} must be from 1 to train.batch={self.batch}"
             )

@@ -1,15 +1,16 @@
-"""The retriever as sentence-transformers sees it: queries of a video and a text, frames as images.
+"""The retriever in sentence-transformers: a query is a video with a text, a frame is an image.
 
-Inputs follow Qwen3-VL-Embedding: the instruction as system message, the video before the text, a
-generation prompt at the end, and the last token's state, normalised, as the embedding, or as
-`models.retriever.multi_vector` says. What is saved is a plain `SentenceTransformer` or
-`MultiVectorEncoder`.
+Inputs follow Qwen3-VL-Embedding: the instruction is the system message, the video precedes the
+text, and a generation prompt ends the input. The embedding is the normalised state of the last
+token, or many vectors (`models.retriever.multi_vector`). Saved retrievers are plain
+`SentenceTransformer` or `MultiVectorEncoder` models.
 """
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,10 @@ import torch
 from safetensors.torch import load_file
 from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
+from tqdm import tqdm
 from transformers import AutoConfig
 
+from conf.runs import world_size
 from conf.schema import LoraConfig, RetrieverConfig
 from data.records import FrameRef, RetrievalQuery, sample_prefix_frames
 from data.render.frame_cache import FrameReader
@@ -45,18 +48,21 @@ from models.loading import (
     no_targets_error,
     pin_sizes,
 )
+from models.nonfinite_guard import check_finite
 from models.retriever.multi_vector import keep_head_fp32, load_multi_vector, multi_vector_modules
 from models.student.prompts import load_clip
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
 
 Retriever = SentenceTransformer | MultiVectorEncoder
-"""With one vector, or with many."""
+"""A retriever with one vector, or with many."""
+Item = RetrievalQuery | FrameRef
+"""What a retriever embeds."""
 
 ADAPTERS = "adapter_model.safetensors"
-"""Where adapters over a frozen base are saved."""
+"""The file of adapters over a frozen base."""
 PROCESSING = {
-    # The library's default cuts a long input, through its frames if need be; the audit refuses it.
+    # By default the library truncates long inputs, even within a video; the audit refuses them.
     "text": {"truncation": False},
     "video": {"do_sample_frames": False},
     "chat_template": {"add_generation_prompt": True},
@@ -64,19 +70,24 @@ PROCESSING = {
 
 
 def load_retriever(
-    cfg: RetrieverConfig, precision: str, tokenizer_texts: list[str], folder: Path
+    cfg: RetrieverConfig, precision: str, texts: list[str], folder: Path
 ) -> Retriever:
-    """A retriever ready to train. One that is built from a seed is written to `folder` first, so
-    that it is loaded as any other.
+    """Load a retriever for training.
+
+    Args:
+        cfg: The preset.
+        precision: Of the passes: bf16 or fp32.
+        texts: What the tokenizer of a base built from an architecture is trained on.
+        folder: Where such a base is written, to be loaded as any other.
 
     Raises:
-        UserError: the model is not on this machine and cannot be fetched; it has no vision tower,
-            or a processor of another model; it was saved by another pooling, or with trained
-            modules after its backbone.
+        UserError: The model is not on this machine and cannot be fetched; it has no vision tower,
+            or another model's processor; it was saved with other pooling, or with trained modules
+            after its backbone.
     """
     source = cfg.model
     if cfg.architecture is not None:
-        source = from_main(partial(build_base, cfg, tokenizer_texts, folder))
+        source = from_main(partial(build_base, cfg, texts, folder))
     check_reachable("retriever", source)
     if is_retriever(source, cfg.revision):
         check_modules(source, cfg.revision)
@@ -98,37 +109,36 @@ def load_retriever(
         raise load_error("retriever", cfg.model, error) from error
     check_processor("retriever", source, config, backbone.processor)
     pin_sizes(backbone.processor, cfg.image_size, cfg.frames)
-    whole = {
+    options = {
         "prompts": {"query": cfg.query_instruction, "document": cfg.frame_instruction},
         "device": "cuda" if torch.cuda.is_available() else "cpu",
     }
     if cfg.late is not None:
-        model = MultiVectorEncoder(modules=multi_vector_modules(backbone, cfg.late), **whole)
+        model = MultiVectorEncoder(modules=multi_vector_modules(backbone, cfg.late), **options)
         keep_head_fp32(model)
     else:
         pooling = Pooling(backbone.get_embedding_dimension(), pooling_mode="lasttoken")
-        model = SentenceTransformer(modules=[backbone, pooling, Normalize()], **whole)
-    # Rows name queries by number: there is no text of theirs that a model card could show.
+        model = SentenceTransformer(modules=[backbone, pooling, Normalize()], **options)
+    # The examples of a model card come from texts in the training rows, which only hold numbers.
     model.model_card_data.generate_widget_examples = False
     prepare_for_training(model, cfg, precision)
     return model
 
 
 def prepare_for_training(model: Retriever, cfg: RetrieverConfig, precision: str) -> None:
-    """Make a loaded retriever ready to train: its attention, and adapters where it has some."""
-    # Prefixes are shared by masks.
-    choose_attention(model[0].model, precision, cfg.max_length, masks=True)
+    """Set a loaded retriever's attention, and add adapters if the preset has any."""
+    choose_attention(model[0].model, precision, cfg.max_length)
     keep_differentiable(model[0])
     if cfg.lora.rank:
         add_adapters(model, cfg.lora)
 
 
 def add_adapters(model: Retriever, lora: LoraConfig) -> None:
-    """Freeze the backbone and add LoRA to its language tower's projections, in fp32 whatever the
-    base has: updates of this size vanish in bf16's steps.
+    """Freeze the backbone and add LoRA to its language tower's projections. Adapters are fp32 even
+    over a bf16 base: updates of their size vanish in bf16's steps.
 
     Raises:
-        UserError: the pattern is none, or matches no module that can be adapted.
+        UserError: The pattern is invalid, or matches no module that can be adapted.
     """
     import peft
 
@@ -146,36 +156,41 @@ def add_adapters(model: Retriever, lora: LoraConfig) -> None:
 
 
 def load_adapters(model: Retriever, folder: Path) -> None:
-    """Give a retriever the adapters, and the weights of its modules after the backbone, that were
-    saved of it in a folder."""
+    """Load into a retriever the adapters saved in a folder, and the weights of the modules after
+    its backbone."""
     import peft
 
-    named = load_file(folder / ADAPTERS)
-    adapters = {name.removeprefix(PEFT): weight for name, weight in named.items()}
-    found = peft.set_peft_model_state_dict(model[0].model, adapters)
-    if found.unexpected_keys:
-        raise ValueError(f"{folder} has adapters of other layers: {found.unexpected_keys[:2]}")
+    weights = load_file(folder / ADAPTERS)
+    adapters = {name.removeprefix(PEFT): weight for name, weight in weights.items()}
+    loaded = peft.set_peft_model_state_dict(model[0].model, adapters)
+    if loaded.unexpected_keys:
+        raise ValueError(f"{folder} has adapters of other layers: {loaded.unexpected_keys[:2]}")
+    load_head(model, folder)
+
+
+def load_head(model: Retriever, folder: Path) -> None:
+    """Load the weights of a retriever's modules after its backbone."""
     for part in json.loads((folder / "modules.json").read_text())[1:]:
         weights = folder / part["path"] / "model.safetensors"
         if weights.exists():
             model[part["idx"]].load_state_dict(load_file(weights))
 
 
-def build_base(cfg: RetrieverConfig, tokenizer_texts: list[str], folder: Path) -> str:
-    """The folder of a base that is built from a seed and written there."""
+def build_base(cfg: RetrieverConfig, texts: list[str], folder: Path) -> str:
+    """Build a base from an architecture and its seed, write it to `folder`, and return that."""
     assert cfg.architecture is not None
-    processor = build_processor(tokenizer_texts, cfg.architecture.vocabulary, cfg.image_size)
+    processor = build_processor(texts, cfg.architecture.vocabulary, cfg.image_size)
     build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
     processor.save_pretrained(folder)
     return str(folder)
 
 
 def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retriever:
-    """The retriever that `train.contrastive` saved in `folder`, its adapters over the same 4-bit
-    weights that they were trained on.
+    """Load the retriever that `train.contrastive` saved in `folder`, with its adapters over the
+    4-bit weights that they were trained on, or the one that `train.export` merged.
 
     Raises:
-        UserError: `folder` holds no whole retriever, or its base is not on this machine.
+        UserError: `folder` holds no complete retriever, or its base is not on this machine.
     """
     if (folder / EXPORT).exists() and not (folder / "adapter_config.json").exists():
         return load_merged(folder, cfg)
@@ -192,16 +207,16 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
             model = SentenceTransformer(str(folder), **options)
     except UNREADABLE as error:
         raise damaged_error(folder, error) from error
-    choose_attention(model[0].model, precision, cfg.max_length, masks=True)
+    choose_attention(model[0].model, precision, cfg.max_length)
     return model
 
 
 def load_merged(folder: Path, cfg: RetrieverConfig) -> Retriever:
-    """A retriever merged into its base, as `train.export` wrote it: in the precision of its
-    weights, and with nothing that the library does not read itself.
+    """Load a merged retriever that `train.export` wrote, in the precision of its weights, by the
+    library's means alone.
 
     Raises:
-        UserError: it cannot be read.
+        UserError: It cannot be read.
     """
     options = {"model_kwargs": {"dtype": "auto", "use_safetensors": True}, "local_files_only": True}
     try:
@@ -213,10 +228,10 @@ def load_merged(folder: Path, cfg: RetrieverConfig) -> Retriever:
 
 
 def weight_options(cfg: RetrieverConfig, precision: str) -> dict[str, Any]:
-    """How weights are loaded: fp32 where all of them are trained, else in the precision that they
-    compute in, 4-bit where the preset says so; safetensors only."""
-    whole = cfg.quantization == "none" and cfg.lora.rank == 0
-    dtype = torch.float32 if whole else DTYPES[precision]
+    """How weights are loaded: fp32 if all of them are trained, else in the precision of the passes,
+    in 4 bits if the preset says so; from safetensors only."""
+    trains_all = cfg.quantization == "none" and cfg.lora.rank == 0
+    dtype = torch.float32 if trains_all else DTYPES[precision]
     options: dict[str, Any] = {"dtype": dtype, "use_safetensors": True}
     if cfg.quantization == "nf4":
         options["quantization_config"] = nf4_config(dtype)
@@ -224,15 +239,15 @@ def weight_options(cfg: RetrieverConfig, precision: str) -> dict[str, Any]:
 
 
 def tokenizer_texts(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list[str]:
-    """Texts for a tokenizer built from nothing: questions, instructions and timestamps."""
-    texts = sorted({q.question for q in queries})
+    """Texts to train a tokenizer on: questions, instructions, roles and timestamps."""
+    questions = sorted({q.question for q in queries})
     clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
     roles = ["system", "user", "assistant"]
-    return [*texts, cfg.query_instruction, cfg.frame_instruction, *roles, *clock] * 10
+    return [*questions, cfg.query_instruction, cfg.frame_instruction, *roles, *clock] * 10
 
 
 def longest_query(queries: list[RetrievalQuery], tokenizer: Any) -> RetrievalQuery:
-    """The query with the most tokens. Frames are alike in all of them, so the text tells."""
+    """The query with the most tokens. All clips have the same length, so only texts differ."""
     encoded = tokenizer([q.question for q in queries], add_special_tokens=False).input_ids
     return queries[max(range(len(queries)), key=lambda k: len(encoded[k]))]
 
@@ -248,3 +263,61 @@ def query_input(query: RetrievalQuery, frames: FrameReader, cfg: RetrieverConfig
 def frame_input(frame: FrameRef, frames: FrameReader) -> Any:
     """A database frame as sentence-transformers takes it: an image."""
     return frames.image(frame.scene_id, frame.frame)
+
+
+def item_input(item: Item, frames: FrameReader, cfg: RetrieverConfig) -> Any:
+    """A query or a frame as sentence-transformers takes it."""
+    if isinstance(item, FrameRef):
+        return frame_input(item, frames)
+    return query_input(item, frames, cfg)
+
+
+def instruction_of(item: Item, cfg: RetrieverConfig) -> str:
+    """The system message of a query or of a frame."""
+    return cfg.frame_instruction if isinstance(item, FrameRef) else cfg.query_instruction
+
+
+def item_name(item: Item) -> str:
+    """The name of a query or of a frame in messages."""
+    if isinstance(item, FrameRef):
+        return f"frame {item.frame} of {item.scene_id}"
+    return f"query {item.query_id}"
+
+
+def embed(
+    model: Retriever,
+    items: Sequence[Item],
+    frames: FrameReader,
+    cfg: RetrieverConfig,
+    batch: int,
+    progress: str | None = None,
+) -> list[torch.Tensor]:
+    """Embed queries, or frames, loading the pixels of `batch` a rank at a time.
+
+    Args:
+        progress: Label of a progress bar; without one there is no bar.
+
+    Returns:
+        An fp32 tensor on the CPU for each item, (width,) or (vectors, width).
+
+    Raises:
+        UserError: An embedding is not finite.
+    """
+    encode = model.encode_document if isinstance(items[0], FrameRef) else model.encode_query
+    rows: list[torch.Tensor] = []
+    # Within an evaluation the library shares out the inputs of a call among the ranks.
+    step = batch * world_size()
+    starts = range(0, len(items), step)
+    for start in tqdm(starts, desc=progress, unit="batch", leave=False, disable=progress is None):
+        part = items[start : start + step]
+        embedded = encode(
+            [item_input(item, frames, cfg) for item in part],
+            prompt=instruction_of(items[0], cfg),
+            batch_size=batch,
+            show_progress_bar=False,
+        )
+        for item, row in zip(part, embedded, strict=True):
+            row = torch.as_tensor(row).float().cpu()
+            check_finite(row[None], lambda item=item: [item_name(item)])
+            rows.append(row)
+    return rows

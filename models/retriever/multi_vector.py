@@ -1,8 +1,8 @@
-"""The multi-vector retriever: what differs from the one of a single vector.
+"""The modules of a multi-vector retriever after its backbone.
 
-Each token that is scored has a vector, the backbone's state projected to `late.width` and
-normalised. A frame's score is the sum, over the query's vectors, of the most that one of the
-frame's gives: late interaction, of which ColBERT's MaxSim is the form here.
+Each scored token has a vector: the backbone's state, projected to `late.width` and normalised. The
+score of a frame is, summed over the query's vectors, the greatest similarity with one of the
+frame's vectors (late interaction, ColBERT's MaxSim).
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from models.retriever.scored_tokens import ScoredTokens
 
 MESSAGE_END = "<|im_end|>"
 
-# What is saved names a module by this, and the library then finds its file in the folder.
+# A saved model names its module by this path, and the library finds the file in the folder.
 ScoredTokens.__module__ = "scored_tokens"
 SAVED_AS = {"scored_tokens.ScoredTokens": ScoredTokens}
 
 
 def multi_vector_modules(backbone: Transformer, late: LateConfig) -> list[Module]:
-    """What makes vectors of the backbone's states. The projection is always drawn alike."""
+    """The backbone and the modules that compute vectors from its states. The projection is
+    initialised from a fixed seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         projection = Dense(
@@ -39,8 +40,8 @@ def multi_vector_modules(backbone: Transformer, late: LateConfig) -> list[Module
         )
     config = backbone.model.config
     scored = ScoredTokens(
-        shown=[config.image_token_id, config.video_token_id],
-        show_end=config.vision_end_token_id,
+        media_ids=[config.image_token_id, config.video_token_id],
+        media_end=config.vision_end_token_id,
         message_end=backbone.tokenizer.convert_tokens_to_ids(MESSAGE_END),
     )
     modules = [backbone, projection, scored, Normalize("token_embeddings")]
@@ -50,25 +51,27 @@ def multi_vector_modules(backbone: Transformer, late: LateConfig) -> list[Module
 
 
 def load_multi_vector(folder: Path, **options: Any) -> MultiVectorEncoder:
-    """A saved multi-vector retriever. Its token mask is this project's, as in the library's own
-    checkpoints: no code that stands in `folder` runs."""
+    """Load a saved multi-vector retriever. Its `ScoredTokens` is this project's class: code in
+    `folder` is not executed."""
     return MultiVectorEncoder._load_with_module_classes(str(folder), SAVED_AS, **options)
 
 
 def keep_head_fp32(model: MultiVectorEncoder) -> None:
-    """Keep what follows a base of lower precision in fp32: the projection, as adapters are, since
-    updates of its size vanish in bf16's steps; and the distances by which tokens are pooled, which
-    the library cannot read where autocast on a CPU makes them bf16."""
+    """Compute the modules after the backbone in fp32: the projection, because updates of its size
+    vanish in bf16's steps, and the distances of token pooling, which the library cannot convert to
+    NumPy when autocast on a CPU makes them bf16."""
     model[1].float().register_forward_pre_hook(cast_to_fp32)
     for module in model:
         if isinstance(module, HierarchicalTokenPooling):
             module.pool_one = torch.autocast("cpu", enabled=False)(module.pool_one)
 
 
-def cast_to_fp32(_: nn.Module, given: tuple[dict[str, Any]]) -> None:
-    (features,) = given
+def cast_to_fp32(_: nn.Module, args: tuple[dict[str, Any]]) -> None:
+    """Before a module's forward: convert the token states."""
+    (features,) = args
     features["token_embeddings"] = features["token_embeddings"].float()
 
 
 def find_scored_tokens(model: MultiVectorEncoder) -> ScoredTokens:
+    """The module of a retriever that selects the scored tokens."""
     return next(module for module in model if isinstance(module, ScoredTokens))

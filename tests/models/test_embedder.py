@@ -1,4 +1,4 @@
-"""The retriever's inputs, and that what is saved is a plain SentenceTransformer."""
+"""The retriever's inputs, and that a saved one is a plain SentenceTransformer."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from models.loading import keep_differentiable
 from models.parameter_counts import count_towers
 from models.retriever import embedder
 from models.retriever.embedder import frame_input, query_input
+from tests.user_errors import raises_user_error
 from train.common.audit import audit_retriever
 from train.retriever.evaluator import (
-    STEP,
+    FRAME_STEP,
     HeldOutEvaluator,
     MultiVectorHeldOutEvaluator,
-    slice_database,
+    build_database,
 )
 
 
@@ -49,10 +50,10 @@ def test_a_query_is_instruction_then_video_then_text_and_a_generation_prompt(
     assert "of 6 x 3 x 3 tokens" in audit_retriever(model, retriever_cfg, query, frames)
 
 
-def test_a_clip_is_told_at_its_own_rate(
+def test_timestamps_follow_the_clips_frame_rate(
     micro_store, frames, retriever_cfg, tmp_path, monkeypatch
 ) -> None:
-    """As in the suites of other simulators, whose clips have 12 or 30 frames a second."""
+    """Suites of other simulators have 12 or 30 frames a second."""
     query = micro_store.retrieval("train")[0]
     slow = replace(frames.scene(query.scene_id), fps=12)
     monkeypatch.setattr(frames, "scene", lambda _: slow)
@@ -63,7 +64,7 @@ def test_a_clip_is_told_at_its_own_rate(
     assert f"<{(shown[0] + shown[1]) / 2 / 12:.1f} seconds>" in text
 
 
-def test_a_long_query_is_refused_and_never_cut(
+def test_a_long_query_is_refused_instead_of_truncated(
     micro_store, frames, retriever_cfg, tmp_path
 ) -> None:
     model = load(micro_store, retriever_cfg, tmp_path)
@@ -105,7 +106,7 @@ def test_a_saved_retriever_encodes_the_same_without_this_project(
         )
 
 
-def test_adapters_are_read_back_over_the_4_bit_weights_they_were_trained_on(
+def test_adapters_are_loaded_over_the_4_bit_weights_they_were_trained_on(
     micro_store, frames, retriever_cfg, saved_base, tmp_path
 ) -> None:
     cfg = replace(
@@ -140,11 +141,11 @@ def test_adapters_are_trained_in_fp32_over_a_bf16_base(
     assert np.isfinite(model.encode(query, prompt_name="query")).all()
 
 
-def test_no_frame_of_a_slice_shows_what_another_shows(micro_store) -> None:
-    """But for targets, which are all in it."""
+def test_frames_of_the_database_look_different(micro_store) -> None:
+    """Except targets, which are always in it."""
     queries = micro_store.retrieval("train")
     targets = {q.target for q in queries}
-    database = slice_database(queries, micro_store)
+    database = build_database(queries, micro_store)
     assert targets < set(database)
     album = UniqueFrames(micro_store.scene)
     for target in targets:
@@ -152,20 +153,20 @@ def test_no_frame_of_a_slice_shows_what_another_shows(micro_store) -> None:
     assert all(album.add(frame) for frame in database if frame not in targets)
     shown = {(f.scene_id, f.frame) for f in database}
     for scene_id in {f.scene_id for f in database}:
-        left_out = {f for f in range(0, FRAMES, STEP) if (scene_id, f) not in shown}
+        left_out = {f for f in range(0, FRAMES, FRAME_STEP) if (scene_id, f) not in shown}
         assert not any(album.add(FrameRef(scene_id, frame)) for frame in left_out)
 
 
 @pytest.mark.parametrize("late", [None, LateConfig(width=24)])
-def test_a_held_out_ranking_is_that_of_all_pixels_at_once(
+def test_the_evaluator_ranks_as_the_library_with_all_pixels_in_memory(
     micro_store, frames, retriever_cfg, tmp_path, monkeypatch, late
 ) -> None:
-    """It reads them a mini-batch at a time, and a frame that is no number has its name."""
+    """It loads them by mini-batches, and names a frame with a non-finite embedding."""
     cfg = replace(retriever_cfg, late=late)
     model = load(micro_store, cfg, tmp_path).eval()
     queries = micro_store.retrieval("train")[:7]
     kind = MultiVectorHeldOutEvaluator if late else HeldOutEvaluator
-    evaluator = kind(queries, slice_database(queries, micro_store), frames, cfg, 2)
+    evaluator = kind(queries, build_database(queries, micro_store), frames, cfg, 2)
     assert all(isinstance(one, FrameRef) for one in evaluator.corpus)
     asked = model.encode_query([query_input(q, frames, cfg) for q in queries])
     shown = model.encode_document([frame_input(f, frames) for f in evaluator.corpus])
@@ -183,5 +184,5 @@ def test_a_held_out_ranking_is_that_of_all_pixels_at_once(
         return [made[0] * float("nan"), *made[1:]]
 
     monkeypatch.setattr(model, "encode_document", torn)
-    with pytest.raises(UserError, match=f"frame {first.frame} of {first.scene_id} is no number"):
+    with raises_user_error("non-finite-embedding", f"frame {first.frame} of {first.scene_id}"):
         evaluator(model)

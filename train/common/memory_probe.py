@@ -23,7 +23,7 @@ from accelerate.utils import gather_object
 from torch import nn
 
 from conf.runs import write_json
-from conf.schema import ContrastiveTrainConfig, SftTrainConfig
+from conf.schema import SftTrainConfig
 from models.distributed import is_sharded
 from models.memory import available_bytes, is_out_of_memory, peak_bytes, reset_peak
 from models.student.collator import Collator
@@ -297,7 +297,7 @@ def lower(train: SftTrainConfig) -> str:
     return lowered(named, train)
 
 
-def lowered(named: str, train: SftTrainConfig | ContrastiveTrainConfig) -> str:
+def lowered(named: str, train: SftTrainConfig) -> str:
     """That what is `named` is to be lowered, and which switches are left to turn."""
     switched = {"gradient_checkpointing": True, "reuse_features": False}
     left = [

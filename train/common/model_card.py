@@ -1,114 +1,144 @@
-"""The model card of an export: what its training run wrote down, and nothing else."""
+"""The model card of an export, from what its training run recorded."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
-from huggingface_hub import ModelCardData
+from huggingface_hub import ModelCard, ModelCardData
 
 from conf.multirun.table import AT_START_SUFFIX
-from conf.schema import ContrastiveCommand, RetrieverConfig, SftCommand, StudentConfig
+from conf.schema import ContrastiveCommand, SftCommand
 from models.fingerprints import is_hub_model
 from models.resolved import read_resolved
 from train.common.journal import BEST_STEP
 
-SHOWN_PACKAGES = ("torch", "transformers", "sentence-transformers", "peft", "bitsandbytes")
-WHAT = {
-    "bf16": "merged into its base; weights in bf16.",
-    "fp32": "merged into its base; weights in fp32.",
-    "adapter": "the LoRA adapters, to be laid over their base.",
-}
-OVER_NF4 = (
-    "The adapters go with the base in NF4, as bitsandbytes rounds it. Over a base that is not "
-    "rounded, as a server lays them, they give something else than was trained; the merged weights "
-    "do not (`python -m train.export run={run} product={product} format=bf16`)."
-)
-MEASURED = {
-    "student": "On the items of training scenes that it was not trained on, {count} at most, "
-    "before the first step and {kept}. A letter is chosen by the letters' logits, with what stands "
-    "before it given.",
-    "retriever": "On the queries of training scenes that it was not trained on, {count} at most, "
-    "over the frames of these scenes, before the first step and {kept}.",
-}
-APART = {
-    "student": "The merged weights against the adapters over their base as they were trained, on "
-    "some of these items (differences of logits as a share of their size):",
-    "retriever": "The merged weights against the adapters over their base as they were trained, on "
-    "some of these queries (differences of embeddings and scores as a share of their size):",
+PACKAGES = ("torch", "transformers", "sentence-transformers", "peft", "bitsandbytes")
+"""Packages whose versions the card lists."""
+FORMATS = {
+    "bf16": "merged into its base; weights in bf16",
+    "fp32": "merged into its base; weights in fp32",
+    "adapter": "the LoRA adapters, to be loaded over their base",
 }
 PIPELINES = {"student": "image-text-to-text", "retriever": "sentence-similarity"}
+TEMPLATE = """---
+{{ card_data }}
+---
 
-Settings = SftCommand | ContrastiveCommand
+# {{ name }}
+
+A {{ product }} of DynaPix: {{ format }}.
+
+## Training
+
+| | |
+| --- | --- |
+{% for label, value in training %}| {{ label }} | {{ value }} |
+{% endfor %}
+{% if over_nf4 %}
+The adapters belong to the base in NF4, as bitsandbytes quantises it. Over the unquantised base, as
+servers load them, the model differs from the trained one; the merged weights do not
+(`python -m train.export run={{ name }} product={{ product }} format=bf16`).
+{% endif %}
+## Evaluation
+
+On at most {{ count }} {{ items }} of training scenes that the model was not trained on, before the
+first step and after {{ kept }}.
+{% if product == "student" %}
+A letter is chosen by the letters' logits, after the correct preceding text.
+{% else %}
+The database consists of frames of these scenes.
+{% endif %}
+
+| | start | end |
+| --- | --- | --- |
+{% for label, start, end in curve %}| {{ label }} | {{ start }} | {{ end }} |
+{% endfor %}
+{% if measured %}
+The merged weights compared with the adapters over their base as trained, on some of these
+{{ items }} (differences are relative to the size of the values):
+
+| | |
+| --- | --- |
+{% for label, value in measured %}| {{ label }} | {{ value }} |
+{% endfor %}
+{% endif %}"""
 
 
-def text(
-    name: str, settings: Settings, folder: Path, format: str, measured: dict[str, float]
-) -> str:
-    """README.md of an export of the run in `folder`.
+def model_card(
+    name: str,
+    settings: SftCommand | ContrastiveCommand,
+    folder: Path,
+    format: str,
+    measured: dict[str, float],
+) -> ModelCard:
+    """The card of an export.
 
-    `measured` is how far the exported weights are from the trained student or retriever.
+    Args:
+        name: The training run.
+        settings: Its settings.
+        folder: Its folder.
+        format: What was exported: bf16, fp32 or adapter.
+        measured: Differences between the exported and the trained model.
     """
-    product, preset = product_of(settings), preset_of(settings)
+    student = isinstance(settings, SftCommand)
+    product = "student" if student else "retriever"
+    preset, train = getattr(settings, product), settings.train
     metrics = json.loads((folder / "metrics.json").read_text())
-    train = settings.train
-    count = train.validation_items if product == "student" else train.validation_queries
-    sections = [
-        f"---\n{front_matter(settings, format)}\n---",
-        f"# {name}",
-        f"A {product} of DynaPix: {WHAT[format]}",
-        "## How it was trained",
-        _table(("", ""), _training(settings, folder)),
-        *(
-            [OVER_NF4.format(run=name, product=product)]
-            if format == "adapter" and preset.quantization == "nf4"
-            else []
+    merged_library = "transformers" if student else "sentence-transformers"
+    return ModelCard.from_template(
+        ModelCardData(
+            # A local folder is not a model that the hub could link to.
+            base_model=preset.model if is_hub_model(preset.model) else None,
+            library_name="peft" if format == "adapter" else merged_library,
+            pipeline_tag=PIPELINES[product],
+            tags=["dynapix", train.regime if student else "retriever"],
         ),
-        "## How it was measured",
-        MEASURED[product].format(count=count, kept=_kept(settings, metrics)),
-        _table(("", "start", "end"), _curve(metrics)),
-    ]
-    if measured:
-        told = [(key.replace("_", " "), _figure(value)) for key, value in measured.items()]
-        sections += [APART[product], _table(("", ""), told)]
-    return "\n\n".join(sections) + "\n"
+        template_str=TEMPLATE,
+        name=name,
+        product=product,
+        format=FORMATS[format],
+        training=list(_training_rows(settings, folder)),
+        over_nf4=format == "adapter" and preset.quantization == "nf4",
+        count=train.validation_items if student else train.validation_queries,
+        items="items" if student else "queries",
+        kept=_kept_step(train.best, metrics),
+        curve=[
+            (_label(key), f"{metrics[f'{key}{AT_START_SUFFIX}']:.4g}", f"{value:.4g}")
+            for key, value in metrics.items()
+            if f"{key}{AT_START_SUFFIX}" in metrics
+        ],
+        measured=[(_label(key), f"{value:.4g}") for key, value in measured.items()],
+    )
 
 
-def product_of(settings: Settings) -> str:
-    return "student" if isinstance(settings, SftCommand) else "retriever"
+def _label(name: str) -> str:
+    return name.replace("_", " ")
 
 
-def preset_of(settings: Settings) -> StudentConfig | RetrieverConfig:
-    return getattr(settings, product_of(settings))
+def _kept_step(best: str | None, metrics: dict[str, float]) -> str:
+    """The step whose weights are exported."""
+    if (step := metrics.get(BEST_STEP)) is None:
+        return "the last one"
+    return f"step {step:g}, the best by {best}"
 
 
-def front_matter(settings: Settings, format: str) -> str:
-    """The card's metadata as YAML. A base in a folder is none that a hub could link to."""
-    model = preset_of(settings).model
+def _training_rows(
+    settings: SftCommand | ContrastiveCommand, folder: Path
+) -> Iterator[tuple[str, str]]:
     student = isinstance(settings, SftCommand)
-    merged = "transformers" if student else "sentence-transformers"
-    return ModelCardData(
-        base_model=None if Path(model).is_dir() else model,
-        library_name="peft" if format == "adapter" else merged,
-        pipeline_tag=PIPELINES[product_of(settings)],
-        tags=["dynapix", settings.train.regime if student else "retriever"],
-    ).to_yaml()
-
-
-def _training(settings: Settings, folder: Path) -> Iterable[tuple[str, str]]:
-    preset, train, benchmark = preset_of(settings), settings.train, settings.benchmark
-    student = isinstance(settings, SftCommand)
+    preset = settings.student if student else settings.retriever
+    train, benchmark, lora = settings.train, settings.benchmark, preset.lora
     record = json.loads((folder / "run.json").read_text())
     yield "base", f"{preset.model}{f' at {preset.revision}' if preset.revision else ''}"
     if not is_hub_model(preset.model) and (resolved := read_resolved(folder)):
-        yield "hash of the base's weights", resolved["base"]
+        yield "digest of the base's weights", resolved["base"]
     yield "quantisation of the base", preset.quantization
-    lora = preset.lora
     yield "adapters", f"LoRA of rank {lora.rank}, alpha {lora.alpha}, dropout {lora.dropout}"
     scenes = f"{benchmark.scenes} scenes by " if benchmark.simulator == "bullet" else ""
     yield "benchmark", f"{benchmark.name}, {scenes}{benchmark.simulator}, seed {benchmark.seed}"
-    yield from _of_student(settings) if student else _of_retriever(settings)
+    yield from _student_rows(settings) if student else _retriever_rows(settings)
     yield "frames", f"{preset.frames} a prefix, {preset.image_size} x {preset.image_size} px"
     length = f"{train.epochs:g} epochs" if train.max_steps == -1 else f"{train.max_steps} steps"
     yield "length", f"{length} of {train.batch} {'samples' if student else 'queries'} a step"
@@ -120,46 +150,24 @@ def _training(settings: Settings, folder: Path) -> Iterable[tuple[str, str]]:
         changed = ", with changes" if record["git"]["dirty"] else ""
         yield "code", f"commit {record['git']['commit']}{changed}"
     versions = record["packages"]
-    yield "versions", ", ".join(f"{p} {versions[p]}" for p in SHOWN_PACKAGES if p in versions)
+    yield "versions", ", ".join(f"{p} {versions[p]}" for p in PACKAGES if p in versions)
 
 
-def _of_student(settings: SftCommand) -> Iterable[tuple[str, str]]:
+def _student_rows(settings: SftCommand) -> Iterator[tuple[str, str]]:
     yield "regime", settings.train.regime
     if settings.train.regime not in ("answer_only", "describe"):
         teacher = settings.teacher
         yield "teacher", f"{teacher.name}{f' ({teacher.model})' if teacher.model else ''}"
 
 
-def _of_retriever(settings: ContrastiveCommand) -> Iterable[tuple[str, str]]:
+def _retriever_rows(settings: ContrastiveCommand) -> Iterator[tuple[str, str]]:
     preset, train = settings.retriever, settings.train
     if preset.late is None:
         yield "widths", ", ".join(map(str, preset.widths))
     else:
-        yield "vectors", f"one a token, {preset.late.width} wide, for late interaction"
+        yield "vectors", f"one for each token, {preset.late.width} wide, for late interaction"
     yield "instruction of queries", preset.query_instruction
     yield "instruction of frames", preset.frame_instruction
     mined = f", mined every {train.mine_every} steps" if train.mine_every else ""
     yield "hard negatives", f"{train.hard_negatives} a query{mined}"
     yield "scale of scores", f"{train.scale:g}"
-
-
-def _kept(settings: Settings, metrics: dict[str, float]) -> str:
-    """Of which step the exported weights are."""
-    if (step := metrics.get(BEST_STEP)) is None:
-        return "after the last"
-    return f"after step {step:g}, the best by {settings.train.best}"
-
-
-def _curve(metrics: dict[str, float]) -> Iterable[tuple[str, str, str]]:
-    for name, value in metrics.items():
-        if (start := metrics.get(f"{name}{AT_START_SUFFIX}")) is not None:
-            yield name.replace("_", " "), _figure(start), _figure(value)
-
-
-def _figure(value: float) -> str:
-    return f"{value:.4g}"
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,4 +1,4 @@
-"""How a retriever ranks frames of held-out training scenes, measured while it trains."""
+"""Ranks frames of held-out training scenes while a retriever is trained."""
 
 from __future__ import annotations
 
@@ -14,42 +14,39 @@ from sentence_transformers.sentence_transformer.evaluation import InformationRet
 from sentence_transformers.util import cos_sim
 from sentence_transformers.util.similarity import maxsim
 
-from conf.runs import world_size
 from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery
 from data.render.frame_cache import FrameReader
 from data.store import Store
 from data.tracks.retrieval.database import UniqueFrames
-from models.nonfinite_guard import check_finite
-from models.retriever.embedder import Retriever, frame_input, query_input
-from train.retriever.batches import frame_title, query_title
+from models.retriever.embedder import Item, Retriever, embed
 
-STEP = 6
-"""Every so many frames of a held-out scene one is in the slice's database, but for twins."""
+FRAME_STEP = 6
+"""Every so many frames of a held-out scene, one enters the database unless it has a twin there."""
 RECALLS = (1, 10, 50)
 
 
-def slice_database(queries: Sequence[RetrievalQuery], store: Store) -> list[FrameRef]:
-    """The targets of the queries and, of their scenes, every few frames that show what no other
-    frame of the database shows; in the order of their scenes."""
+def build_database(queries: Sequence[RetrievalQuery], store: Store) -> list[FrameRef]:
+    """A small database: the queries' targets, and every `FRAME_STEP`th frame of their scenes that
+    looks different from every other frame of the database; in the order of the scenes."""
     album = UniqueFrames(store.scene)
     for query in queries:
         album.add(query.target)
     for scene_id in sorted({q.scene_id for q in queries}):
-        for frame in range(0, store.scene(scene_id).frames, STEP):
+        for frame in range(0, store.scene(scene_id).frames, FRAME_STEP):
             album.add(FrameRef(scene_id, frame))
     return sorted(
         album.frames.keys() | {q.target for q in queries}, key=attrgetter("scene_id", "frame")
     )
 
 
-class Slice:
-    """What an evaluator of the library's needs to rank a database for a slice of queries; recall
-    and reciprocal rank at the full width, under the names that the evaluation command uses.
+class LazyRankingEvaluator:
+    """Mixin for the library's evaluators: queries and frames are names, and their pixels are loaded
+    a mini-batch at a time.
 
-    Frames that score alike stand in the order of their names, as the library has it; the command
-    shares the places out among them. It holds names: pixels are read a mini-batch a rank at a time,
-    which the library deals out.
+    Returns recall and reciprocal rank at the full width, by the names of `evaluation.retrieve`.
+    Frames with equal scores rank by name, as in the library; in `evaluation.retrieve` they share
+    their rank.
     """
 
     score = staticmethod(cos_sim)
@@ -75,8 +72,6 @@ class Slice:
             batch_size=batch,
             write_csv=False,
             score_functions={"score": self.score},
-            query_prompt=cfg.query_instruction,
-            corpus_prompt=cfg.frame_instruction,
         )
         self.primary_metric = "recall@10"
 
@@ -84,43 +79,26 @@ class Slice:
         self, model: Retriever, output_path=None, epoch: int = -1, steps: int = -1, **_
     ) -> dict[str, float]:
         scores = self.compute_metrices(model)["score"]
-        results = {f"recall@{k}": scores["accuracy@k"][k] for k in RECALLS}
-        return {**results, "mrr": next(iter(scores["mrr@k"].values()))}
+        recalls = {f"recall@{k}": scores["accuracy@k"][k] for k in RECALLS}
+        return {**recalls, "mrr": next(iter(scores["mrr@k"].values()))}
 
-    def embed_inputs(
-        self, model: Retriever, named: list, encode_fn_name: str, **settings: Any
-    ) -> Any:
-        """The embeddings of queries (`encode_fn_name` is query) or of frames (document).
+    def embed_inputs(self, model: Retriever, sentences: Sequence[Item], *_: Any, **__: Any) -> Any:
+        """Embeddings of queries or of frames.
 
         Raises:
-            UserError: one is no number.
+            UserError: An embedding is not finite.
         """
-        title = query_title if encode_fn_name == "query" else frame_title
-        at_once = self.batch_size * world_size()
-        rows: list[torch.Tensor] = []
-        for start in range(0, len(named), at_once):
-            some = named[start : start + at_once]
-            inputs = [self._input(one) for one in some]
-            made = super().embed_inputs(model, inputs, encode_fn_name, **settings)
-            for one, row in zip(some, made, strict=True):
-                check_finite(row[None], lambda one=one: [title(one)])
-            rows += made
-        return self.joined(rows)
-
-    def _input(self, one: RetrievalQuery | FrameRef) -> Any:
-        if isinstance(one, FrameRef):
-            return frame_input(one, self._frames)
-        return query_input(one, self._frames, self._cfg)
+        return self.stack(embed(model, sentences, self._frames, self._cfg, self.batch_size))
 
 
-class HeldOutEvaluator(Slice, InformationRetrievalEvaluator):
-    """Of a retriever with one vector."""
+class HeldOutEvaluator(LazyRankingEvaluator, InformationRetrievalEvaluator):
+    """For a retriever with one vector."""
 
-    joined = staticmethod(torch.stack)
+    stack = staticmethod(torch.stack)
 
 
-class MultiVectorHeldOutEvaluator(Slice, MultiVectorInformationRetrievalEvaluator):
-    """Of a retriever with many."""
+class MultiVectorHeldOutEvaluator(LazyRankingEvaluator, MultiVectorInformationRetrievalEvaluator):
+    """For a retriever with many vectors."""
 
     score = staticmethod(maxsim)
-    joined = staticmethod(list)
+    stack = staticmethod(list)

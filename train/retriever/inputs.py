@@ -1,94 +1,92 @@
-"""Makes what the retriever's forward takes from names of queries and frames."""
+"""Makes the inputs of a retriever's forward pass from queries and frames."""
 
 from __future__ import annotations
 
-from functools import partial
-from itertools import islice
+from collections.abc import Sequence
 from typing import Any
 
 import torch
-from sentence_transformers import SentenceTransformer
+from accelerate.utils import send_to_device
 from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
 
 from conf.schema import RetrieverConfig
 from data.render.frame_cache import FrameReader
-from models.retriever.embedder import frame_input
+from models.retriever.embedder import Item, Retriever, instruction_of, item_input
 from models.student.collator import MEDIA
-from train.retriever.batches import Batch
-from train.retriever.shared_prefixes import give_own, shared_input
-from train.student.lazy_samples import STAMP, TOKEN
 
-SEEN = "seen"
-"""With a kind of media: the tower's outputs, (1 + deepstack layers, tokens, width)."""
+FEATURES = "vision_features"
+"""Prefix, before a kind of media, of the vision tower's outputs among a model's inputs."""
 
 
 class RetrieverInputs:
-    """Makes inputs of a model, which is prepared to take them."""
+    """Loads the inputs of one mini-batch at a time, so that memory is independent of the batch.
+
+    Args:
+        model: The retriever; its backbone gets a hook that accepts outputs of its vision tower.
+        frames: Pixels of the benchmark's frames.
+        cfg: The retriever's preset: its instructions and the frames of a prefix.
+        bf16: Whether the vision tower computes in bf16.
+        reuse_features: Whether the frozen vision tower's outputs of a step's first pass are kept
+            for its second pass.
+    """
 
     def __init__(
-        self, model: SentenceTransformer, frames: FrameReader, cfg: RetrieverConfig, precision: str
+        self,
+        model: Retriever,
+        frames: FrameReader,
+        cfg: RetrieverConfig,
+        bf16: bool,
+        reuse_features: bool = False,
     ) -> None:
         self._model, self._frames, self._cfg = model, frames, cfg
-        self._bf16 = precision == "bf16"
-        self._device = model.device
-        self._shown = round(cfg.image_size / TOKEN) ** 2 + STAMP
-        model[0].register_forward_pre_hook(give_seen)
-        model[0].register_forward_hook(partial(give_own, last=cfg.late is None))
+        self._bf16, self._reuse = bf16, reuse_features
+        self._kept: dict[tuple[Item, ...], dict[str, Any]] = {}
+        model[0].register_forward_pre_hook(pass_features)
 
-    def of_prefixes(self, batch: Batch, first: int, last: int) -> dict[str, Any]:
-        """Of the queries of a range of the batch's prefixes."""
-        groups = batch.groups(first, last)
-        return shared_input(self._model, groups, self._frames, self._cfg)
+    def load(self, items: Sequence[Item]) -> dict[str, Any]:
+        """Inputs of some queries, or of some frames, on the CPU."""
+        kept = self._kept.pop(tuple(items), None)
+        if kept is not None:
+            return kept
+        inputs = [item_input(item, self._frames, self._cfg) for item in items]
+        return self._model.preprocess(inputs, prompt=instruction_of(items[0], self._cfg))
 
-    def of_frames(self, batch: Batch, first: int, last: int) -> dict[str, Any]:
-        """Of a range of the batch's frames."""
-        shown = [frame_input(frame, self._frames) for frame in batch.frames[first:last]]
-        return self._model.preprocess(shown, prompt=self._cfg.frame_instruction)
+    def prepare(
+        self, items: Sequence[Item], inputs: dict[str, Any], first_pass: bool
+    ) -> dict[str, Any]:
+        """Loaded inputs on the model's device; in a first pass with `reuse_features`, the vision
+        tower's outputs replace the pixels and are kept for the next `load` of these items."""
+        inputs = send_to_device(inputs, self._model.device, non_blocking=True)
+        if first_pass and self._reuse:
+            inputs = self._encode_media(inputs)
+            self._kept[tuple(items)] = send_to_device(inputs, "cpu")
+        return inputs
 
-    def prefix_lengths(self, batch: Batch) -> list[int]:
-        """About how many tokens each prefix and its questions have."""
-        questions = [query.question for query in batch.queries]
-        asked = iter(self._model.tokenizer(questions, add_special_tokens=False).input_ids)
-        # The tower sees a clip as pairs of frames.
-        clip = self._shown * -(-self._cfg.frames // 2)
-        return [clip + sum(map(len, islice(asked, count))) for count in batch.prefixes]
-
-    def frame_lengths(self, batch: Batch) -> list[int]:
-        """About how many tokens each frame has."""
-        return [self._shown] * len(batch.frames)
-
-    def on_device(self, inputs: dict[str, Any]) -> dict[str, Any]:
-        return {
-            name: value.to(self._device, non_blocking=True) if torch.is_tensor(value) else value
-            for name, value in inputs.items()
-        }
-
-    def seen(self, inputs: dict[str, Any]) -> dict[str, Any]:
-        """Inputs with the tower's outputs in place of the pixels."""
-        given = dict(inputs)
+    def _encode_media(self, inputs: dict[str, Any]) -> dict[str, Any]:
+        encoded = dict(inputs)
+        autocast = torch.autocast(self._model.device.type, torch.bfloat16, enabled=self._bf16)
         for kind, (pixels, grid) in MEDIA.items():
-            if pixels in given:
-                with (
-                    torch.no_grad(),
-                    torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16),
-                ):
-                    # A clip passes the tower as its pairs of frames do.
-                    found = self._model[0].model.get_image_features(given.pop(pixels), given[grid])
-                layers = [found.pooler_output, *found.deepstack_features]
-                given[f"{SEEN}_{kind}"] = torch.stack([torch.cat(layer) for layer in layers])
-        return given
+            if pixels in encoded:
+                with torch.no_grad(), autocast:
+                    # The tower encodes a clip as the images of its pairs of frames.
+                    outputs = self._model[0].model.get_image_features(
+                        encoded.pop(pixels), encoded[grid]
+                    )
+                layers = (outputs.pooler_output, *outputs.deepstack_features)
+                encoded[f"{FEATURES}_{kind}"] = tuple(torch.cat(layer) for layer in layers)
+        return encoded
 
 
-def give_seen(module: Any, given: tuple[dict[str, Any]]) -> None:
-    """Before the transformer, as a hook of its forward: hand over the tower's outputs that stand in
-    the features under the name that the model has for them."""
-    (features,) = given
+def pass_features(module: Any, args: tuple[dict[str, Any]]) -> None:
+    """Before the backbone's forward: pass kept outputs of the vision tower under the argument that
+    the model has for them."""
+    (inputs,) = args
     outputs = {}
     for kind in MEDIA:
-        if (layers := features.pop(f"{SEEN}_{kind}", None)) is not None:
-            merged, *deepstack = layers.unbind()
+        if (layers := inputs.pop(f"{FEATURES}_{kind}", None)) is not None:
+            merged, *deepstack = layers
             outputs[kind] = BaseModelOutputWithDeepstackFeatures(
                 pooler_output=(merged,), deepstack_features=[(layer,) for layer in deepstack]
             )
     if outputs:
-        features["mm_encoder_outputs"] = outputs
+        inputs["mm_encoder_outputs"] = outputs

@@ -1,100 +1,84 @@
-"""The retriever's loss: the library's cached ranking loss over batches that hold names.
+"""The retriever's losses: the library's cached ranking losses over batches that hold names.
 
-Inputs are made a mini-batch at a time, ahead of the pass that takes them, so that memory does not
-grow with a batch's pixels. Frames that several queries name are embedded once, a prefix that they
-share passes once, and the frozen tower's outputs of the first pass are given to the second: none of
-these changes a gradient.
+The library embeds a batch twice, first to cache the gradients of the embeddings, then to propagate
+them, and cuts mini-batches from inputs that are all in memory. Here the inputs of a mini-batch are
+loaded when a pass reaches it. A frame that is some query's target is never a negative of that
+query.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
-from functools import partial
+from itertools import chain
 from typing import Any, TypeVar
 
 import torch
 from accelerate.utils import gather_object
-from sentence_transformers import SentenceTransformer
 from sentence_transformers.base.losses.gradcache import RandContext
+from sentence_transformers.multi_vector_encoder.losses import (
+    CachedMultiVectorMultipleNegativesRankingLoss,
+)
+from sentence_transformers.multi_vector_encoder.scoring import colbert_scores
 from sentence_transformers.sentence_transformer.losses import CachedMultipleNegativesRankingLoss
-from sentence_transformers.util import all_gather_with_grad, cos_sim
-from torch.nn.functional import cross_entropy
+from sentence_transformers.util import cos_sim
 
 from conf.runs import rank, world_size
+from data.records import FrameRef
 from models.nonfinite_guard import check_finite
-from train.retriever.batches import Batch
+from models.retriever.embedder import Retriever, item_name
 from train.retriever.inputs import RetrieverInputs
-from train.retriever.negatives import Weighing
 
-Made = TypeVar("Made")
-Asked = TypeVar("Asked")
-Range = tuple[int, int]
+In = TypeVar("In")
+Out = TypeVar("Out")
 
 
-class RankingLoss(CachedMultipleNegativesRankingLoss):
-    """Cached multiple-negatives ranking over a `Batch`. For the same queries its gradients are the
-    library's, on any number of ranks, unless a `Weighing` changes what negatives count for."""
+class LazyBatchLoss:
+    """Mixin for the library's cached losses: features name `items`, as `batch_columns` makes them.
+
+    Args:
+        model: The retriever.
+        inputs: Loads the inputs of a mini-batch.
+        scale: Inverse temperature of the scores.
+        mini_batch: Queries or frames in a mini-batch; the gradients are independent of it.
+        prefetch: Mini-batches that a thread loads ahead.
+    """
+
+    similarity: Callable[..., torch.Tensor]
+    query_major = False
+    """Whether scores order documents by their query; otherwise by column."""
 
     def __init__(
         self,
-        model: SentenceTransformer,
+        model: Retriever,
         inputs: RetrieverInputs,
-        weighing: Weighing,
+        *,
         scale: float,
         mini_batch: int,
-        mini_batch_tokens: int | None = None,
-        reuse_features: bool = False,
-        ahead: int = 0,
+        prefetch: int = 0,
     ) -> None:
-        """`mini_batch`: prefixes or frames that pass at once; as many as `mini_batch_tokens` hold,
-        where that is given. `ahead`: mini-batches that are made while others pass."""
         super().__init__(
             model,
             scale=scale,
+            similarity_fct=self._scores,
             mini_batch_size=mini_batch,
-            mini_batch_num_tokens=mini_batch_tokens,
             gather_across_devices=world_size() > 1,
         )
         self._inputs = inputs
-        self._weighing = weighing
-        self._reuse = reuse_features
-        self._ahead = ahead
+        self._prefetch = prefetch
 
-    def forward(self, features: Sequence[Batch], labels: torch.Tensor | None = None) -> Any:
-        (batch,) = features
-        self._columns = batch.columns
-        self._added = self._weigh(batch)
-        # Of its own features the library reads here how many rows they have, and their lengths.
-        rows = [
-            {
-                "attention_mask": filled(self._inputs.prefix_lengths(batch)),
-                "make": partial(self._inputs.of_prefixes, batch),
-                "kept": {},
-                "name": batch.query_names,
-                "task": "query",
-            },
-            {
-                "attention_mask": filled(self._inputs.frame_lengths(batch)),
-                "make": partial(self._inputs.of_frames, batch),
-                "kept": {},
-                "name": batch.frame_names,
-                "task": "document",
-            },
-        ]
-        return self.forward_cached(rows, labels)
-
-    def _weigh(self, batch: Batch) -> torch.Tensor | None:
-        """(B, documents of all ranks) what is added to the scores; None where nothing is."""
-        if not self._weighing.changes:
-            return None
-        documents = batch.documents()
-        if world_size() > 1:
-            documents = gather_object(documents)
-        start = rank() * len(batch.queries)
-        own = range(start, start + len(batch.queries))
-        return self._weighing.added(documents, own).flatten(1)
+    def forward(
+        self, sentence_features: Iterable[dict[str, Any]], labels: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        features = list(sentence_features)
+        documents = [column["items"] for column in features[1:]]
+        parts = gather_object([documents]) if world_size() > 1 else [documents]
+        columns = [list(chain(*column)) for column in zip(*parts, strict=True)]
+        rows = len(documents[0])
+        own = range(rank() * rows, (rank() + 1) * rows)
+        self._identical = identical_frames(columns, own, self.query_major)
+        self._next_row = 0
+        return super().forward(features, labels)
 
     def embed_minibatch_iter(
         self,
@@ -102,91 +86,74 @@ class RankingLoss(CachedMultipleNegativesRankingLoss):
         with_grad: bool,
         copy_random_state: bool,
         random_states: list[RandContext] | None = None,
-        ranges: Sequence[Range] = (),
-    ) -> Iterator[tuple[torch.Tensor, RandContext | None]]:
-        """Embed the rows of each range. What the first pass keeps, the second takes."""
-        kept: dict[Range, dict[str, Any]] = sentence_feature["kept"]
+        ranges: Sequence[tuple[int, int]] = (),
+    ) -> Iterator[tuple[Any, ...]]:
+        """Embed the items of each range, as the library does of inputs in memory.
 
-        def made(bounds: Range) -> dict[str, Any]:
-            return kept.pop(bounds, None) or sentence_feature["make"](*bounds)
-
-        for k, inputs in enumerate(early(made, ranges, self._ahead)):
-            with nullcontext() if random_states is None else random_states[k]:
-                given = self._inputs.on_device(inputs)
-                state = RandContext(*given.values()) if copy_random_state else None
-                if self._reuse and not with_grad:
-                    given = self._inputs.seen(given)
-                    kept[ranges[k]] = {name: on_cpu(value) for name, value in given.items()}
-                with torch.set_grad_enabled(with_grad):
-                    embedded = self.embed(self.model, given, sentence_feature["task"])
+        Raises:
+            UserError: An embedding is not finite.
+        """
+        parts = [sentence_feature["items"][first:last] for first, last in ranges]
+        task = {name: sentence_feature[name] for name in ("task",) if name in sentence_feature}
+        for k, loaded in enumerate(prefetched(self._inputs.load, parts, self._prefetch)):
+            inputs = self._inputs.prepare(parts[k], loaded, first_pass=not with_grad)
+            state = None if random_states is None else random_states[k]
+            embedded = self.embed_minibatch(
+                inputs | task, 0, len(parts[k]), with_grad, copy_random_state, state
+            )
             if not with_grad:
-                check_finite(embedded, partial(sentence_feature["name"], *ranges[k]))
-            yield embedded, state
+                check_finite(embedded[0], lambda k=k: [item_name(item) for item in parts[k]])
+            yield embedded
 
-    @staticmethod
-    def embed(model: SentenceTransformer, given: dict[str, Any], task: str) -> torch.Tensor:
-        """(rows, width) of a mini-batch of queries (`task` is query) or of frames (document)."""
-        return model(given)["sentence_embedding"]
+    def _scores(self, queries: torch.Tensor, documents: torch.Tensor, **masks: Any) -> torch.Tensor:
+        """Similarities of the next rows of queries with all documents. The library asks for all
+        rows in their order, once for each width."""
+        scores = type(self).similarity(queries, documents, **masks)
+        rows = slice(self._next_row, self._next_row + len(queries))
+        self._next_row = rows.stop % len(self._identical)
+        return scores.masked_fill(self._identical[rows].to(scores.device), -torch.inf)
 
-    def joined(self, parts: list[torch.Tensor]) -> torch.Tensor:
-        """What was embedded a mini-batch at a time."""
-        return torch.cat(parts)
+
+class RankingLoss(LazyBatchLoss, CachedMultipleNegativesRankingLoss):
+    """For a retriever with one vector."""
 
     similarity = staticmethod(cos_sim)
-    """(queries, frames) of embeddings, before it is scaled."""
-
-    def calculate_loss(
-        self,
-        reps: list[list[torch.Tensor]],
-        labels: torch.Tensor | None = None,
-        *,
-        with_backward: bool = False,
-    ) -> torch.Tensor:
-        """The mean over a rank's queries of the cross entropy of each one's target among all frames
-        that the batch names, on all ranks. Scores of some rows at a time are kept."""
-        queries, frames = self.joined(reps[0]), self.joined(reps[1])
-        # (B, 1 + negatives, ...): a frame that several queries name gathers its gradients.
-        documents = frames[self._columns.T.to(frames.device)]
-        if self.gather_across_devices:
-            documents = all_gather_with_grad(documents)
-        own = (rank() * len(queries) + torch.arange(len(queries))) * documents.shape[1]
-        own, shown = own.to(queries.device), documents.flatten(0, 1).detach()
-        shown.requires_grad_(with_backward)
-        losses = []
-        for start in range(0, len(queries), self.mini_batch_size):
-            rows = slice(start, start + self.mini_batch_size)
-            scores = self.similarity(queries[rows], shown) * self.scale
-            if self._added is not None:
-                scores = scores + self._added[rows].to(scores.device)
-            loss = cross_entropy(scores, own[rows], reduction="sum") / len(queries)
-            if with_backward:
-                loss.backward()
-                loss = loss.detach()
-            losses.append(loss)
-        if with_backward:
-            documents.backward(shown.grad.view_as(documents))
-        return torch.stack(losses).sum()
 
 
-def on_cpu(value: Any) -> Any:
-    return value.cpu() if torch.is_tensor(value) else value
+class MultiVectorRankingLoss(LazyBatchLoss, CachedMultiVectorMultipleNegativesRankingLoss):
+    """For a retriever with many vectors, by late interaction."""
+
+    similarity = staticmethod(colbert_scores)
+    query_major = True
 
 
-def filled(lengths: Sequence[int]) -> torch.Tensor:
-    """(rows, longest) an attention mask of rows of so many tokens."""
-    return (torch.arange(max(lengths)) < torch.tensor(lengths)[:, None]).long()
+def identical_frames(
+    columns: Sequence[Sequence[FrameRef]], own: range, query_major: bool
+) -> torch.Tensor:
+    """(own, documents) where a document is the frame of a query's target but not its target.
+
+    Args:
+        columns: The targets of all ranks' queries, then their hard negatives by column.
+        own: Positions of the queries of this rank.
+        query_major: Whether documents are ordered by their query; otherwise by column.
+    """
+    codes: dict[FrameRef, int] = {}
+    table = torch.tensor([[codes.setdefault(f, len(codes)) for f in column] for column in columns])
+    identical = table[0, list(own), None, None] == table
+    identical[range(len(own)), 0, list(own)] = False
+    return (identical.transpose(1, 2) if query_major else identical).flatten(1)
 
 
-def early(make: Callable[[Asked], Made], asked: Sequence[Asked], ahead: int) -> Iterator[Made]:
-    """What is made of each that is asked for, in order, up to `ahead` before they are taken. One
-    thread makes them: a tokenizer is not to be shared by several."""
+def prefetched(load: Callable[[In], Out], items: Sequence[In], ahead: int) -> Iterator[Out]:
+    """`load(item)` of each item in order, up to `ahead` before they are consumed. A single thread
+    loads them: several must not share a tokenizer."""
     if not ahead:
-        yield from map(make, asked)
+        yield from map(load, items)
         return
     with ThreadPoolExecutor(1) as pool:
-        waiting = [pool.submit(make, one) for one in asked[: ahead + 1]]
-        for following in range(ahead + 1, len(asked) + ahead + 1):
-            made = waiting.pop(0).result()
-            if following < len(asked):
-                waiting.append(pool.submit(make, asked[following]))
-            yield made
+        waiting = [pool.submit(load, item) for item in items[: ahead + 1]]
+        for k in range(len(items)):
+            loaded = waiting.pop(0).result()
+            if k + ahead + 1 < len(items):
+                waiting.append(pool.submit(load, items[k + ahead + 1]))
+            yield loaded

@@ -1,135 +1,85 @@
-"""A retriever merged into its base: written, read back, and held against the trained one."""
+"""Merges a retriever into its base."""
 
 from __future__ import annotations
 
-import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-import torch
 from torch.nn.utils.rnn import pad_sequence
 
-from conf.errors import UserError
-from conf.schema import ContrastiveCommand, ExportModelCommand, LoraConfig
+from conf.schema import ContrastiveCommand, LoraConfig
 from data.build import ensure_benchmark
 from data.records import RetrievalQuery
 from data.render.frame_cache import FrameReader
 from models import loading
 from models.retriever.embedder import (
     Retriever,
-    frame_input,
+    embed,
+    load_head,
     load_merged,
     load_retriever,
     load_trained,
-    query_input,
 )
-from train.retriever.run import split
+from train.common.merge import ModelOutputs, check_benchmark
+from train.retriever.batches import split_queries
 
-log = logging.getLogger(__name__)
+MAX_QUERIES = 64
+"""Held-out queries that are compared, against the targets of all of them."""
+BATCH = 8
 
-CHECKED = 64
-"""Held-out queries that the exported retriever is checked on, against the targets of all."""
-LARGEST_DIFFERENCE = 0.1
-"""Of embeddings, as a share of their size, and of scores, as one of a query's with itself. Of a
-small retriever with adapters as heavy as its base, rounding to bf16 moves embeddings by 0.03."""
-
-Measured = dict[str, float]
+Items = tuple[list[RetrievalQuery], FrameReader]
 
 
-def write_merged(
-    settings: ContrastiveCommand, saved: Path, cfg: ExportModelCommand, folder: Path
-) -> Measured:
-    """Write the merged weights, the processor and the modules after them, read them back as anyone
-    reads them, and measure how far what is embedded is from what the retriever in `saved` embeds,
-    adapters over the 4-bit base.
+class RetrieverMerge:
+    """Compares embeddings of queries, relative to their size, and scores, relative to a query's
+    score with itself, because scores may all be close to zero."""
 
-    Raises:
-        UserError: it is too far.
-    """
-    preset, precision = settings.retriever, settings.train.precision
-    store = ensure_benchmark(settings.benchmark, Path(cfg.store), cfg.workers)
-    held_out = split(settings, store)[1][:CHECKED]
-    frames = FrameReader(store, preset.image_size)
-    log.info("asking the trained retriever")
-    model = load_trained(preset, precision, saved)
-    # As it was trained: packed for inference, some CPUs round 4-bit products another way.
-    loading.keep_differentiable(model)
-    before = outputs(model, settings, held_out, frames)
-    log.info("merging")
-    # Of two models of this size a GPU holds one.
-    model.cpu()
-    plain = replace(preset, lora=LoraConfig(rank=0))
-    base = load_retriever(plain, precision, [], folder)[0].model
-    model[0].model = loading.merge_adapters(base, saved, preset.quantization, cfg.format)
-    model.save_pretrained(str(folder), create_model_card=False)
-    del model, base
-    log.info("asking the exported retriever")
-    after = outputs(load_merged(folder, preset), settings, held_out, frames)
-    measured = compare(before, after)
-    for name in ("query_difference", "score_difference"):
-        # A NaN is no small difference.
-        if not (found := measured[name]) <= LARGEST_DIFFERENCE:
-            raise UserError(
-                f"the {name.replace('_', ' ')} of the exported retriever from {saved} is "
-                f"{found:.3g} of its size, more than {LARGEST_DIFFERENCE}; nothing was exported. "
-                "Try format=fp32 or format=adapter"
-            )
-    return measured
+    product = "retriever"
+    max_difference = 0.1
+    """Rounding to bf16 moves embeddings by 0.03 of their size where the adapters of a small
+    retriever weigh as much as its base."""
 
+    def __init__(self, settings: ContrastiveCommand, saved: Path) -> None:
+        self._settings, self._saved = settings, saved
+        self._preset, self._precision = settings.retriever, settings.train.precision
 
-@dataclass(frozen=True)
-class RetrieverOutputs:
-    """What a retriever gives for some queries and their targets, fp32.
+    def held_out(self, store: Path, workers: int) -> Items:
+        check_benchmark(store / self._settings.benchmark.name)
+        opened = ensure_benchmark(self._settings.benchmark, store, workers)
+        train = self._settings.train
+        queries = split_queries(
+            opened, train.batch, train.hard_negatives, train.validation_queries, self._settings.seed
+        )[1]
+        return queries[:MAX_QUERIES], FrameReader(opened, self._preset.image_size)
 
-    Attributes:
-        queries: (Q, ...) embeddings.
-        scores: (Q, targets) before they are scaled.
-        own: (Q,) each query's score with itself, the most that it can have: 1 of one vector, and of
-            many one a token.
-    """
+    def trained_outputs(self, items: Items) -> ModelOutputs:
+        model = load_trained(self._preset, self._precision, self._saved)
+        # Some CPUs round 4-bit products differently once the weights are packed for inference.
+        loading.keep_differentiable(model)
+        return self._outputs(model, items)
 
-    queries: torch.Tensor
-    scores: torch.Tensor
-    own: torch.Tensor
+    def write(self, folder: Path, format: str) -> None:
+        base = replace(self._preset, lora=LoraConfig(rank=0))
+        model = load_retriever(base, self._precision, [], folder)
+        model[0].model = loading.merge_adapters(
+            model[0].model, self._saved, self._preset.quantization, format
+        )
+        load_head(model, self._saved)
+        model.save_pretrained(str(folder), create_model_card=False)
 
+    def merged_outputs(self, folder: Path, items: Items) -> ModelOutputs:
+        return self._outputs(load_merged(folder, self._preset), items)
 
-def outputs(
-    model: Retriever,
-    settings: ContrastiveCommand,
-    queries: list[RetrievalQuery],
-    frames: FrameReader,
-) -> RetrieverOutputs:
-    """The outputs for queries and for their targets, each of these once."""
-    preset = settings.retriever
-    targets = dict.fromkeys(q.target for q in queries)
-    batch = {"batch_size": 8, "show_progress_bar": False}
-    asked = [query_input(q, frames, preset) for q in queries]
-    shown = [frame_input(f, frames) for f in targets]
-    asked = model.encode_query(asked, prompt=preset.query_instruction, **batch)
-    shown = model.encode_document(shown, prompt=preset.frame_instruction, **batch)
-    asked, shown = (rows_of(made) for made in (asked, shown))
-    own = model.similarity(asked, asked).diagonal()
-    return RetrieverOutputs(asked, model.similarity(asked, shown).cpu(), own.cpu())
-
-
-def rows_of(embedded: list) -> torch.Tensor:
-    """(rows, ...) of what the library gives; fewer vectors are filled up with zeros."""
-    rows = [torch.as_tensor(one).float().cpu() for one in embedded]
-    return pad_sequence(rows, batch_first=True)
-
-
-def compare(before: RetrieverOutputs, after: RetrieverOutputs) -> Measured:
-    """The sizes of the differences of the queries' embeddings, as a share of their own size, and of
-    the scores, as a share of those that queries have with themselves, since scores may all be near
-    zero; and the share of queries whose best frame is the same."""
-    same = before.scores.argmax(dim=1) == after.scores.argmax(dim=1)
-    return {
-        "query_difference": size(after.queries - before.queries) / size(before.queries),
-        "score_difference": size(after.scores - before.scores) / size(before.own),
-        "best_frame_agreement": float(same.float().mean()),
-    }
-
-
-def size(values: torch.Tensor) -> float:
-    """The root of the mean square."""
-    return float(values.square().mean().sqrt())
+    def _outputs(self, model: Retriever, items: Items) -> ModelOutputs:
+        queries, frames = items
+        targets = list(dict.fromkeys(q.target for q in queries))
+        rows, documents = (
+            pad_sequence(embed(model, some, frames, self._preset, BATCH), batch_first=True)
+            for some in (queries, targets)
+        )
+        scores = model.similarity(rows, documents)
+        return ModelOutputs(
+            values={"query": [rows], "score": [scores]},
+            choices={"best_frame": scores.argmax(dim=1).tolist()},
+            scales={"score": [model.similarity(rows, rows).diagonal()]},
+        )

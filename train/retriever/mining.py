@@ -1,170 +1,151 @@
-"""Hard negatives from the retriever as it is: the wrong frames that it ranks highest."""
+"""Mines hard negatives: the wrong frames that the retriever itself ranks highest."""
 
 from __future__ import annotations
 
 import json
-import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from sentence_transformers.util import semantic_search
 from torch.nn.utils.rnn import pad_sequence
-from tqdm import tqdm
 from transformers import TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.errors import UserError
 from conf.runs import rank, write_text
-from conf.schema import ContrastiveTrainConfig
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
 from data.tracks.retrieval.database import TWIN_DISTANCE
 from data.world.displacement import frame_displacements
 from models.distributed import from_main
-from models.nonfinite_guard import check_finite
-from models.retriever.embedder import Retriever
-from train.retriever.batches import Batch, batch_of
-from train.retriever.inputs import RetrieverInputs
-from train.retriever.loss import RankingLoss
+from models.retriever.embedder import Item, Retriever
 
-log = logging.getLogger(__name__)
-
-Mined = dict[str, list[FrameRef]]
-"""The hard negatives of queries, by their ids."""
-KINDS = {"query": "queries", "document": "frames"}
-AT_ONCE = 4096
-"""Frames that queries are held against at once."""
+HardNegatives = dict[str, list[FrameRef]]
+"""Hard negatives by query id."""
+CHUNK = 4096
+"""FrameReader that are scored at once."""
 SPARE = 64
-"""How many more frames than are wanted are looked at: those near the target are no negatives."""
+"""Further frames that are ranked: those near the target are not negatives."""
 
 
-class HardNegatives(TrainerCallback):
-    """Which hard negatives the training queries have: the benchmark's, and every `train.mine_every`
-    steps those frames of the pool that the retriever ranks highest, without the target and what its
-    scene's oracle displaces by less than `train.mine_margin` px (at 336 x 336) from it. The pool is
-    what the benchmark's batches show: targets, and `train.hard_negatives` of each query.
+class HardNegativeMiner(TrainerCallback):
+    """Every `every` steps, replaces the hard negatives by the frames of the pool that the retriever
+    ranks highest, except the target and frames that the scene's oracle displaces by less than
+    `margin` px from it. The pool is every target and hard negative of the training queries.
 
-    They are in the run's folder, a file a mining, so that a run that goes on has those it had.
+    Each mining is a file in the run's folder, from which a resumed run continues.
+
+    Args:
+        queries: The training queries.
+        count: Hard negatives a query.
+        every: Steps between minings; 0 keeps the benchmark's hard negatives.
+        margin: Least displacement from the target, in px at 336 x 336.
+        model: The retriever that is trained.
+        embed: Embeds queries, or frames: their fp32 rows on the CPU.
+        store: The benchmark, with its oracle.
+        folder: The run's folder.
     """
 
     def __init__(
         self,
         queries: Sequence[RetrievalQuery],
-        train: ContrastiveTrainConfig,
+        count: int,
+        every: int,
+        margin: float,
         model: Retriever,
-        inputs: RetrieverInputs,
-        ranking: type[RankingLoss],
+        embed: Callable[[Sequence[Item], str], list[torch.Tensor]],
         store: Store,
         folder: Path,
     ) -> None:
-        """`ranking` says how the model embeds and how embeddings are held against each other."""
-        self._queries = queries
-        self._every, self._margin = train.mine_every, train.mine_margin
-        self._count = train.hard_negatives
-        self._mini_batch, self._tokens = train.mini_batch, train.mini_batch_tokens
-        self._model, self._inputs, self._ranking = model, inputs, ranking
+        self._queries, self._count = queries, count
+        self._every, self._margin = every, margin
+        self._model, self._embed = model, embed
         self._store, self._folder = store, folder
-        self._mined: Mined = {}
+        self._mined: HardNegatives = {}
 
-    def given(self, query: RetrievalQuery) -> RetrievalQuery:
-        """A query with the hard negatives that are its own now."""
+    def update(self, query: RetrievalQuery) -> RetrievalQuery:
+        """The query with its current hard negatives."""
         mined = self._mined.get(query.query_id)
         return query if mined is None else replace(query, hard_negatives=tuple(mined))
 
     def on_train_begin(self, args, state: TrainerState, control: TrainerControl, **_: Any) -> None:
         if self._every and (last := state.global_step // self._every * self._every):
-            self._mined = read(self._path(last))
+            self._mined = read_negatives(self._path(last))
 
     def on_step_end(self, args, state: TrainerState, control: TrainerControl, **_: Any) -> None:
         step = state.global_step
         if self._every and step % self._every == 0 and step < state.max_steps:
             self._mined = from_main(self._mine)
             if rank() == 0:
-                write(self._mined, self._path(step))
+                write_negatives(self._mined, self._path(step))
 
-    def _mine(self) -> Mined:
-        batch = batch_of(self._queries, self._count, distinct=True, shared=True)
+    def _mine(self) -> HardNegatives:
+        shown = ((q.target, *q.hard_negatives[: self._count]) for q in self._queries)
+        pool = list(dict.fromkeys(frame for frames in shown for frame in frames))
         was_training = self._model.training
-        self._model.eval()
-        asked = self._embedded(batch, "query", len(batch.prefixes))
-        shown = self._embedded(batch, "document", len(batch.frames))
-        self._model.train(was_training)
-        top = min(self._count + SPARE, len(shown))
-        found = semantic_search(
-            asked, shown, corpus_chunk_size=AT_ONCE, top_k=top, score_function=self._scores
+        queries, frames = (
+            pad_sequence(self._embed(items, f"mining: {label}"), batch_first=True)
+            for items, label in ((self._queries, "queries"), (pool, "frames"))
         )
-        ranked = [[batch.frames[hit["corpus_id"]] for hit in hits] for hits in found]
+        self._model.train(was_training)
+        hits = semantic_search(
+            queries,
+            frames,
+            corpus_chunk_size=CHUNK,
+            top_k=min(self._count + SPARE, len(pool)),
+            score_function=self._scores,
+        )
+        ranked = [[pool[hit["corpus_id"]] for hit in row] for row in hits]
         return {
-            query.query_id: wrong(query, frames, self._store, self._margin, self._count)
-            for query, frames in zip(batch.queries, ranked, strict=True)
+            query.query_id: select_negatives(query, row, self._store, self._margin, self._count)
+            for query, row in zip(self._queries, ranked, strict=True)
         }
-
-    @torch.no_grad()
-    def _embedded(self, batch: Batch, task: str, rows: int) -> torch.Tensor:
-        """(queries or frames, ...) fp32 embeddings of so many prefixes or frames, on the CPU; what
-        has fewer vectors than others is filled up with zeros."""
-        query = task == "query"
-        make = self._inputs.of_prefixes if query else self._inputs.of_frames
-        names = batch.query_names if query else batch.frame_names
-        size = self._mini_batch
-        if self._tokens is not None:
-            # A prefix has the questions of the whole pool here, not of a batch.
-            lengths = self._inputs.prefix_lengths if query else self._inputs.frame_lengths
-            size = max(1, self._tokens // max(lengths(batch)))
-        made: list[torch.Tensor] = []
-        starts = range(0, rows, size)
-        for start in tqdm(starts, desc=f"mining: {KINDS[task]}", unit="batch", leave=False):
-            some = start, min(start + size, rows)
-            given = self._inputs.on_device(make(batch, *some))
-            embedded = self._ranking.embed(self._model, given, task).float().cpu()
-            check_finite(embedded, partial(names, *some))
-            made += embedded
-        return pad_sequence(made, batch_first=True)
 
     def _scores(self, queries: torch.Tensor, frames: torch.Tensor) -> torch.Tensor:
         device = self._model.device
-        return self._ranking.similarity(queries.to(device), frames.to(device))
+        return self._model.similarity(queries.to(device), frames.to(device))
 
     def _path(self, step: int) -> Path:
         return self._folder / "mined" / f"{step}.json"
 
 
-def wrong(
+def select_negatives(
     query: RetrievalQuery, ranked: Sequence[FrameRef], store: Store, margin: float, count: int
 ) -> list[FrameRef]:
-    """The first `count` of the ranked frames that are not the query's target, its twins, or nearer
-    to it than `margin`; the benchmark's own where there are not so many."""
+    """The first `count` ranked frames that are not the query's target, a twin of it, or displaced
+    by less than `margin` px from it; filled up with the benchmark's hard negatives."""
     target, least = query.target, max(margin, TWIN_DISTANCE)
-    apart = frame_displacements(store.scene(target.scene_id))[target.frame]
+    distances = frame_displacements(store.scene(target.scene_id))[target.frame]
     far = [
         frame
         for frame in [*ranked, *query.hard_negatives]
         if frame.scene_id != target.scene_id
-        or (frame.frame != target.frame and apart[frame.frame] >= least)
+        or (frame.frame != target.frame and distances[frame.frame] >= least)
     ]
     return [*dict.fromkeys([*far, *query.hard_negatives])][:count]
 
 
-def write(mined: Mined, path: Path) -> None:
+def write_negatives(mined: HardNegatives, path: Path) -> None:
     path.parent.mkdir(exist_ok=True)
     rows = {name: [asdict(frame) for frame in frames] for name, frames in mined.items()}
     write_text(path, json.dumps(rows))
 
 
-def read(path: Path) -> Mined:
-    """
+def read_negatives(path: Path) -> HardNegatives:
+    """Read a mining.
+
     Raises:
-        UserError: the file is missing or damaged.
+        UserError: The file is missing or damaged.
     """
     try:
         rows = json.loads(path.read_text())
         return {name: [FrameRef(**frame) for frame in frames] for name, frames in rows.items()}
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(
-            f"{path} is missing or damaged, which holds the hard negatives that the run goes on "
-            "with: put it back, or delete the run's folder and train again"
+            f"{path}, the hard negatives that the run resumes with, is missing or damaged: restore "
+            "it, or delete the run's folder and train again",
+            code="damaged-file",
         ) from error

@@ -12,14 +12,13 @@ from torch import nn
 
 from conf.entry import Run
 from conf.schema import SftCommand
-from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
+from conf.schema.training import SftTrainConfig
 from models import memory
 from models.loading import load_student
 from models.student.collator import Collator
 from train import sft
 from train.common import journal, memory_probe
 from train.common.memory_probe import Choice, choose, settle, sizes
-from train.retriever import mini_batches
 from train.student.dataset import splits
 from train.student.lazy_samples import Samples
 
@@ -260,13 +259,4 @@ def test_what_is_advised_is_what_is_left_to_do() -> None:
     spare = replace(train, micro_batch=1, gradient_checkpointing=True, reuse_features=False)
     assert memory_probe.lower(spare) == (
         "lower student.image_size or student.frames, in a run of its own (run=NAME)"
-    )
-    retriever = ContrastiveTrainConfig(mini_batch=8, gradient_checkpointing=True)
-    assert mini_batches.lower(retriever) == (
-        "lower train.mini_batch, which is 8 and changes no gradient, in a run of its own (run=NAME)"
-    )
-    by_tokens = replace(retriever, mini_batch_tokens=2048, reuse_features=True)
-    assert mini_batches.lower(by_tokens) == (
-        "lower train.mini_batch_tokens, which is 2048 and changes no gradient, or set "
-        "train.reuse_features=false, in a run of its own (run=NAME)"
     )

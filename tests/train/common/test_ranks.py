@@ -162,18 +162,15 @@ def test_two_ranks_are_one(settings, contrastive_settings, saved_base, few, tmp_
     best = replace(settings.train, best="eval_answer_loss")
     plain = replace(settings, student=unquantised, train=best)
     alone(plain, runs / "plain")
-    # Near frames are told by names of both ranks.
-    train = replace(contrastive_settings.train, mask_near=20.0, batches="scenes")
-    near_masked = replace(contrastive_settings, train=train)
-    many = replace(near_masked.retriever, late=LateConfig(width=24))
-    late = replace(near_masked, retriever=many, train=replace(train, scale=1.0))
-    # By tokens, ranks have not the same number of mini-batches.
-    train = replace(train, mine_every=2, mini_batch_tokens=500, reuse_features=True)
+    train = contrastive_settings.train
+    many = replace(contrastive_settings.retriever, late=LateConfig(width=24))
+    late = replace(contrastive_settings, retriever=many, train=replace(train, scale=1.0))
     base = {"architecture": None, "model": saved_base, "lora": LoraConfig(rank=4)}
-    adapted = replace(near_masked.retriever, **base)
-    mined = replace(near_masked, retriever=adapted, train=train)
-    # Its loss is the library's own on one rank, to which another test holds it.
-    wholes = {"plain": contrastive_settings, "near": near_masked, "mined": mined, "late": late}
+    adapted = replace(contrastive_settings.retriever, **base)
+    # Mined frames are often another query's target, which both ranks mask.
+    train = replace(train, mine_every=2, reuse_features=True)
+    mined = replace(contrastive_settings, retriever=adapted, train=train)
+    wholes = {"plain": contrastive_settings, "mined": mined, "late": late}
     for name, alone_settings in wholes.items():
         (whole := tmp_path / "contrastive" / name).mkdir(parents=True)
         contrastive.main.__wrapped__(alone_settings, Run(name, whole))

@@ -1,8 +1,7 @@
-"""Hard negatives that the retriever itself finds."""
+"""Hard negatives that the retriever mines."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 
@@ -13,48 +12,59 @@ from conf.entry import Run
 from conf.schema import LateConfig
 from data.records import FrameRef
 from data.world.displacement import frame_displacements
-from models.retriever.embedder import frame_input, load_trained, query_input
+from models.retriever.embedder import embed, load_trained
+from tests.user_errors import raises_user_error
 from train import contrastive
 from train.common.journal import read_journal
-from train.retriever.mining import read, wrong
+from train.retriever.mining import read_negatives, select_negatives
 from train.student.dataset import held_out_scenes
 
 MARGIN = 24.0
 
 
-def test_what_is_ranked_high_and_wrong_is_taken_in_order(micro_store) -> None:
-    query = micro_store.retrieval("train")[0]
+def ranked_by_displacement(query, store) -> tuple[list[FrameRef], np.ndarray]:
     scene, target = query.target.scene_id, query.target.frame
-    apart = frame_displacements(micro_store.scene(scene))[target]
-    ranked = [FrameRef(scene, f) for f in np.argsort(apart, kind="stable").tolist()]
-    elsewhere = [FrameRef("s0-000009", target), FrameRef("s0-000008", 0)]
-    found = wrong(query, [*ranked, *elsewhere], micro_store, MARGIN, 5)
-    far = [f for f in ranked if f.frame != target and apart[f.frame] >= MARGIN]
-    assert found == [*far, *elsewhere][:5]
-    assert wrong(query, elsewhere, micro_store, MARGIN, 2) == elsewhere
+    distances = frame_displacements(store.scene(scene))[target]
+    return [FrameRef(scene, f) for f in np.argsort(distances, kind="stable").tolist()], distances
 
 
-def test_the_benchmarks_own_fill_what_is_lacking(micro_store) -> None:
+def test_highly_ranked_wrong_frames_are_selected_in_order(micro_store) -> None:
     query = micro_store.retrieval("train")[0]
-    assert wrong(query, [query.target], micro_store, 1e9, 2) == list(query.hard_negatives[:2])
+    ranked, distances = ranked_by_displacement(query, micro_store)
+    elsewhere = [FrameRef("s0-000009", query.target.frame), FrameRef("s0-000008", 0)]
+    selected = select_negatives(query, [*ranked, *elsewhere], micro_store, MARGIN, 5)
+    far = [f for f in ranked if f.frame != query.target.frame and distances[f.frame] >= MARGIN]
+    assert selected == [*far, *elsewhere][:5]
+    assert select_negatives(query, elsewhere, micro_store, MARGIN, 2) == elsewhere
 
 
-def test_no_margin_takes_a_frame_that_shows_what_the_target_shows(micro_store) -> None:
+def test_the_benchmarks_negatives_fill_up_missing_ones(micro_store) -> None:
+    query = micro_store.retrieval("train")[0]
+    selected = select_negatives(query, [query.target], micro_store, 1e9, 2)
+    assert selected == list(query.hard_negatives[:2])
+
+
+def test_twins_of_the_target_are_never_selected(micro_store) -> None:
     for query in micro_store.retrieval("train"):
-        scene, target = query.target.scene_id, query.target.frame
-        apart = frame_displacements(micro_store.scene(scene))[target]
-        ranked = [FrameRef(scene, f) for f in np.argsort(apart, kind="stable").tolist()]
-        found = wrong(query, ranked, micro_store, 0, len(ranked))
-        assert {f.frame for f in found} == set(np.flatnonzero(apart >= 1).tolist())
+        ranked, distances = ranked_by_displacement(query, micro_store)
+        selected = select_negatives(query, ranked, micro_store, 0, len(ranked))
+        assert {f.frame for f in selected} == set(np.flatnonzero(distances >= 1).tolist())
+
+
+def test_a_damaged_mining_is_refused(tmp_path) -> None:
+    (tmp_path / "1.json").write_text("{")
+    for name in ("1.json", "2.json"):
+        with raises_user_error("damaged-file", name):
+            read_negatives(tmp_path / name)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("late", "tokens"), [(None, None), (LateConfig(width=24), 256)])
-def test_a_run_mines_what_ranks_highest_and_goes_on_with_it(
-    contrastive_settings, micro_store, frames, tmp_path, late, tokens
+@pytest.mark.parametrize("late", [None, LateConfig(width=24)])
+def test_a_run_mines_the_highest_ranked_frames_and_resumes_with_them(
+    contrastive_settings, micro_store, frames, tmp_path, late
 ) -> None:
     often = {"mine_every": 1, "mine_margin": MARGIN, "evaluations": 4, "keep": 4}
-    train = replace(contrastive_settings.train, mini_batch_tokens=tokens, **often)
+    train = replace(contrastive_settings.train, **often)
     cfg = replace(contrastive_settings.retriever, late=late)
     settings = replace(contrastive_settings, retriever=cfg, train=train)
     whole, killed = tmp_path / "whole", tmp_path / "killed"
@@ -66,16 +76,16 @@ def test_a_run_mines_what_ranks_highest_and_goes_on_with_it(
     shutil.copytree(whole / "mined", killed / "mined")
     for path in (killed / "mined").glob("[23].json"):
         path.unlink()
-    # Killed at its second mining.
+    # Killed during its second mining.
     shutil.copytree(whole / "checkpoint-1", killed / "checkpoint-1")
     contrastive.main.__wrapped__(settings, Run("killed", killed))
     for step in (2, 3):
-        names = [f / "mined" / f"{step}.json" for f in (whole, killed)]
-        assert read(names[0]) == read(names[1])
+        first, second = (f / "mined" / f"{step}.json" for f in (whole, killed))
+        assert read_negatives(first) == read_negatives(second)
     later = [[r for r in read_journal(f) if r["step"] > 1] for f in (whole, killed)]
     assert later[0] == later[1]
 
-    mined = read(whole / "mined" / "3.json")
+    mined = read_negatives(whole / "mined" / "3.json")
     held_out = held_out_scenes(micro_store)
     queries = [q for q in micro_store.retrieval("train") if q.scene_id not in held_out]
     assert mined.keys() == {q.query_id for q in queries}
@@ -85,12 +95,11 @@ def test_a_run_mines_what_ranks_highest_and_goes_on_with_it(
         shutil.copy(weights, tmp_path / "third" / weights.relative_to(whole / "checkpoint-3"))
     model = load_trained(cfg, "fp32", tmp_path / "third")
     pool = list(dict.fromkeys(f for q in queries for f in (q.target, *q.hard_negatives[:1])))
-    shown = model.encode_document([frame_input(f, frames) for f in pool])
+    shown = embed(model, pool, frames, cfg, 8)
     for query in queries[:5]:
-        asked = model.encode_query([query_input(query, frames, cfg)])
-        found = model.similarity(asked, shown)[0].cpu().numpy()
-        ranked = [pool[k] for k in np.argsort(-found, kind="stable")]
-        scores = dict(zip(pool, found, strict=True))
-        best = wrong(query, ranked, micro_store, MARGIN, 1)[0]
-        assert scores[mined[query.query_id][0]] == pytest.approx(scores[best], abs=1e-5)
-    assert json.loads((whole / "mined" / "1.json").read_text())
+        vectors = embed(model, [query], frames, cfg, 1)
+        scores = np.array([float(model.similarity([vectors[0]], [row])) for row in shown])
+        ranked = [pool[k] for k in np.argsort(-scores, kind="stable")]
+        by_frame = dict(zip(pool, scores, strict=True))
+        best = select_negatives(query, ranked, micro_store, MARGIN, 1)[0]
+        assert by_frame[mined[query.query_id][0]] == pytest.approx(by_frame[best], abs=1e-5)

@@ -1,4 +1,4 @@
-"""An exported student answers as the trained one does, wherever it is loaded."""
+"""An exported student answers as the trained one, wherever it is loaded."""
 
 from __future__ import annotations
 
@@ -35,8 +35,12 @@ from models.resolved import resolve_run
 from models.student.collator import encode
 from models.student.prompts import selection_sample
 from models.trained_runs import run_title, trained_settings
+from teacher.narrate import ensure_rationales
+from tests.user_errors import raises_user_error
 from train import export
-from train.student import merge
+from train.common.merge import ModelOutputs, compare
+from train.common.model_card import model_card
+from train.student.merge import StudentMerge
 
 METRICS = {"answer_loss_at_start": 2.5, "answer_loss": 0.375}
 
@@ -53,7 +57,7 @@ def settings(micro, micro_store, nf4_cfg) -> SftCommand:
 
 
 def finished_run(settings: SftCommand, root: Path) -> Path:
-    """A run of train.sft as it ends, with adapters that weigh as much as their base."""
+    """A finished run of train.sft whose adapters weigh as much as their base."""
     folder = root / "sft" / "run"
     open_run(Run("run", folder), asdict(settings), "train.sft", [])
     resolve_run(folder, "fp32", settings.student, data="0")
@@ -69,7 +73,8 @@ def finished_run(settings: SftCommand, root: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def runs(settings, tmp_path_factory) -> Path:
+def runs(settings, micro_store, tmp_path_factory) -> Path:
+    ensure_rationales(micro_store, settings.teacher)
     return finished_run(settings, tmp_path_factory.mktemp("checkpoints"))
 
 
@@ -83,7 +88,7 @@ def exported(settings: SftCommand, runs: Path, format: str, into: Path) -> tuple
 
 @pytest.fixture(scope="module")
 def forms(settings, runs, tmp_path_factory) -> dict[str, tuple[dict, Path]]:
-    """What the command says of each format, and its folder."""
+    """The metrics and the folder of each format."""
     root = tmp_path_factory.mktemp("exports")
     return {f: exported(settings, runs, f, root / f) for f in ("bf16", "fp32", "adapter")}
 
@@ -111,7 +116,7 @@ def test_a_merged_weight_is_the_dequantised_one_and_its_adapters_product(
     assert changed == 2 * 7
 
 
-def test_the_measured_difference_is_told_and_small(forms) -> None:
+def test_the_measured_difference_is_recorded_and_small(forms) -> None:
     for format, most in (("fp32", 1e-5), ("bf16", 0.05)):
         measured, folder = forms[format]
         assert json.loads((folder / "export.json").read_text())["measured"] == measured
@@ -131,8 +136,8 @@ import torch
 from transformers import AutoModelForImageTextToText, AutoProcessor
 from transformers.video_utils import VideoMetadata
 
-folder, asked, said = sys.argv[1:]
-given = torch.load(asked, weights_only=False)
+folder, inputs, outputs = sys.argv[1:]
+given = torch.load(inputs, weights_only=False)
 processor = AutoProcessor.from_pretrained(folder)
 model = AutoModelForImageTextToText.from_pretrained(folder).eval()
 text = processor.apply_chat_template(
@@ -145,26 +150,26 @@ batch = processor(
 with torch.no_grad():
     logits = model(**batch).logits
 assert not {"train", "conf", "peft", "bitsandbytes"} & set(sys.modules)
-torch.save((batch["input_ids"], logits), said)
+torch.save((batch["input_ids"], logits), outputs)
 """
 
 
 @pytest.mark.slow
-def test_it_says_the_same_where_only_transformers_is(
+def test_transformers_alone_computes_the_same_logits(
     settings, runs, forms, micro_store, frames, tmp_path
 ) -> None:
-    """Against the trained student itself, the adapters over their 4-bit base."""
+    """As the trained student, the adapters over their 4-bit base."""
     item = micro_store.selection("test")[0]
     sample = selection_sample(item, "answer", "cot", frames, settings.student)
     given = {"content": sample.content, "images": sample.images}
     given |= {"video": sample.clip.pixels, "metadata": sample.clip.metadata}
-    torch.save(given, tmp_path / "asked.pt")
-    arguments = [forms["fp32"][1], tmp_path / "asked.pt", tmp_path / "said.pt"]
+    torch.save(given, tmp_path / "inputs.pt")
+    arguments = [forms["fp32"][1], tmp_path / "inputs.pt", tmp_path / "outputs.pt"]
     subprocess.run(
         [sys.executable, "-c", ELSEWHERE, *map(str, arguments)],
         cwd=tmp_path, check=True, env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
     )  # fmt: skip
-    ids, logits = torch.load(tmp_path / "said.pt")
+    ids, logits = torch.load(tmp_path / "outputs.pt")
     student = runs / "sft" / "run" / "student"
     model, processor = loading.load_trained(settings.student, "fp32", student)
     # Packed for inference, some CPUs round 4-bit products another way.
@@ -178,7 +183,7 @@ def test_it_says_the_same_where_only_transformers_is(
 
 
 @pytest.mark.slow
-def test_every_form_is_measured_like_the_run(settings, runs, forms, tmp_path) -> None:
+def test_every_format_evaluates_like_the_run(settings, runs, forms, tmp_path) -> None:
     unused = StudentConfig(name="unused", model="unused")
     said = {}
     models = {f: forms[f][1] for f in ("fp32", "adapter")} | {"run": runs / "sft" / "run"}
@@ -198,7 +203,7 @@ def test_every_form_is_measured_like_the_run(settings, runs, forms, tmp_path) ->
     assert run_title(models["fp32"]) == "run fp32"
 
 
-def test_an_export_is_written_once_and_of_these_weights(settings, runs, forms, tmp_path) -> None:
+def test_an_export_is_written_once_for_its_weights(settings, runs, forms, tmp_path) -> None:
     shutil.copytree(runs, tmp_path / "runs")
     measured, folder = forms["fp32"]
     before = (folder / "model.safetensors").stat()
@@ -207,28 +212,28 @@ def test_an_export_is_written_once_and_of_these_weights(settings, runs, forms, t
     assert (folder / "model.safetensors").stat() == before
     path = tmp_path / "runs" / "sft" / "run" / "student" / "adapter_model.safetensors"
     save_file({k: v + 1 for k, v in load_file(path).items()}, path, metadata={"format": "pt"})
-    with pytest.raises(UserError, match="is an export of other adapters"):
+    with raises_user_error("other-adapters"):
         exported(settings, tmp_path / "runs", "fp32", folder.parent)
 
 
 @pytest.mark.slow
-def test_an_export_that_answers_otherwise_is_not_kept(
-    settings, runs, tmp_path, monkeypatch
-) -> None:
-    """The adapters left out stand for anything that goes wrong in merging."""
-    monkeypatch.setattr(
-        merge, "merge", lambda *_: loading.load_base(replace_nf4(settings), "fp32", list)
-    )
-    with pytest.raises(UserError, match=r"differ by .* of their size .* nothing was exported"):
+def test_an_export_that_differs_too_much_is_deleted(settings, runs, tmp_path, monkeypatch) -> None:
+    """Here merging leaves out the adapters."""
+    monkeypatch.setattr(loading, "merge_adapters", lambda base, *_: base.dequantize(torch.float32))
+    with raises_user_error("merge-difference"):
         exported(settings, runs, "fp32", tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def replace_nf4(settings: SftCommand) -> StudentConfig:
-    return replace(settings.student, quantization="none")
+def test_missing_rationales_are_not_narrated(settings, tmp_path, micro_store) -> None:
+    """The export compares logits on them, and must not send requests to a teacher."""
+    shutil.copytree(micro_store.folder, tmp_path / "micro")
+    (tmp_path / "micro" / "rationales.jsonl").unlink()
+    with raises_user_error("missing-rationales", "verify=false"):
+        StudentMerge(settings, tmp_path).held_out(tmp_path, 1)
 
 
-def test_what_a_kill_left_does_not_stay(settings, runs, forms, tmp_path) -> None:
+def test_leftovers_of_a_killed_export_are_deleted(settings, runs, forms, tmp_path) -> None:
     (tmp_path / ".student.partial").mkdir()
     (tmp_path / ".student.partial" / "model.safetensors").write_bytes(b"half")
     _, folder = exported(settings, runs, "adapter", tmp_path)
@@ -241,7 +246,7 @@ def test_what_a_kill_left_does_not_stay(settings, runs, forms, tmp_path) -> None
         assert (folder / name).read_bytes() == trained.read_bytes()
 
 
-def test_a_disk_that_takes_no_more_is_told(model, processor, tmp_path) -> None:
+def test_a_full_disk_is_reported(model, processor, tmp_path) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
@@ -251,12 +256,12 @@ def test_a_disk_that_takes_no_more_is_told(model, processor, tmp_path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-def test_a_card_says_what_the_run_says(settings, runs, forms) -> None:
+def test_the_card_describes_the_run(settings, runs, forms) -> None:
     card = ModelCard.load(forms["adapter"][1] / "README.md")
     assert card.data.library_name == "peft"
     assert card.data.tags == ["dynapix", "cot"]
     record = json.loads((runs / "sft" / "run" / "run.json").read_text())
-    for told in (
+    for row in (
         f"| base | {settings.student.model} |",
         "| adapters | LoRA of rank 4, alpha 32, dropout 0.0 |",
         "| quantisation of the base | nf4 |",
@@ -266,33 +271,33 @@ def test_a_card_says_what_the_run_says(settings, runs, forms) -> None:
         f"| started | {record['started']} |",
         "| answer loss | 2.5 | 0.375 |",
     ):
-        assert told in card.text
-    # A server lays adapters over the base as it was released.
-    assert "The adapters go with the base in NF4" in card.text
+        assert row in card.text
+    # Servers load adapters over the base as it was released.
+    assert "unquantised base" in card.text
     hub = replace(settings, student=replace(settings.student, model="Qwen/Qwen3-VL-2B-Instruct"))
     folder = runs / "sft" / "run"
-    from train.common.model_card import text
-
-    named = ModelCard(text("run", hub, folder, "bf16", {"answer_logit_difference": 0.0125}))
-    assert named.data.base_model == "Qwen/Qwen3-VL-2B-Instruct"
-    assert "| answer logit difference | 0.0125 |" in named.text
-    assert "NF4" not in named.text
+    card = model_card("run", hub, folder, "bf16", {"answer_logit_difference": 0.0125})
+    assert card.data.base_model == "Qwen/Qwen3-VL-2B-Instruct"
+    assert "| answer logit difference | 0.0125 |" in card.text
+    assert "unquantised base" not in card.text
 
 
-def test_differences_are_shares_of_the_logits_size() -> None:
-    def outputs(*values: float, letter: int | None = 0) -> merge.StudentOutputs:
-        return merge.StudentOutputs(torch.tensor([values]), letter)
+def test_differences_are_relative_to_the_values_or_their_scale() -> None:
+    def outputs(*rows: list[float], choices=(0, 0), **scales) -> ModelOutputs:
+        return ModelOutputs(
+            {"logit": [torch.tensor(r) for r in rows]}, {"letter": list(choices)}, scales
+        )
 
-    before = {"answer": [outputs(3.0, 0.0), outputs(0.0, 4.0)]}
-    after = {"answer": [outputs(3.0, 1.0), outputs(0.0, 4.0, letter=2)]}
-    assert merge.compare(before, after) == pytest.approx(
-        {"answer_logit_difference": 0.2, "answer_letter_agreement": 0.5}
+    before = outputs([3.0, 0.0], [0.0, 4.0])
+    after = outputs([3.0, 1.0], [0.0, 4.0], choices=(0, 2))
+    assert compare(before, after) == pytest.approx(
+        {"logit_difference": 0.2, "letter_agreement": 0.5}
     )
-    assert set(merge.compare(before, before).values()) == {0.0, 1.0}
-    silent = {"describe": [outputs(3.0, letter=None)]}
-    assert merge.compare(silent, silent) == {"describe_logit_difference": 0.0}
-    broken = {"answer": [outputs(math.nan, 0.0), outputs(0.0, 4.0)]}
-    assert math.isnan(merge.compare(before, broken)["answer_logit_difference"])
+    assert compare(before, before) == {"logit_difference": 0.0, "letter_agreement": 1.0}
+    scaled = outputs([3.0, 0.0], [0.0, 4.0], logit=[torch.tensor([2.0])])
+    assert compare(scaled, after)["logit_difference"] == pytest.approx(0.25)
+    broken = outputs([math.nan, 0.0], [0.0, 4.0])
+    assert math.isnan(compare(before, broken)["logit_difference"])
 
 
 def other_base(path: Path) -> None:
@@ -300,33 +305,30 @@ def other_base(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "named"),
     [
-        (lambda run: (run / "metrics.json").unlink(), r"run=.*sft/run is not finished"),
-        (lambda run: shutil.rmtree(run), r"run=.*sft/run is no run folder"),
-        (lambda run: whole(run / "config.yaml"), r"trained the whole model .*lora\.rank=0"),
+        (lambda run: (run / "metrics.json").unlink(), "sft/run"),
+        (lambda run: shutil.rmtree(run), "sft/run"),
+        (lambda run: whole(run / "config.yaml"), r"lora\.rank=0"),
         (lambda run: (run / "student" / "adapter_model.safetensors").unlink(), "no adapters"),
-        (
-            lambda run: (run / "resolved.yaml").write_text("precision: fp32\nbase: other\ndata: x"),
-            "are not those that",
-        ),
+        (lambda run: other_base(run / "resolved.yaml"), "weights"),
     ],
 )
-def test_what_cannot_be_exported_is_told(settings, runs, tmp_path, damage, said) -> None:
+def test_a_run_that_cannot_be_exported_is_refused(settings, runs, tmp_path, damage, named) -> None:
     shutil.copytree(runs, tmp_path / "runs")
     damage(tmp_path / "runs" / "sft" / "run")
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=named):
         exported(settings, tmp_path / "runs", "adapter", tmp_path / "into")
     assert list((tmp_path / "into").iterdir()) == []
 
 
 def whole(config: Path) -> None:
-    told = config.read_text()
-    assert "rank: 4" in told
-    config.write_text(told.replace("rank: 4", "rank: 0").replace("nf4", "none"))
+    text = config.read_text()
+    assert "rank: 4" in text
+    config.write_text(text.replace("rank: 4", "rank: 0").replace("nf4", "none"))
 
 
-def test_a_torn_export_is_told(settings, forms, tmp_path) -> None:
+def test_a_damaged_export_is_refused(settings, forms, tmp_path) -> None:
     shutil.copytree(forms["bf16"][1], tmp_path / "export")
     weights = tmp_path / "export" / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:5000])
@@ -343,7 +345,7 @@ def test_a_torn_export_is_told(settings, forms, tmp_path) -> None:
         run_title(tmp_path / "student")
 
 
-def test_a_run_goes_by_its_name_or_its_folder(tmp_path, monkeypatch) -> None:
+def test_a_run_is_named_by_its_name_or_its_folder(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     for given in ("exp-cot", "exp-cot/", "checkpoints/sft/exp-cot", "./checkpoints/sft/exp-cot/",
                   str(tmp_path / "checkpoints" / "sft" / "exp-cot")):  # fmt: skip

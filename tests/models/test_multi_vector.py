@@ -1,5 +1,5 @@
-"""The multi-vector retriever: what is scored, its loss held against the library's, and that what
-is saved is a plain MultiVectorEncoder."""
+"""The multi-vector retriever: which tokens are scored, and that a saved one is a plain
+MultiVectorEncoder."""
 
 from __future__ import annotations
 
@@ -10,11 +10,6 @@ from dataclasses import replace
 import pytest
 import torch
 from sentence_transformers import MultiVectorEncoder
-from sentence_transformers.multi_vector_encoder.losses import (
-    CachedMultiVectorMultipleNegativesRankingLoss,
-)
-from sentence_transformers.util.similarity import maxsim
-from torch.nn.functional import cross_entropy
 from transformers import dynamic_module_utils
 
 from conf.compose import compose, register
@@ -30,19 +25,13 @@ from models.retriever.embedder import (
 from models.retriever.multi_vector import find_scored_tokens
 from models.retriever.scored_tokens import ScoredTokens
 from train.common.audit import audit_retriever
-from train.retriever.batches import batch_of
-from train.retriever.inputs import RetrieverInputs
-from train.retriever.late_loss import MultiVectorRankingLoss
-from train.retriever.negatives import Weighing
 
-SCALE = 0.5
-NEGATIVES = 2
-FRAME = 9
-"""Tokens of a frame of 96 px; a clip has as many for each of its six pairs of frames."""
+FRAME_TOKENS = 9
+"""Tokens of a frame of 96 px, and of each of the six pairs of frames of a clip."""
 
 
 def load(cfg, micro_store, folder, noise: float = 0.0) -> MultiVectorEncoder:
-    """In which adapters, if any, already do something."""
+    """A retriever whose adapters, if any, have an effect."""
     torch.manual_seed(0)
     model = load_retriever(
         cfg, "fp32", tokenizer_texts(micro_store.retrieval("train"), cfg), folder
@@ -59,103 +48,14 @@ def late_cfg(retriever_cfg):
     return replace(retriever_cfg, late=LateConfig(width=24))
 
 
-@pytest.fixture(scope="module", params=["whole", "adapters", "pooled"])
-def trained(request, micro_store, late_cfg, saved_base, tmp_path_factory):
-    cfg = late_cfg
-    if request.param == "adapters":
-        cfg = replace(cfg, architecture=None, model=saved_base, lora=LoraConfig(rank=4))
-    if request.param == "pooled":
-        cfg = replace(cfg, late=LateConfig(width=24, pool=2))
-    return load(cfg, micro_store, tmp_path_factory.mktemp("base"), noise=0.05).train(), cfg
-
-
-def columns_of(model, cfg, queries, frames) -> list[dict]:
-    """As a data collator of the library's makes them of a batch."""
-    shown = [[q.target, *q.hard_negatives[:NEGATIVES]] for q in queries]
-    asked = [query_input(q, frames, cfg) for q in queries]
-    return [
-        model.preprocess(asked, prompt=cfg.query_instruction, task="query"),
-        *(
-            model.preprocess(
-                [frame_input(f, frames) for f in column],
-                prompt=cfg.frame_instruction,
-                task="document",
-            )
-            for column in zip(*shown, strict=True)
-        ),
-    ]
-
-
-@pytest.fixture(scope="module")
-def library(trained, queries, frames) -> tuple[float, dict[str, torch.Tensor]]:
-    model, cfg = trained
-    loss = CachedMultiVectorMultipleNegativesRankingLoss(model, scale=SCALE, mini_batch_size=4)
-    return gradients(model, loss, columns_of(model, cfg, queries, frames))
-
-
-def gradients(model, loss, features) -> tuple[float, dict[str, torch.Tensor]]:
-    model.zero_grad()
-    found = loss(features, None)
-    found.backward()
-    trained = {n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None}
-    return found.item(), trained
-
-
-def ours(trained, queries, frames, store, distinct=True, shared=True, **settings):
-    model, cfg = trained
-    settings = {"mini_batch": 4, "weighing": Weighing(store), "scale": SCALE, **settings}
-    loss = MultiVectorRankingLoss(model, RetrieverInputs(model, frames, cfg, "fp32"), **settings)
-    return gradients(model, loss, [batch_of(queries, NEGATIVES, distinct, shared)])
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"distinct": False, "shared": False},
-        {"distinct": True, "shared": False},
-        {"mini_batch": 1},
-        {"mini_batch": 12, "ahead": 2},
-        {"mini_batch_tokens": 400},
-    ],
-    ids=str,
-)
-def test_gradients_are_the_librarys(
-    trained, queries, frames, micro_store, library, settings
-) -> None:
-    loss, found = ours(trained, queries, frames, micro_store, **settings)
-    assert loss == pytest.approx(library[0], rel=1e-5)
-    assert found.keys() == library[1].keys()
-    for name, gradient in library[1].items():
-        apart = (found[name] - gradient).norm() / gradient.norm().clamp(min=1e-9)
-        assert apart < 1e-4, (name, apart)
-
-
-@pytest.mark.parametrize("trained", ["whole", "pooled"], indirect=True)
-@pytest.mark.parametrize("columns", ["all", "last"])
-def test_the_loss_is_its_formula_over_what_anyone_gets(
-    trained, queries, frames, micro_store, columns
-) -> None:
-    """Also where queries and frames make several mini-batches of several lengths."""
-    model, cfg = trained
-    some = queries if columns == "all" else queries[-3:]
-    loss, _ = ours(trained, some, frames, micro_store, distinct=False)
-    batch = batch_of(some, NEGATIVES, False, True)
-    shown = [frame_input(f, frames) for row in batch.documents() for f in row]
-    asked = model.encode_query([query_input(q, frames, cfg) for q in batch.queries])
-    scores = maxsim(asked, model.encode_document(shown)) * SCALE
-    own = torch.arange(len(some)) * (1 + NEGATIVES)
-    assert loss == pytest.approx(cross_entropy(scores, own).item(), rel=1e-4)
-    model.train()
-
-
 @pytest.fixture(scope="module")
 def model(late_cfg, micro_store, tmp_path_factory) -> MultiVectorEncoder:
     return load(late_cfg, micro_store, tmp_path_factory.mktemp("base"))
 
 
-def test_scored_are_the_question_and_what_is_shown_alone(model, late_cfg, queries, frames) -> None:
-    """Of rows that are padded too, and where the question has a timestamp's and the instruction's
-    own words."""
+def test_only_the_question_and_the_pixels_are_scored(model, late_cfg, queries, frames) -> None:
+    """Also in padded rows, and if the question contains words of a timestamp and of the
+    instruction."""
     asked = replace(queries[0], question="<0.1 seconds> Retrieve images: user's query, 0.5 seconds")
     features = model.preprocess(
         [query_input(q, frames, late_cfg) for q in (asked, queries[-1])],
@@ -165,15 +65,15 @@ def test_scored_are_the_question_and_what_is_shown_alone(model, late_cfg, querie
     scored = find_scored_tokens(model).scored(ids, features["attention_mask"])
     video = model.tokenizer.convert_tokens_to_ids("<|video_pad|>")
     for query, row, kept in zip((asked, queries[-1]), ids, scored, strict=True):
-        assert (row[kept] == video).sum() == (row == video).sum() == 6 * FRAME
+        assert (row[kept] == video).sum() == (row == video).sum() == 6 * FRAME_TOKENS
         assert model.tokenizer.decode(row[kept & (row != video)]) == query.question
     shown = model.preprocess([frame_input(asked.target, frames)], prompt=late_cfg.frame_instruction)
     kept = find_scored_tokens(model).scored(shown["input_ids"], shown["attention_mask"])[0]
     image = model.tokenizer.convert_tokens_to_ids("<|image_pad|>")
-    assert shown["input_ids"][0][kept].tolist() == [image] * FRAME
+    assert shown["input_ids"][0][kept].tolist() == [image] * FRAME_TOKENS
 
 
-def test_an_input_that_shows_nothing_is_refused(model) -> None:
+def test_an_input_without_pixels_is_refused(model) -> None:
     with pytest.raises(ValueError, match="neither an image nor a clip"):
         model.encode_query(["Which frame?"])
 
@@ -181,7 +81,7 @@ def test_an_input_that_shows_nothing_is_refused(model) -> None:
 def test_vectors_are_the_scored_tokens_projected_and_normalised(
     model, late_cfg, queries, frames
 ) -> None:
-    """Beside longer queries as alone, and whatever the states of other tokens are."""
+    """In a batch as alone, and independent of the states of other tokens."""
     inputs = [query_input(q, frames, late_cfg) for q in (queries[0], queries[-1])]
     together = model.encode_query(inputs)
     assert len(together[0]) != len(together[1])
@@ -204,7 +104,7 @@ def test_vectors_are_the_scored_tokens_projected_and_normalised(
         torch.testing.assert_close(spoilt, vectors, atol=1e-5, rtol=0)
 
 
-def test_a_pooled_frame_keeps_one_of_so_many_vectors_and_a_query_all(
+def test_pooling_reduces_the_vectors_of_frames_but_not_of_queries(
     micro_store, late_cfg, queries, frames, tmp_path
 ) -> None:
     pooled = replace(late_cfg, late=LateConfig(width=24, pool=3))
@@ -216,8 +116,8 @@ def test_a_pooled_frame_keeps_one_of_so_many_vectors_and_a_query_all(
         counts.append(
             (len(frame), len(model.encode_query([query_input(queries[0], frames, cfg)])[0]))
         )
-    assert counts[0][0] == FRAME
-    assert counts[1] == (FRAME // 3, counts[0][1])
+    assert counts[0][0] == FRAME_TOKENS
+    assert counts[1] == (FRAME_TOKENS // 3, counts[0][1])
 
 
 def test_a_saved_retriever_encodes_the_same_without_this_project(
@@ -243,14 +143,14 @@ def vectors_by(model, inputs) -> list[torch.Tensor]:
     return [model.encode_query(inputs[:1])[0], model.encode_document(inputs[1:])[0]]
 
 
-def test_no_code_of_a_saved_folder_runs_here(micro_store, late_cfg, tmp_path) -> None:
+def test_code_in_a_saved_folder_is_not_executed(micro_store, late_cfg, tmp_path) -> None:
     model = load(late_cfg, micro_store, tmp_path / "base")
     model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
     (tmp_path / "saved" / "scored_tokens.py").write_text("raise RuntimeError('this ran')")
-    assert find_scored_tokens(load_trained(late_cfg, "fp32", tmp_path / "saved")).shown
+    assert find_scored_tokens(load_trained(late_cfg, "fp32", tmp_path / "saved")).media_ids
 
 
-def test_adapters_and_projection_are_read_back_over_4_bit_weights(
+def test_adapters_and_projection_are_loaded_over_4_bit_weights(
     micro_store, late_cfg, queries, frames, saved_base, tmp_path
 ) -> None:
     over = {"architecture": None, "model": saved_base, "quantization": "nf4"}
@@ -276,7 +176,7 @@ def test_the_projection_is_trained_in_fp32_over_a_bf16_base(
     assert {p.dtype for p in trained.values()} == {torch.float32}
     assert next(model[0].parameters()).dtype == torch.bfloat16
     (vectors,) = model.encode_document([frame_input(queries[0].target, frames)])
-    torch.testing.assert_close(vectors.norm(dim=1), torch.ones(FRAME))
+    torch.testing.assert_close(vectors.norm(dim=1), torch.ones(FRAME_TOKENS))
 
 
 @pytest.mark.parametrize("pool", [1, 2, 4])
@@ -289,21 +189,21 @@ def test_tokens_are_pooled_in_bf16_as_in_fp32(
     (exact,) = model.encode_document(shown)
     with torch.autocast("cpu", torch.bfloat16):
         (vectors,) = model.encode_document(shown)
-    assert vectors.shape == exact.shape == (FRAME // pool, 24)
+    assert vectors.shape == exact.shape == (FRAME_TOKENS // pool, 24)
     assert vectors.isfinite().all()
 
 
-def test_the_audit_shows_what_is_scored(model, late_cfg, queries, frames) -> None:
+def test_the_audit_marks_scored_tokens(model, late_cfg, queries, frames) -> None:
     told = audit_retriever(model, late_cfg, queries[0], frames)
     length = len(model.tokenizer(queries[0].question, add_special_tokens=False).input_ids)
-    assert f"{6 * FRAME + length} of them scored" in told
-    assert f"{FRAME} of them scored" in told
+    assert f"{6 * FRAME_TOKENS + length} of them scored" in told
+    assert f"{FRAME_TOKENS} of them scored" in told
     assert f">>>{queries[0].question}<<<<|im_end|>" in told
     assert told.count(">>><|video_pad|>...<<<") == 6
     assert ">>><|image_pad|>...<<<" in told
 
 
-def test_weights_of_widths_go_with_one_vector_alone(contrastive_settings, late_cfg) -> None:
+def test_width_weights_need_a_retriever_with_one_vector(contrastive_settings, late_cfg) -> None:
     weighed = replace(contrastive_settings.train, width_weights=[1.0, 1.0])
     settings = replace(contrastive_settings, train=weighed)
     assert not settings.check()
@@ -312,7 +212,7 @@ def test_weights_of_widths_go_with_one_vector_alone(contrastive_settings, late_c
 
 
 @pytest.mark.parametrize("retriever", ["tiny", "qwen3_vl_emb_8b"])
-def test_any_retriever_becomes_one_of_many_vectors(retriever) -> None:
+def test_the_overlay_turns_any_retriever_into_a_multi_vector_one(retriever) -> None:
     register("train.contrastive", ContrastiveCommand)
     one, many = (
         compose("train.contrastive", ContrastiveCommand, [f"retriever={retriever}", *overlay])
