@@ -13,7 +13,8 @@ from string import ascii_lowercase
 from conf.errors import UserError
 from conf.schema import TeacherConfig
 from data.records import LETTERS
-from teacher.numbers import WORDS, lexicon
+from teacher.numbers import lexicon
+from teacher.numbers.detection import WORDS
 from teacher.sections import SECTIONS
 from teacher.validation.validator import count_words
 

@@ -143,11 +143,11 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
             for rationale in new:
                 responses[rationale.item_id].append(rationale)
 
-        # Finished items are left out here, so that none occupies a slot of the requests in flight.
+        # Finished items are left out, so that none occupies a slot of the requests in flight.
         jobs = [
-            (item, made)
+            (item, attempts)
             for item in items
-            if (made := len(responses[item.item_id])) < cfg.attempts and not is_settled(item)
+            if (attempts := len(responses[item.item_id])) < cfg.attempts and not is_settled(item)
         ]
         progress, too_short = Progress(len(items), len(items) - len(jobs)), 0
         with progress.bar:

@@ -70,17 +70,11 @@ OUT_OF_VIEW = "out of view"
 class ObjectFacts:
     """One object at the cut and at the target.
 
-    Attributes:
-        object: Color, material and shape.
-        region: Cell of the 3x3 grid at the cut, or "out of view".
-        sight: Visibility at the cut: "shown", "hidden" (in view but covered) or "out of view".
-        speed: "stationary" or a speed word; None if the object is out of view at the cut.
-        heading: Compass word of the motion at the cut; None if stationary, or if a contact at the
-            cut leaves no frame of the motion after it.
-        target_region: Region at the target.
-        target_sight: Visibility at the target.
-        extent: Distance from cut to target; "unseen" if the object is out of view at both.
-        travel: Compass word of the way from cut to target; None if the object stays or is unseen.
+    `sight` and `target_sight` are "shown", "hidden" (in view but covered) or "out of view". `speed`
+    is "stationary" or a speed word; None if the object is out of view at the cut. `heading` is the
+    compass word of the motion at the cut; None if stationary or hit at the cut. `extent` describes
+    the displacement from cut to target, "unseen" if the object is out of view at both; `travel` is
+    its compass word, None if the object stays or is unseen.
     """
 
     object: str
@@ -153,17 +147,11 @@ class CandidateFacts:
 
 @dataclass(frozen=True)
 class Facts:
-    """A scene at the cut and at the target.
+    """A scene at the cut and at the target; `instant` and `moment` name the two in words.
 
-    Attributes:
-        instant: The cut in words.
-        moment: The target's moment in words.
-        objects: One entry per object.
-        entering: Objects that come into view between cut and target.
-        leaving: Objects that go out of view between cut and target.
-        courses: Pairs on a collision course at the cut.
-        contacts: Pairs that collide between cut and target, on a course or not.
-        close: Pairs that are very close at the target.
+    `entering` and `leaving` are objects that come into view or go out of it from cut to target.
+    `courses` are pairs on a collision course at the cut; `contacts` are pairs that collide between
+    cut and target, on a course or not; `close` are pairs that are very close at the target.
     """
 
     instant: str
@@ -322,6 +310,11 @@ def _cell(scene: Scene, point: np.ndarray) -> str:
     return REGIONS[row][column]
 
 
+def _position(scene: Scene, frame: int, index: int) -> np.ndarray:
+    """An object's center (x, y) in px of the square image."""
+    return scene.image_positions[frame, index] * IMAGE_SIZE / np.asarray(scene.image_size)
+
+
 def _sight(scene: Scene, frame: int, index: int) -> str:
     if not scene.in_view[frame, index]:
         return OUT_OF_VIEW
@@ -330,11 +323,10 @@ def _sight(scene: Scene, frame: int, index: int) -> str:
 
 
 def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFacts:
-    pixels = scene.image_positions[:, index] * IMAGE_SIZE / np.asarray(scene.image_size)
     sight, target_sight = _sight(scene, cut, index), _sight(scene, target, index)
     speed = _speed(scene, index, cut) if sight != OUT_OF_VIEW else None
     moving = speed not in (None, "stationary")
-    travelled = pixels[target] - pixels[cut]
+    travelled = _position(scene, target, index) - _position(scene, cut, index)
     extent = _extent(travelled) if {sight, target_sight} != {OUT_OF_VIEW} else "unseen"
     return ObjectFacts(
         object=scene.objects[index].phrase,
@@ -356,8 +348,7 @@ def object_heading(scene: Scene, index: int, since: int, frame: int) -> str | No
     `frame`."""
     if _speed(scene, index, frame) == "stationary":
         return None
-    pixels = scene.image_positions[:, index] * IMAGE_SIZE / np.asarray(scene.image_size)
-    return compass_direction(pixels[frame] - pixels[since])
+    return compass_direction(_position(scene, frame, index) - _position(scene, since, index))
 
 
 def _speed(scene: Scene, index: int, frame: int) -> str:
@@ -434,13 +425,10 @@ def _displacement(
     scene: Scene, target: int, i: int, other: Scene, frame: int, j: int
 ) -> tuple[Difference, float]:
     name = scene.objects[i].phrase
-    wanted = scene.image_positions[target, i] * IMAGE_SIZE / np.asarray(scene.image_size)
-    actual = other.image_positions[frame, j] * IMAGE_SIZE / np.asarray(other.image_size)
-    distance = float(np.hypot(*(actual - wanted)))
+    shift = _position(other, frame, j) - _position(scene, target, i)
+    distance = float(np.hypot(*shift))
     region = object_region(other, frame, j)
     if region != object_region(scene, target, i):
         return Difference(name, "region", region=region), distance
     extent = "clearly" if distance >= CLEARLY else "slightly"
-    return Difference(
-        name, "displaced", heading=compass_direction(actual - wanted), extent=extent
-    ), distance
+    return Difference(name, "displaced", heading=compass_direction(shift), extent=extent), distance

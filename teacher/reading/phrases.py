@@ -1,4 +1,4 @@
-"""The closed vocabulary that `claims` reads rationales with: phrases, their tags and values."""
+"""The closed vocabulary of the claim extraction: phrases, their tags and values."""
 
 from __future__ import annotations
 

@@ -32,26 +32,15 @@ OBJECT_NAME = re.compile(rf"\b(?:{'|'.join(COLORS)}) (?:{'|'.join(MATERIALS)}) \
 class Summary:
     """Figures of all responses of one teacher under one configuration.
 
-    Attributes:
-        items: Training items.
-        accepted: Items with an accepted rationale.
-        fallback: Accepted rationales that the built-in narrator wrote in the teacher's place.
-        set_aside: Items whose attempts were all rejected.
-        too_short: Items whose prefix is too short.
-        responses: The teacher's responses, by attempt.
-        accepted_responses: Those of them that were accepted, by attempt.
-        rejected: Rejected responses by kind of reason, the most frequent first.
-        examples: Items and details of some rejections, by kind of reason.
-        lengths: Words of each accepted rationale.
-        words: The most frequent words of accepted rationales, in lower case, with their counts.
-        distinct_words: Number of distinct words.
-        same_text: Accepted rationales that repeat the text of another one.
-        same_but_names: Accepted rationales that do so up to the objects' names.
-        claims: Supported, contradicted and unknown claims of all responses, by kind.
-        requests: Requests to servers.
-        prompt_tokens: Tokens of all prompts.
-        completion_tokens: Tokens of all responses.
-        hours: Time in which the servers were in use; times their GPUs, it gives GPU hours.
+    `accepted` counts items; `fallback`, those of them that the built-in narrator wrote in the
+    teacher's place; `set_aside`, items whose attempts were all rejected; `too_short`, items whose
+    prefix is too short. `responses` and `accepted_responses` are the teacher's, by attempt.
+    `rejected` counts responses by kind of reason, the most frequent first, and `examples` has items
+    and details of some. `lengths` are words of each accepted rationale and `words` the most frequent
+    ones. `same_text` counts accepted rationales that repeat another one's text, `same_but_names`
+    those that do so up to the objects' names. `claims` are the supported, contradicted and unknown
+    ones, by kind. `hours` is the time in which servers were in use; times their GPUs, it gives GPU
+    hours.
     """
 
     items: int
@@ -89,8 +78,8 @@ class Summary:
             ("prefix too short", self.too_short),
         ]
         attempts = [
-            (k + 1, made, accepted, f"{accepted / max(made, 1):.1%}")
-            for k, (made, accepted) in enumerate(
+            (k + 1, count, accepted, f"{accepted / max(count, 1):.1%}")
+            for k, (count, accepted) in enumerate(
                 zip(self.responses, self.accepted_responses, strict=True)
             )
         ]
@@ -182,7 +171,7 @@ def summarize(
     settled = {r.item_id for r in accepted}
     by_attempt = Counter(r.attempt for r in every if not r.fallback)
     accepted_by_attempt = Counter(r.attempt for r in every if r.accepted and not r.fallback)
-    made = range(max(by_attempt, default=-1) + 1)
+    attempted = range(max(by_attempt, default=-1) + 1)
     rejections = _collect_rejections(every)
     words = Counter(word for r in accepted for word in WORD.findall(r.text.lower()))
     gaps = np.diff(np.sort([r.finished for r in every if r.finished is not None]))
@@ -195,8 +184,8 @@ def summarize(
             for item in items
         ),
         too_short=too_short,
-        responses=tuple(by_attempt[k] for k in made),
-        accepted_responses=tuple(accepted_by_attempt[k] for k in made),
+        responses=tuple(by_attempt[k] for k in attempted),
+        accepted_responses=tuple(accepted_by_attempt[k] for k in attempted),
         rejected={kind: len(details) for kind, details in rejections.items()},
         examples={kind: details[:EXAMPLES] for kind, details in rejections.items()},
         lengths=tuple(len(WORD.findall(r.text)) for r in accepted),

@@ -40,22 +40,17 @@ class NoResponseError(Exception):
 
 
 class ServerState:
-    """A server of the pool and its condition.
-
-    Attributes:
-        problem: Why the server is out of use; None while it is in use.
-        available_at: Earliest time of the next request, on the clock of time.monotonic().
-        rate_limits: Rate-limited responses in a row.
-        checked_at: Time of the last health check.
-        recovery: The task that waits until the server is up again.
-    """
+    """A server of the pool and its condition."""
 
     def __init__(self, server: Server) -> None:
         self.server = server
         self.in_flight = 0
         self.problem: str | None = None
+        """Why the server is out of use; None while it is in use."""
         self.available_at = -math.inf
+        """Earliest time of the next request, on the clock of time.monotonic()."""
         self.rate_limits = 0
+        """Rate-limited responses in a row."""
         self.health_lock = asyncio.Lock()
         self.checked_at = -math.inf
         self.recovery: asyncio.Task[None] | None = None

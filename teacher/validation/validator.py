@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from conf.schema import TeacherConfig
 from data.records import LETTERS, SelectionItem
 from teacher.candidate_letters import find_letters
-from teacher.numbers import find_numbers
+from teacher.numbers.detection import find_numbers
 from teacher.predicates import Predicates
 from teacher.reading.grounding import Claim
 from teacher.sections import SECTIONS, split_sections, text_before_sections

@@ -108,8 +108,8 @@ def verdicts(section, sentence):
 
 @pytest.mark.parametrize(("truth", "section", "sentence"), CASES)
 def test_only_false_sentences_are_contradicted(truth, section, sentence):
-    found = contradicted(f"{SECTION[section]}: {sentence}", FACTS)
-    assert bool(found) == (truth == "false"), found
+    detected = contradicted(f"{SECTION[section]}: {sentence}", FACTS)
+    assert bool(detected) == (truth == "false"), detected
 
 
 @pytest.mark.parametrize(
@@ -179,11 +179,11 @@ def test_only_false_sentences_are_contradicted(truth, section, sentence):
     ],
 )
 def test_subject_and_polarity_of_claims(section, sentence, claims):
-    found = verdicts(section, sentence)
+    detected = verdicts(section, sentence)
     if claims is None:
-        assert "contradicted" not in found.values()
+        assert "contradicted" not in detected.values()
     else:
-        assert found == claims
+        assert detected == claims
 
 
 @pytest.mark.parametrize(
@@ -200,14 +200,16 @@ def test_subject_and_polarity_of_claims(section, sentence, claims):
     ],
 )
 def test_ambiguous_claims_are_not_contradicted(section, plain, ambiguous):
-    found = verdicts(section, plain.format(RED, BLUE))
-    assert "contradicted" in found.values()
+    detected = verdicts(section, plain.format(RED, BLUE))
+    assert "contradicted" in detected.values()
     assert "contradicted" not in verdicts(section, ambiguous.format(RED, BLUE)).values()
 
 
 def test_most_claims_of_true_sentences_are_supported():
-    found = [v for truth, s, text in CASES if truth == "true" for v in verdicts(s, text).values()]
-    assert found.count("supported") > 0.9 * len(found) > 200
+    detected = [
+        v for truth, s, text in CASES if truth == "true" for v in verdicts(s, text).values()
+    ]
+    assert detected.count("supported") > 0.9 * len(detected) > 200
 
 
 def test_spans_of_claims():
@@ -221,14 +223,14 @@ def test_spans_of_claims():
 @pytest.fixture(scope="module")
 def narrated(benchmark_store):
     """Training items of the benchmark with predicates and the narrator's rationales."""
-    found = []
+    detected = []
     for item in benchmark_store.selection("train"):
         scene = benchmark_store.scene(item.scene_id)
         predicates = extract_predicates(item, scene, benchmark_store.scene)
         if predicates is not None:
-            found.append((item, predicates, write_rationale(predicates, item, seed=1)))
-    assert len(found) > 30
-    return found
+            detected.append((item, predicates, write_rationale(predicates, item, seed=1)))
+    assert len(detected) > 30
+    return detected
 
 
 @pytest.mark.slow
@@ -241,11 +243,11 @@ def test_no_claim_of_the_narrator_is_contradicted(narrated):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_false_fact_is_contradicted(narrated, kind):
-    found = []
+    detected = []
     for item, predicates, _ in narrated:
         for false, _ in falsehoods(predicates, item, kind, Random(item.item_id), seed=1):
-            found.append(bool(contradicted(false, predicates)))
-    assert sum(found) >= 0.97 * len(found) > 20
+            detected.append(bool(contradicted(false, predicates)))
+    assert sum(detected) >= 0.97 * len(detected) > 20
 
 
 def test_no_true_claim_of_a_language_model_is_contradicted():
@@ -256,12 +258,12 @@ def test_no_true_claim_of_a_language_model_is_contradicted():
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", EDITS)
 def test_false_word_in_prose_is_contradicted(kind):
-    found = []
+    detected = []
     for record in PROSE:
         predicates = predicates_from(record["predicates"])
         edits = EDITS[kind](record["text"], predicates, Random(record["item_id"]))
-        found += [bool(contradicted(text, predicates)) for text, _ in edits]
-    assert sum(found) >= 0.97 * len(found) > 20
+        detected += [bool(contradicted(text, predicates)) for text, _ in edits]
+    assert sum(detected) >= 0.97 * len(detected) > 20
 
 
 @pytest.mark.slow

@@ -43,8 +43,8 @@ for line in sys.stdin:
     tokens = xgrammar.TokenizerInfo(vocabulary, stop_token_ids=[len(vocabulary) - 1])
     compiled = xgrammar.GrammarCompiler(tokens).compile_grammar(request["grammar"])
     accepted = [accepts(compiled, text) for text in request["texts"]]
-    made = [sample(compiled, vocabulary, seed) for seed in request["seeds"]]
-    print(json.dumps([accepted, made]), flush=True)
+    sampled = [sample(compiled, vocabulary, seed) for seed in request["seeds"]]
+    print(json.dumps([accepted, sampled]), flush=True)
 """
 DEFAULT = TeacherConfig(name="test")
 NUMBERS = (*lexicon.CARDINALS, *lexicon.ORDINALS, *lexicon.QUANTITIES, *lexicon.TIMES)
@@ -191,8 +191,8 @@ def test_random_texts_have_the_form_and_hardly_any_number(run_engine: RunEngine)
         predicates = extract_predicates(item, scene, lambda _, scene=scene: scene)
         if predicates is not None:
             break
-    made = run_engine(DEFAULT, [], samples=40)[1]
-    verdicts = [validate_rationale(text, predicates, item, DEFAULT) for text in made]
+    sampled = run_engine(DEFAULT, [], samples=40)[1]
+    verdicts = [validate_rationale(text, predicates, item, DEFAULT) for text in sampled]
     # Random claims are seldom true.
     reasons = [
         r for v in verdicts for r in v.reasons if not r.startswith(("wrong answer", "contradicts"))

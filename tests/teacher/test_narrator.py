@@ -9,7 +9,7 @@ import pytest
 
 from conf.schema import TeacherConfig
 from teacher.narrator import write_description, write_rationale
-from teacher.numbers import find_numbers
+from teacher.numbers.detection import find_numbers
 from teacher.predicates import extract_predicates
 from teacher.validation.validator import WORD, count_words, validate_rationale
 from tests.teacher import synthetic

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from teacher.narrator import write_description, write_rationale
-from teacher.numbers import find_numbers
+from teacher.numbers.detection import find_numbers
 from tests.teacher import synthetic
 from tests.teacher.adversarial_text import PIECES, repeat_piece
 from tests.teacher.test_predicates import cases

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from teacher.numbers import find_numbers
+from teacher.numbers.detection import find_numbers
 from teacher.predicates import (
     REGIONS,
     compass_direction,

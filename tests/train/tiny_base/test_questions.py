@@ -165,18 +165,18 @@ def test_headings_of_objects_at_visual_tokens(micro_store, kinds) -> None:
 def parse_places(response: str, phrase: str, end: str) -> list[tuple[str | None, str]]:
     """The place of an object in each candidate, None if missing, and the text after it."""
     each = rf"Candidate (\w) (?:lacks|shows) the {phrase}(?: (near the [\w-]+))?{end}"
-    found = list(re.finditer(each, response))
-    assert [one[1] for one in found] == list(LETTERS)
-    assert " ".join(one[0] for one in found) == response
-    return [(one[2], one[3] if len(one.groups()) > 2 else "") for one in found]
+    matches = list(re.finditer(each, response))
+    assert [one[1] for one in matches] == list(LETTERS)
+    assert " ".join(one[0] for one in matches) == response
+    return [(one[2], one[3] if len(one.groups()) > 2 else "") for one in matches]
 
 
 def predicted_place(text: str, phrase: str) -> str | None:
     """The place that the narrator predicts for an object."""
     prediction = text[text.index("Prediction: ") : text.index("Outcome: ")]
     will = rf"{phrase} (?:will be|should be|remains|stays)(?: hidden)? (near the [\w-]+)"
-    found = re.search(will, prediction)
-    return found and found[1]
+    matches = re.search(will, prediction)
+    return matches and matches[1]
 
 
 def test_only_one_candidate_fits_a_description(micro_store, kinds) -> None:
