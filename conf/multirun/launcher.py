@@ -57,10 +57,6 @@ class Job:
         return self.folder / "output.log"
 
 
-Ended = tuple[Job, int | None, float | None]
-"""A job that has ended, its exit status and its wall time (s); None for an unknown value."""
-
-
 class ProcessLauncher(Launcher):
     """Runs one job at a time on each visible GPU, or one job at a time without a GPU."""
 
@@ -95,32 +91,31 @@ class ProcessLauncher(Launcher):
             for old in read_jobs(sweep)[len(jobs) :]:
                 (sweep / str(old["job"]) / JOB_FILE).unlink()
         with closing(self.run([job for job in jobs if not self._is_finished(job)])) as ended:
-            for job, status, seconds in ended:
-                _record_end(job, status, seconds)
+            for job, succeeded in ended:
+                _record_end(job, succeeded)
         return [
             JobReturn(job.overrides, status=JobStatus.COMPLETED, _return_value=_metrics(job))
             for job in jobs
         ]
 
-    def run(self, jobs: list[Job]) -> Iterator[Ended]:
-        """Run jobs and yield each as it ends; closing the iterator ends those that still run."""
+    def run(self, jobs: list[Job]) -> Iterator[tuple[Job, bool]]:
+        """Run jobs, and yield each as it ends with whether it succeeded.
+
+        Closing the iterator ends the jobs that still run.
+        """
         waiting, free = jobs[::-1], visible_gpus() or [None]
-        running: dict[subprocess.Popen, tuple[Job, str | None, float]] = {}
+        running: dict[subprocess.Popen, tuple[Job, str | None]] = {}
         try:
             while waiting or running:
                 while waiting and free:
                     job, gpu = waiting.pop(), free.pop(0)
                     log.info("%s: started%s", job.title, f" on GPU {gpu}" if gpu else "")
-                    running[start_process(job.command, job.output, gpu)] = (
-                        job,
-                        gpu,
-                        time.monotonic(),
-                    )
+                    running[start_process(job.command, job.output, gpu)] = job, gpu
                 time.sleep(POLL)
                 for process in [process for process in running if process.poll() is not None]:
-                    job, gpu, started = running.pop(process)
+                    job, gpu = running.pop(process)
                     free.append(gpu)
-                    yield job, process.returncode, time.monotonic() - started
+                    yield job, process.returncode == 0
         finally:
             end_processes(list(running))
 
@@ -139,7 +134,7 @@ class ProcessLauncher(Launcher):
         if not (job.folder / "metrics.json").exists() or differences(job.folder, settings):
             return False
         log.info("%s: already finished, skipped", job.title)
-        _record(job, "done", None)
+        _record(job, "done")
         return True
 
 
@@ -180,18 +175,16 @@ def end_processes(processes: list[subprocess.Popen]) -> None:
             process.wait()
 
 
-def _record_end(job: Job, status: int | None, seconds: float | None) -> None:
+def _record_end(job: Job, succeeded: bool) -> None:
     """Record and log how a job ended."""
-    seconds = seconds and round(seconds, 1)
-    _record(job, "done" if status == 0 else "failed", seconds)
-    took = "" if seconds is None else f" after {seconds} s"
-    if status == 0:
+    _record(job, "done" if succeeded else "failed")
+    if succeeded:
         values = list(final_metrics(_metrics(job) or {}).items())[:3]
-        log.info("%s: done%s%s", job.title, took, "".join(f", {n} {v:.4g}" for n, v in values))
+        log.info("%s: done%s", job.title, "".join(f", {name} {v:.4g}" for name, v in values))
         return
     output = job.output.read_text(errors="replace") if job.output.exists() else ""
     lines = "".join(f"\n    {line}" for line in output.splitlines()[-5:])
-    log.error("%s: failed%s, last lines of %s:%s", job.title, took, job.output, lines)
+    log.error("%s: failed, last lines of %s:%s", job.title, job.output, lines)
 
 
 def _metrics(job: Job) -> dict[str, float] | None:
@@ -202,16 +195,10 @@ def _metrics(job: Job) -> dict[str, float] | None:
     return json.loads(path.read_text()) if path.exists() else {}
 
 
-def _record(job: Job, status: str, seconds: float | None) -> None:
-    path = job.folder / JOB_FILE
-    record = {"overrides": job.overrides, "status": status, "seconds": seconds}
-    if seconds is None and path.exists():
-        # The sweep was started again; the time of the job's own run is still known.
-        before = json.loads(path.read_text())
-        record["seconds"] = before["seconds"] if before["status"] == status else None
+def _record(job: Job, status: str) -> None:
     # A job that the cluster did not start has no folder.
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, record)
+    job.folder.mkdir(parents=True, exist_ok=True)
+    write_json(job.folder / JOB_FILE, {"overrides": job.overrides, "status": status})
 
 
 class TableCallback(Callback):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from conf.errors import UserError
-from conf.multirun.launcher import Ended, Job, ProcessLauncher, end_processes, start_process
+from conf.multirun.launcher import Job, ProcessLauncher, end_processes, start_process
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +32,7 @@ class SubmititLauncher(ProcessLauncher):
             if value is not None
         }
 
-    def run(self, jobs: list[Job]) -> Iterator[Ended]:
+    def run(self, jobs: list[Job]) -> Iterator[tuple[Job, bool]]:
         if not jobs:
             return
         handles = dict(zip(self._submit(jobs), jobs, strict=True))
@@ -43,7 +42,7 @@ class SubmititLauncher(ProcessLauncher):
             for handle, job in handles.items():
                 log.info("%s: submitted to %s as job %s", job.title, self.cluster, handle.job_id)
             for handle in as_completed(list(handles), poll_frequency=POLL):
-                yield handles.pop(handle), *_result(handle)
+                yield handles.pop(handle), _exit_status(handle) == 0
         finally:
             for handle in handles:
                 handle.cancel(check=False)
@@ -67,21 +66,20 @@ class SubmititLauncher(ProcessLauncher):
             raise UserError(f"{typed}: {error}", code="cluster-refused") from error
 
 
-def run_command(command: list[str], output: Path) -> tuple[int, float]:
-    """Run a job on its node of the cluster; returns its exit status and wall time (s)."""
-    started = time.monotonic()
+def run_command(command: list[str], output: Path) -> int:
+    """Run a job on its node of the cluster; returns its exit status."""
     process = start_process(command, output)
     try:
-        return process.wait(), time.monotonic() - started
+        return process.wait()
     finally:
         end_processes([process])
 
 
-def _result(handle: Any) -> tuple[int | None, float | None]:
+def _exit_status(handle: Any) -> int | None:
     from submitit.core.utils import UncompletedJobError
 
     try:
         return handle.result()
     except UncompletedJobError as error:
         log.error("%s", str(error).strip())
-        return None, None
+        return None

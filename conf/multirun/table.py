@@ -20,8 +20,7 @@ def read_jobs(folder: Path) -> list[dict[str, Any]]:
     """The jobs of a sweep that have ended, by number.
 
     Returns:
-        For each job its number (`job`), `overrides`, `status` (done or failed), wall time
-        (`seconds`, None if unknown) and `metrics`.
+        For each job its number (`job`), `overrides`, `status` (done or failed) and `metrics`.
     """
     jobs = []
     for path in folder.glob(f"[0-9]*/{JOB_FILE}"):
@@ -51,8 +50,10 @@ def write_sweep_table(folder: Path) -> str:
     metrics = sorted({name for job in jobs for name in job["metrics"]})
     settings = varying_overrides([job["overrides"] for job in jobs])
     rows = [
-        {"job": job["job"], **varying, **{name: job["metrics"].get(name) for name in metrics}}
-        | {"status": job["status"], "seconds": job["seconds"]}
+        {"job": job["job"]}
+        | varying
+        | {name: job["metrics"].get(name) for name in metrics}
+        | {"status": job["status"]}
         for job, varying in zip(jobs, settings, strict=True)
     ]
     table = pd.DataFrame(rows)
