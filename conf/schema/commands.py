@@ -261,32 +261,9 @@ class SelectCommand(CommandConfig):
 
 
 @dataclass
-class RetrieveCommand(CommandConfig):
-    benchmark: BenchmarkConfig = MISSING
-    retriever: RetrieverConfig = MISSING
-    train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
-    """The preset's training recipe, of which only the precision is used."""
-    model: str | None = None
-    """Run folder of train.contrastive or folder that train.export wrote, with its own retriever and
-    recipe; null measures the retriever's base."""
-    batch: int = 64
-    """Queries or frames per forward pass."""
-    index: str = "exact"
-    """exact compares each query with every frame; faiss uses an approximate index (extra `index`)
-    for databases of millions of frames, and reports its recall against exact search."""
-    probes: int = 16
-    """Lists of the approximate index that a query searches, of about sqrt(number of frames)."""
-    seed: int = 0
-    """Seed of the bootstrap and of the queries that compare an approximate index with exact
-    search."""
+class EmbeddingCommand(CommandConfig):
+    """Settings of the commands that measure a retriever."""
 
-    def check(self) -> list[str]:
-        problems = super().check() + check_minimum(self, "", {"batch": 1, "probes": 1})
-        return problems + check_options(self, "", {"index": INDEXES})
-
-
-@dataclass
-class SimilarityCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     retriever: RetrieverConfig = MISSING
     train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
@@ -295,18 +272,37 @@ class SimilarityCommand(CommandConfig):
     """Run folder of train.contrastive or folder that train.export wrote, with its own retriever and
     recipe; null measures the preset's released model."""
     batch: int = 64
-    """Prefixes or frames per forward pass."""
+    """Queries, prefixes or frames per forward pass."""
+    seed: int = 0
+    """Seed of every sample, including the bootstrap's."""
+
+    def check(self) -> list[str]:
+        return super().check() + check_minimum(self, "", {"batch": 1})
+
+
+@dataclass
+class RetrieveCommand(EmbeddingCommand):
+    index: str = "exact"
+    """exact compares each query with every frame; faiss uses an approximate index (extra `index`)
+    for databases of millions of frames, and reports its recall against exact search."""
+    probes: int = 16
+    """Lists of the approximate index that a query searches, of about sqrt(number of frames)."""
+
+    def check(self) -> list[str]:
+        problems = super().check() + check_minimum(self, "", {"probes": 1})
+        return problems + check_options(self, "", {"index": INDEXES})
+
+
+@dataclass
+class SimilarityCommand(EmbeddingCommand):
     limit: int | None = None
     """Maximum number of test items, spread evenly over the families; null uses all."""
-    seed: int = 0
-    """Seed of the items that `limit` samples and of the bootstrap."""
     suite: str | None = None
     """matched_anchor measures the pairs of items that differ only in the question's anchor; null
     measures the benchmark's standard items."""
 
     def check(self) -> list[str]:
-        problems = super().check() + check_minimum(self, "", {"batch": 1, "limit": 1})
-        return problems + check_suite(self)
+        return super().check() + check_minimum(self, "", {"limit": 1}) + check_suite(self)
 
 
 @dataclass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from omegaconf import MISSING
 
@@ -57,14 +58,18 @@ class LoraConfig:
 
 
 @dataclass
-class StudentConfig:
+class ModelConfig:
+    """Settings that students and retrievers share."""
+
+    GROUP: ClassVar[str]
+
     name: str = MISSING
-    """Name of the student in reports."""
+    """Name of the model in reports."""
     model: str | None = None
     """Folder of the base, or its name on the Hugging Face hub if it is in the local cache; null
     builds `architecture`."""
     revision: str | None = None
-    """Branch, tag or commit of the model on the hub."""
+    """Branch, tag or commit of `model` on the hub."""
     trust_remote_code: bool = False
     """Allow the model's own Python code to run."""
     architecture: ArchitectureConfig | None = None
@@ -76,7 +81,39 @@ class StudentConfig:
     frames: int = 12
     """Evenly spaced frames per prefix."""
     max_length: int = 3072
-    """Maximum length of a sample (tokens); longer samples are refused, never truncated."""
+    """Maximum length of an input with its response (tokens); longer ones are refused, never
+    truncated."""
+
+    def check(self) -> list[str]:
+        group, lora = self.GROUP, self.lora
+        least = {"image_size": 32, "frames": 2, "max_length": 1}
+        problems = check_minimum(self, f"{group}.", least)
+        problems += check_options(self, f"{group}.", {"quantization": ("nf4", "none")})
+        problems += check_minimum(lora, f"{group}.lora.", {"rank": 0})
+        problems += check_fraction(lora, f"{group}.lora.", ["dropout"])
+        if (self.model is None) == (self.architecture is None):
+            problems.append(
+                f"{group}.model and {group}.architecture: set exactly one, a model to load or the "
+                "sizes of a model to build"
+            )
+        if self.quantization == "nf4" and lora.rank == 0:
+            problems.append(
+                f"{group}.quantization=nf4 with {group}.lora.rank=0: 4-bit weights cannot be "
+                f"trained directly; set {group}.quantization=none or raise {group}.lora.rank"
+            )
+        if self.architecture is not None and (self.quantization == "nf4" or lora.rank > 0):
+            problems.append(
+                f"{group}.quantization={self.quantization} and {group}.lora.rank={lora.rank} "
+                f"with {group}.architecture: a model with random weights is trained as a whole; set "
+                f"{group}.quantization=none and {group}.lora.rank=0"
+            )
+        return problems
+
+
+@dataclass
+class StudentConfig(ModelConfig):
+    GROUP: ClassVar[str] = "student"
+
     max_new_tokens: int = 512
     """Maximum length of a response (tokens), including its thinking."""
     thinking: bool = False
@@ -90,7 +127,7 @@ class StudentConfig:
 
     def check(self) -> list[str]:
         least = {"max_new_tokens": 1, "temperature": 0, "top_k": 0}
-        problems = _check_model("student", self) + check_minimum(self, "student.", least)
+        problems = super().check() + check_minimum(self, "student.", least)
         return problems + check_share(self, "student.", ["top_p"])
 
 
@@ -111,34 +148,17 @@ class LateConfig:
 
 
 @dataclass
-class RetrieverConfig:
-    name: str = MISSING
-    """Name of the retriever in reports."""
+class RetrieverConfig(ModelConfig):
+    GROUP: ClassVar[str] = "retriever"
+
     encoder: str = "qwen3_vl"
     """Kind of model. qwen3_vl and vlm2vec embed a prefix and its question jointly; dual (CLIP,
     SigLIP 2) and languagebind embed them separately and add the embeddings. Only qwen3_vl can be
     trained; the others are measured as released."""
-    model: str | None = None
-    """Folder of the base, or its name on the Hugging Face hub if it is in the local cache; null
-    builds `architecture`."""
     image_model: str | None = None
     """Model that embeds frames, for languagebind only; `model` embeds prefixes and questions."""
-    revision: str | None = None
-    """Branch, tag or commit of `model` on the hub."""
     image_revision: str | None = None
     """Branch, tag or commit of `image_model` on the hub."""
-    trust_remote_code: bool = False
-    """Allow the model's own Python code to run."""
-    architecture: ArchitectureConfig | None = None
-    quantization: str = "nf4"
-    """Quantisation of the base's weights: nf4 (4 bits) or none."""
-    lora: LoraConfig = field(default_factory=LoraConfig)
-    image_size: int = 336
-    """Width and height (px) to which frames are resized before the model's image processor."""
-    frames: int = 12
-    """Evenly spaced frames per prefix."""
-    max_length: int = 3072
-    """Maximum length of an input (tokens); longer inputs are refused, never truncated."""
     widths: list[int] = field(default_factory=lambda: [4096, 2048, 1024, 512, 256, 128, 64])
     """Matryoshka widths in descending order; unused with `late`, which has its own width."""
     late: LateConfig | None = None
@@ -149,7 +169,7 @@ class RetrieverConfig:
     """System prompt of a frame."""
 
     def check(self) -> list[str]:
-        problems = _check_model("retriever", self)
+        problems = super().check()
         descending = sorted(set(self.widths), reverse=True) == list(self.widths)
         if not self.widths or not descending or self.widths[-1] < 1:
             problems.append(
@@ -181,27 +201,3 @@ class RetrieverConfig:
                 "languagebind needs an image_model, and no other encoder takes one"
             )
         return problems
-
-
-def _check_model(group: str, cfg: StudentConfig | RetrieverConfig) -> list[str]:
-    problems = check_minimum(cfg, f"{group}.", {"image_size": 32, "frames": 2, "max_length": 1})
-    problems += check_options(cfg, f"{group}.", {"quantization": ("nf4", "none")})
-    problems += check_minimum(cfg.lora, f"{group}.lora.", {"rank": 0})
-    problems += check_fraction(cfg.lora, f"{group}.lora.", ["dropout"])
-    if (cfg.model is None) == (cfg.architecture is None):
-        problems.append(
-            f"{group}.model and {group}.architecture: set exactly one, a model to load or sizes to "
-            "build"
-        )
-    if cfg.quantization == "nf4" and cfg.lora.rank == 0:
-        problems.append(
-            f"{group}.quantization=nf4 with {group}.lora.rank=0: 4-bit weights cannot be trained "
-            f"directly; set {group}.quantization=none or raise {group}.lora.rank"
-        )
-    if cfg.architecture is not None and (cfg.quantization == "nf4" or cfg.lora.rank > 0):
-        problems.append(
-            f"{group}.quantization={cfg.quantization} and {group}.lora.rank={cfg.lora.rank} with "
-            f"{group}.architecture: a model with random weights is trained as a whole; set "
-            f"{group}.quantization=none and {group}.lora.rank=0"
-        )
-    return problems
