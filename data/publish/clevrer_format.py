@@ -36,7 +36,7 @@ def export_clevrer(store: Store, folder: Path, workers: Workers) -> int:
         The number of scenes of the release.
 
     Raises:
-        UserError: CLEVRER's layout has no place for so many scenes, or for such scenes.
+        UserError: CLEVRER's layout cannot hold this number of scenes, or one of the scenes.
     """
     indices = {
         name: first + k
@@ -82,7 +82,7 @@ def write_clevrer(
         The paths of the annotation and of the video.
 
     Raises:
-        UserError: CLEVRER's layout has no such index, or no place for such a scene.
+        UserError: CLEVRER's layout has no such index, or cannot hold the scene.
     """
     if not 0 <= index < FIRST_TEST:
         raise UserError(

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FLOOR_ACROSS, FLOOR_DOWN = (-3.6, 3.6), (-4.4, 2.8)
-"""Extent of the drawn floor in simulator units; the camera stands further down."""
+"""Extent of the drawn floor in simulator units; the camera is below."""
 MARKERS = {"cube": "s", "sphere": "o", "cylinder": "H"}
 LABEL_OFFSETS = ((8, 5), (8, -15), (-24, 5), (-24, -15))
 """Offsets in points of collision labels, so that labels at one place do not overlap."""

@@ -98,7 +98,7 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
 
 
 def _find_landings(example: MoviExample, is_object: np.ndarray) -> tuple[Landing, ...]:
-    """Each object's first contact with the floor. All objects start in the air; one that touches
+    """Each object's first contact with the floor. All objects start in the air; an object on
     the floor in the first frame does not land."""
     on_floor = (
         (is_object.sum(axis=1) == 1)

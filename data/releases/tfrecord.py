@@ -52,7 +52,7 @@ Feature = list[bytes] | np.ndarray
 def record_offsets(path: Path) -> list[int]:
     """Return the byte at which each record begins.
 
-    A damaged record, or one that is cut off, is the last: the records after it cannot be located.
+    A damaged or incomplete record is the last: the records after it cannot be located.
     """
     size, start, offsets = path.stat().st_size, 0, []
     with open(path, "rb") as file:

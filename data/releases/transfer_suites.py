@@ -92,7 +92,7 @@ def cross_scene_candidates(
 ) -> Iterator[Candidate]:
     """Yield the first target of other scenes of the scenario, those with most shared objects
     first."""
-    # Scenes are loaded one by one until there are enough: a scenario has few of all scenes.
+    # Scenes are loaded lazily, because few of them are of the scenario.
     scenes = (picker.scene_of(str(name)) for name in rng.permutation(picker.scene_ids))
     similar = (s for s in scenes if s.scene_id != scene.scene_id and s.scenario == scene.scenario)
     targets = ((s, timings[0].target) for s in similar if (timings := cell.timings(s)))

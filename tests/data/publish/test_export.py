@@ -79,9 +79,9 @@ def test_images_are_the_frames_that_their_row_names(micro_store, loaded) -> None
         return rows.select(range(0, rows.num_rows, 5))
 
     for row in some("selection"):
-        shown = sample_prefix_frames(row["prefix_start"], row["prefix_stop"], 12)
-        assert row["prefix_frames"] == shown
-        for image, frame in zip(row["prefix_images"], shown, strict=True):
+        frames_of_prefix = sample_prefix_frames(row["prefix_start"], row["prefix_stop"], 12)
+        assert row["prefix_frames"] == frames_of_prefix
+        for image, frame in zip(row["prefix_images"], frames_of_prefix, strict=True):
             same(image, row["scene_id"], frame)
         for image, candidate in zip(row["candidate_images"], row["candidates"], strict=True):
             same(image, candidate["scene_id"], candidate["frame"])

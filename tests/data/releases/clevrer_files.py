@@ -1,4 +1,4 @@
-"""Small files in exactly the layout of CLEVRER's release."""
+"""Writes small files in the layout of CLEVRER's release."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.data.releases.pictures import picture
 
 
 def clevrer_annotation(index: int = 0, frames: int = 128) -> dict[str, Any]:
-    """A cube that stands at the origin and a ball that rolls along y and out of view."""
+    """A cube at rest at the origin, and a sphere that rolls along y and out of view."""
     return {
         "scene_index": index,
         "video_filename": f"video_{index:05d}.mp4",

@@ -1,4 +1,4 @@
-"""Small files in exactly the two layouts of MoVi-A's release."""
+"""Writes small files in the two formats of MoVi-A's release."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def write_movi_folder(folder: Path, example: dict) -> Path:
 
 
 def movi_features(example: dict) -> dict[str, Any]:
-    """The example as TensorFlow Datasets flattens it: names to bytes, floats or integers."""
+    """Return the example's features as TensorFlow Datasets flattens them, by name."""
     contacts = example["contacts"]
     shapes, sizes, materials, colors = zip(*example["looks"], strict=True)
     arrays = ("positions", "quaternions", "velocities", "angular_velocities", "image_positions")

@@ -1,4 +1,4 @@
-"""Small files in exactly the layout of Physion's raw trials."""
+"""Writes small files in the layout of Physion's raw trials."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from PIL import Image
 from tests.data.releases.pictures import picture, png
 
 IDS = (16_777_217, 3, 16_777_216)
-"""Object ids, in an order of their own, two of them the same as single floats."""
+"""Unsorted object ids, two of which are equal as float32."""
 COLORS = np.array([[200, 10, 30], [20, 220, 90], [1, 2, 3]], np.uint8)
 
 
@@ -42,7 +42,7 @@ PROJECTION = [[1.5, 0, 0, 0], [0, 2, 0, 0], [0, 0, -1.002, -0.2], [0, 0, -1, 0]]
 def write_physion(
     path: Path, trial: dict[str, Any], states: bool = True, suffix: str = "", first: int = 0
 ) -> Path:
-    """A trial; `suffix` and `first` as later versions have them, without `states` as early ones."""
+    """Write a trial; later versions have `suffix` and `first`, and early ones have no `states`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
         static = file.create_group("static")
@@ -73,7 +73,7 @@ def _write_moment(moment: h5py.Group, trial: dict, k: int, states: bool, suffix:
     collisions = moment.create_group("collisions")
     collisions["object_ids"] = np.array(trial["pairs"][k], np.int32).reshape(-1, 2)
     collisions["relative_velocities"] = np.zeros((len(trial["pairs"][k]), 3), np.float32)
-    # One point more than there are pairs: points of all collisions are joined.
+    # One point more than pairs: the points of all collisions are joined.
     collisions["contacts"] = np.zeros((len(trial["pairs"][k]) + 1, 2, 3), np.float32)
     if states:
         listed = np.array(trial["states"][k], "S5")

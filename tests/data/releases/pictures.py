@@ -1,4 +1,4 @@
-"""Images that tell which frame they are."""
+"""Images whose brightness encodes the frame index."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from PIL import Image
 
 
 def picture(frame: int, size: tuple[int, int] = (48, 32)) -> Image.Image:
-    """An image that tells its frame by how bright it is."""
+    """Return an image whose brightness encodes the frame index."""
     return Image.new("RGB", size, (frame + 60,) * 3)
 
 

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def movi(tmp_path_factory) -> Path:
-    """Twelve scenes, one of them broken; two objects touch at a frame of its own in each."""
+    """Twelve scenes, one of them damaged; two objects touch at a different frame in each."""
     folder = tmp_path_factory.mktemp("releases") / "movi_a"
     for k in range(12):
         example = movi_example([(12.0 + k % 5, 0, 1, 1.0, 0.0)])
@@ -60,8 +60,8 @@ def test_a_release_becomes_a_suite_with_its_own_frames(movi, tmp_path, caplog) -
     assert store.selection("train") == store.retrieval() == store.database() == []
     frames = FrameReader(store)
     for candidate in items[0].candidates:
-        shown = np.asarray(picture(candidate.frame, (256, 256)))
-        np.testing.assert_array_equal(frames.array(candidate.scene_id, candidate.frame), shown)
+        expected = np.asarray(picture(candidate.frame, (256, 256)))
+        np.testing.assert_array_equal(frames.array(candidate.scene_id, candidate.frame), expected)
 
 
 def test_an_invalid_record_stops_a_strict_build(movi, tmp_path) -> None:
@@ -98,8 +98,8 @@ def test_clevrers_scenes_have_the_items_of_dynapix(tmp_path) -> None:
     for k in range(8):
         annotation = clevrer_annotation(k)
         for moment in annotation["motion_trajectory"]:
-            for shown in moment["objects"]:
-                shown["location"][0] -= 0.2 * k
+            for state in moment["objects"]:
+                state["location"][0] -= 0.2 * k
         write_clevrer_scene(tmp_path / "release", annotation, k)
     few = Quota(train=2, test=1)
     cfg = BenchmarkConfig(
@@ -141,6 +141,6 @@ def test_an_exported_benchmark_is_read_as_a_release_with_the_same_items(tmp_path
         places = [s.image_positions[scene.in_view] for s in (back, scene)]
         np.testing.assert_allclose(*places, atol=1e-2)
         np.testing.assert_array_equal(back.in_view, scene.in_view)
-        shown = FrameCache.of(theirs).render(other, [60])[60].astype(float)
-        drawn = FrameCache.of(ours).render(name, [60])[60].astype(float)
-        assert np.abs(shown - drawn).mean() < 3
+        exported = FrameCache.of(theirs).render(other, [60])[60].astype(float)
+        rendered = FrameCache.of(ours).render(name, [60])[60].astype(float)
+        assert np.abs(exported - rendered).mean() < 3

@@ -51,9 +51,9 @@ def test_angles_are_rotations_about_fixed_axes_x_first(tmp_path: Path) -> None:
 def test_images_are_the_requested_frames(tmp_path: Path) -> None:
     path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
     scene = clevrer.read_scene(path, tmp_path, "test")
-    shown = clevrer.load_images(scene, tmp_path, [100, 5, 127])
-    assert sorted(shown) == [5, 100, 127]
-    for frame, image in shown.items():
+    images = clevrer.load_images(scene, tmp_path, [100, 5, 127])
+    assert sorted(images) == [5, 100, 127]
+    for frame, image in images.items():
         assert np.asarray(image).mean() == pytest.approx(frame + 60, abs=1.5)
     assert clevrer.load_images(scene, tmp_path, []) == {}
 
@@ -140,8 +140,8 @@ def test_a_folder_without_scenes_is_refused(tmp_path: Path) -> None:
 
 def test_scenes_are_listed_in_order_and_once(tmp_path: Path) -> None:
     for index in (1200, 3, 10):
-        write_clevrer_scene(tmp_path / "here", clevrer_annotation(index), index, 1)
-    names = [path.stem for path in clevrer.list_scenes(tmp_path / "here")]
+        write_clevrer_scene(tmp_path / "original", clevrer_annotation(index), index, 1)
+    names = [path.stem for path in clevrer.list_scenes(tmp_path / "original")]
     assert names == ["annotation_00003", "annotation_00010", "annotation_01200"]
     write_clevrer_scene(tmp_path / "copy", clevrer_annotation(3), 3, 1)
     with raises_user_error("duplicate-scene", contains="clevrer-00003"):
@@ -151,8 +151,8 @@ def test_scenes_are_listed_in_order_and_once(tmp_path: Path) -> None:
 def test_an_exported_scene_is_read_back(tmp_path: Path) -> None:
     scene = simulate_scene(0, 0, "train", BenchmarkConfig(name="export"))
     assert not scene.in_view.all()
-    drawn = {f: get_renderer("bullet", 192, 128).render(scene, f) for f in range(scene.frames)}
-    annotation, video = write_clevrer(scene, drawn, tmp_path, 10_042)
+    images = {f: get_renderer("bullet", 192, 128).render(scene, f) for f in range(scene.frames)}
+    annotation, video = write_clevrer(scene, images, tmp_path, 10_042)
     block = "validation/{0}_10000-11000/{0}_10042"
     assert annotation == tmp_path / f"annotation_{block.format('annotation')}.json"
     assert video == tmp_path / f"video_{block.format('video')}.mp4"
@@ -166,18 +166,18 @@ def test_an_exported_scene_is_read_back(tmp_path: Path) -> None:
         Rotation.from_quat(s.quaternions.reshape(-1, 4).astype(float)) for s in (scene, again)
     )
     assert (turns.inv() * turned).magnitude().max() < 1e-5
-    shown = clevrer.load_images(again, tmp_path, range(128))
-    for frame, image in drawn.items():
-        error = np.square(np.asarray(image, float) - np.asarray(shown[frame], float)).mean()
+    decoded = clevrer.load_images(again, tmp_path, range(128))
+    for frame, image in images.items():
+        error = np.square(np.asarray(image, float) - np.asarray(decoded[frame], float)).mean()
         assert 10 * np.log10(255**2 / error) > 35
 
 
 def test_scenes_that_clevrer_cannot_hold_are_not_exported(tmp_path: Path) -> None:
     path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
     scene = clevrer.read_scene(path, tmp_path, "test")
-    drawn = clevrer.load_images(scene, tmp_path, range(128))
+    images = clevrer.load_images(scene, tmp_path, range(128))
     with raises_user_error("too-many-scenes", contains="15000"):
-        write_clevrer(scene, drawn, tmp_path / "new", 15_000)
+        write_clevrer(scene, images, tmp_path / "new", 15_000)
     with raises_user_error("invalid-scene", contains="127"):
-        write_clevrer(scene, {f: drawn[f] for f in range(127)}, tmp_path / "new", 0)
+        write_clevrer(scene, {f: images[f] for f in range(127)}, tmp_path / "new", 0)
     assert not (tmp_path / "new").exists()

@@ -65,11 +65,11 @@ def test_rotations_agree_with_angular_velocities(tmp_path: Path) -> None:
     scene = read(tmp_path, trial)
     ours = Rotation.from_quat(scene.quaternions[:, 1].astype(float))
     corner = np.array([0.1, 0.5, -0.3])
-    there = turns.apply(corner)[:, [0, 2, 1]]
-    np.testing.assert_allclose(ours.apply(corner[[0, 2, 1]]), there, atol=1e-5)
-    moved = np.gradient(there, 1 / 30, axis=0)[1:-1]
-    expected = np.cross(scene.angular_velocities[1:-1, 1], there[1:-1])
-    np.testing.assert_allclose(moved, expected, atol=1e-3)
+    expected = turns.apply(corner)[:, [0, 2, 1]]
+    np.testing.assert_allclose(ours.apply(corner[[0, 2, 1]]), expected, atol=1e-5)
+    moved = np.gradient(expected, 1 / 30, axis=0)[1:-1]
+    velocity = np.cross(scene.angular_velocities[1:-1, 1], expected[1:-1])
+    np.testing.assert_allclose(moved, velocity, atol=1e-3)
 
 
 def test_centres_are_projected_by_the_recorded_camera(tmp_path: Path) -> None:

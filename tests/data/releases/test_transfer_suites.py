@@ -1,4 +1,4 @@
-"""Laws of the transfer suites' items: where prefix, target and the wrong frames lie."""
+"""Laws of the transfer suites' items: frames of the prefix, the target and the distractors."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ SCENARIOS = ("Collide", "Drop", "Roll")
 
 
 def scene_of_suite(suite: str, k: int, frames: int, fps: float) -> Scene:
-    """Two objects, one of which rests and is then pushed by the other at a frame of its own. Looks
-    are shared by every second scene. Some are pushed too early for a prefix."""
+    """Two objects; the second rests until the first hits it at a random frame, in some scenes too
+    early for a prefix. Every second scene has the same appearances."""
     rng = np.random.default_rng(k)
     hit = int(rng.integers(6, 20) if suite.endswith("movi_a") else rng.integers(11, frames - 20))
     t = np.arange(frames)
@@ -86,7 +86,8 @@ CELLS = [
 
 
 def cells(*words: str) -> pytest.MarkDecorator:
-    """Runs a test for every cell of a suite or family; `suite` and `items` are the cell's."""
+    """Parametrize a test by the cells of a suite or family, with their fixtures `suite` and
+    `items`."""
     chosen = [c for c in CELLS if set(words) <= set(c)]
     return pytest.mark.parametrize("cell", chosen, ids="/".join)
 
