@@ -104,8 +104,8 @@ class ModelConfig:
         if self.architecture is not None and (self.quantization == "nf4" or lora.rank > 0):
             problems.append(
                 f"{group}.quantization={self.quantization} and {group}.lora.rank={lora.rank} "
-                f"with {group}.architecture: a model with random weights is trained as a whole; set "
-                f"{group}.quantization=none and {group}.lora.rank=0"
+                f"with {group}.architecture: a model with random weights is trained as a whole; "
+                f"set {group}.quantization=none and {group}.lora.rank=0"
             )
         return problems
 
