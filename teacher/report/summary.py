@@ -36,7 +36,7 @@ class Summary:
     teacher's place; `set_aside`, items whose attempts were all rejected; `too_short`, items whose
     prefix is too short. `responses` and `accepted_responses` are the teacher's, by attempt.
     `rejected` counts responses by kind of reason, the most frequent first, and `examples` has items
-    and details of some. `lengths` are words of each accepted rationale and `words` the most frequent
+    and details of some. `lengths` are words of each accepted rationale, `words` the most frequent
     ones. `same_text` counts accepted rationales that repeat another one's text, `same_but_names`
     those that do so up to the objects' names. `claims` are the supported, contradicted and unknown
     ones, by kind. `hours` is the time in which servers were in use; times their GPUs, it gives GPU

@@ -34,65 +34,46 @@ HERE = Path(__file__).parent
 SECTION = {"S": SECTIONS[0], "M": SECTIONS[1], "P": SECTIONS[2], "C": SECTIONS[3], "O": SECTIONS[4]}
 RED, BLUE, GREEN = "red metal cube", "blue rubber sphere", "green metal sphere"
 GRAY, PURPLE, CYAN = "gray rubber cylinder", "purple metal cylinder", "cyan rubber cube"
-LEFT, CENTER, RIGHT, BOTTOM = (
-    "near the left",
-    "near the center",
-    "near the right",
-    "near the bottom",
-)
+LEFT, CENTER, RIGHT = "near the left", "near the center", "near the right"
 TOP_LEFT, TOP_RIGHT = "near the top-left", "near the top-right"
-BOTTOM_LEFT = "near the bottom-left"
+BOTTOM, BOTTOM_LEFT = "near the bottom", "near the bottom-left"
 ACROSS, SHIFTS, SHOWN = "moves across", "shifts slightly", "shown"
+HIT = Meeting((RED, BLUE), "imminent")
+A = (
+    Difference(RED, "region", region=LEFT),
+    Difference(BLUE, "displaced", heading="west", extent="clearly"),
+)
+C = (Difference(RED, "missing"), Difference("yellow rubber cube", "extra"))
+D = (
+    Difference(GREEN, "displaced", heading="north", extent="slightly"),
+    Difference(CYAN, "extra"),
+)
 FACTS = Predicates(
     instant="just before the contact",
     moment="at the target moment",
     objects=(
         ObjectFacts(RED, LEFT, SHOWN, "quickly", "east", CENTER, SHOWN, ACROSS, "east"),
         ObjectFacts(BLUE, CENTER, SHOWN, "stationary", None, RIGHT, SHOWN, SHIFTS, "southeast"),
-        ObjectFacts(
-            GREEN, TOP_RIGHT, SHOWN, "slowly", "southwest", TOP_RIGHT, SHOWN, SHIFTS, "southwest"
-        ),
+        ObjectFacts(GREEN, TOP_RIGHT, SHOWN, "slowly", "southwest",
+                    TOP_RIGHT, SHOWN, SHIFTS, "southwest"),
         ObjectFacts(GRAY, BOTTOM, SHOWN, "stationary", None, BOTTOM, SHOWN, "stays", None),
-        ObjectFacts(
-            PURPLE, OUT_OF_VIEW, OUT_OF_VIEW, None, None, BOTTOM_LEFT, SHOWN, ACROSS, "north"
-        ),
-        ObjectFacts(
-            CYAN, TOP_LEFT, SHOWN, "steadily", "west", OUT_OF_VIEW, OUT_OF_VIEW, ACROSS, "west"
-        ),
+        ObjectFacts(PURPLE, OUT_OF_VIEW, OUT_OF_VIEW, None, None,
+                    BOTTOM_LEFT, SHOWN, ACROSS, "north"),
+        ObjectFacts(CYAN, TOP_LEFT, SHOWN, "steadily", "west",
+                    OUT_OF_VIEW, OUT_OF_VIEW, ACROSS, "west"),
     ),
     entering=(PURPLE,),
     leaving=(CYAN,),
-    courses=(Meeting((RED, BLUE), "imminent"), Meeting((GREEN, BLUE), None)),
-    contacts=(Meeting((RED, BLUE), "imminent"),),
+    courses=(HIT, Meeting((GREEN, BLUE), None)),
+    contacts=(HIT,),
     close=(Closeness((RED, BLUE), CENTER),),
     candidates=(
-        CandidateFacts(
-            "A",
-            False,
-            False,
-            (
-                Difference(RED, "region", region=LEFT),
-                Difference(BLUE, "displaced", heading="west", extent="clearly"),
-            ),
-        ),
+        CandidateFacts("A", False, False, A),
         CandidateFacts("B", True, False, ()),
-        CandidateFacts(
-            "C",
-            False,
-            True,
-            (Difference(RED, "missing"), Difference("yellow rubber cube", "extra")),
-        ),
-        CandidateFacts(
-            "D",
-            False,
-            False,
-            (
-                Difference(GREEN, "displaced", heading="north", extent="slightly"),
-                Difference(CYAN, "extra"),
-            ),
-        ),
+        CandidateFacts("C", False, True, C),
+        CandidateFacts("D", False, False, D),
     ),
-)
+)  # fmt: skip
 CASES = [line.split(" ", 2) for line in (HERE / "claims.txt").read_text().splitlines()]
 PROSE = [json.loads(line) for line in (HERE / "prose.jsonl").read_text().splitlines()]
 
