@@ -1,4 +1,4 @@
-"""Shared by every room's tests: one small benchmark, really simulated and rendered, built once."""
+"""Shared fixtures: a small benchmark that is simulated, rendered and built once a session."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from data.tracks.selection import event, time, window
 
 
 def micro_config(**changes: object) -> BenchmarkConfig:
-    """Ten scenes at the tiny preset's frame size, two items a cell."""
+    """A config with ten scenes at the tiny preset's frame size, and a few items per cell."""
     few = Quota(train=2, test=1)
     settings = {
         "name": "micro",
@@ -53,14 +53,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--benchmark",
         type=Path,
-        help="a built benchmark, such as store/tiny, that the laws of test_tracks.py and "
-        "test_controls.py are held against in place of the small one",
+        help="a built benchmark, such as store/tiny, for the tests of built benchmarks, instead of "
+        "the small one",
     )
 
 
 @pytest.fixture(scope="session")
 def benchmark_store(request: pytest.FixtureRequest) -> Store:
-    """The benchmark that the laws of built benchmarks are held against."""
+    """The benchmark of the tests of built benchmarks."""
     folder = request.config.getoption("--benchmark")
     return open_store(folder) if folder else request.getfixturevalue("micro_store")
 

@@ -48,17 +48,15 @@ def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> tuple[list[
     rng = np.random.default_rng([seed, index])
     while True:
         looks = sample_looks(rng, limits)
-        count = len(looks)
         goal = int(rng.choice(list(COLLISIONS), p=list(COLLISIONS.values())))
-        most = limits.max_collisions
         bodies = [_entering(looks[0], rng)]
         motion = shared_world().simulate(bodies)
         for look in looks[1:]:
-            extended = _add_body(bodies, motion, look, rng, min(goal, most), most)
+            extended = _add_body(bodies, motion, look, rng, goal, limits.max_collisions)
             if extended is None:
                 break
             bodies, motion = extended
-        if len(bodies) == count and motion.collisions:
+        if len(bodies) == len(looks) and motion.collisions:
             return bodies, motion
 
 
@@ -75,7 +73,8 @@ def _entering(look: SceneObject, rng: np.random.Generator) -> Body:
     start = np.array([-0.7, 0.0]) + rng.uniform(2.6, 4.0) * unit_vector(bearing)
     goal = np.array([-0.7, 0.0]) + rng.uniform(-1, 1, 2)
     direction = (goal - start) / np.linalg.norm(goal - start)
-    return _moving(look, start, direction, rng.uniform(*SPEED), rng)
+    speed = rng.uniform(*SPEED)
+    return Body(look, as_pair(start), rng.uniform(0, 2 * np.pi), as_pair(speed * direction))
 
 
 def _add_body(
@@ -91,16 +90,15 @@ def _add_body(
     Returns:
         All bodies and their motion, or None where no attempt succeeded.
     """
-    is_colliding = len(motion.collisions) < goal
+    is_colliding = len(motion.collisions) < min(goal, most)
     for _ in range(PLACEMENTS):
         body = (_colliding if is_colliding else _resting)(look, motion, rng)
         if body is None:
             continue
         trial = [*bodies, body]
         # A colliding body seldom stays clear of the others, so they are simulated together.
-        result = (None if is_colliding else _combine(motion, body)) or shared_world().simulate(
-            trial
-        )
+        combined = None if is_colliding else _combine(motion, body)
+        result = combined or shared_world().simulate(trial)
         has_collided = any(len(bodies) in c.objects for c in result.collisions)
         if (
             not result.touching_at_start
@@ -143,7 +141,8 @@ def _colliding(look: SceneObject, motion: Motion, rng: np.random.Generator) -> B
         return None
     travel = speed * seconds - FRICTION_DECELERATION * seconds**2 / 2
     direction = unit_vector(rng.uniform(0, 2 * np.pi))
-    return _moving(look, place - travel * direction, direction, speed, rng)
+    start = place - travel * direction
+    return Body(look, as_pair(start), rng.uniform(0, 2 * np.pi), as_pair(speed * direction))
 
 
 def _resting(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
@@ -153,16 +152,6 @@ def _resting(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Bod
     if not (is_clear and is_on_screen(place)):
         return None
     return Body(look, as_pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
-
-
-def _moving(
-    look: SceneObject,
-    start: np.ndarray,
-    direction: np.ndarray,
-    speed: float,
-    rng: np.random.Generator,
-) -> Body:
-    return Body(look, as_pair(start), rng.uniform(0, 2 * np.pi), as_pair(speed * direction))
 
 
 def is_on_screen(
@@ -216,25 +205,23 @@ def record_scene(
     """Record a motion as a scene, with projection and visibility by a camera."""
     objects = tuple(body.look for body in bodies)
     in_view, fraction = compute_visibility(objects, motion.positions, motion.quaternions, camera)
-    image_positions, _ = camera.project(motion.positions)
-    scene = Scene(
+    floats = {
+        "positions": motion.positions,
+        "quaternions": motion.quaternions,
+        "velocities": motion.velocities,
+        "angular_velocities": motion.angular_velocities,
+        "image_positions": camera.project(motion.positions)[0],
+        "visible_fraction": fraction,
+    }
+    return Scene(
         scene_id=name,
         split=split,
         objects=objects,
         collisions=motion.collisions,
-        positions=motion.positions,
-        quaternions=motion.quaternions,
-        velocities=motion.velocities,
-        angular_velocities=motion.angular_velocities,
-        image_positions=image_positions,
         in_view=in_view,
-        visible_fraction=fraction,
         image_size=(camera.width, camera.height),
         fps=physics.fps,
         landings=motion.landings,
         scenario=scenario,
+        **{key: array.astype(np.float32) for key, array in floats.items()},
     )
-    return replace(scene, **{k: getattr(scene, k).astype(np.float32) for k in _FLOATS})
-
-
-_FLOATS = tuple(name for name in Scene.ARRAYS if name != "in_view")
