@@ -42,9 +42,9 @@ def _setting_lines(settings: Any, group: str = "") -> Iterator[str]:
         if is_dataclass(value):
             yield from _setting_lines(value, f"{group}{field.name}.")
             continue
-        shown = textwrap.shorten(json.dumps(value, default=asdict), 60, placeholder=" ...")
+        text = textwrap.shorten(json.dumps(value, default=asdict), 60, placeholder=" ...")
         first, *rest = textwrap.wrap(_description(type(settings), field.name), width) or [""]
-        yield f"{f'  {group}{field.name} = {shown}':<{COLUMN - 2}}  {first}".rstrip()
+        yield f"{f'  {group}{field.name} = {text}':<{COLUMN - 2}}  {first}".rstrip()
         yield from (f"{'':<{COLUMN}}{line}" for line in rest)
 
 

@@ -141,10 +141,10 @@ def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[s
         ) from error
 
 
-def other_settings_error(what: str, differences: Sequence[str]) -> SettingsError:
-    """Error for a folder whose content (`what`) was created with other settings."""
+def other_settings_error(subject: str, differences: Sequence[str]) -> SettingsError:
+    """Error for a folder whose content (`subject`) was created with other settings."""
     return SettingsError(
-        f"{what} with other settings: {'; '.join(differences[:3])}. Choose another folder with "
+        f"{subject} with other settings: {'; '.join(differences[:3])}. Choose another folder with "
         "run=NAME, or delete this one.",
         code="other-settings",
     )

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hydra.core.config_loader import ConfigLoader
 from hydra.core.utils import JobReturn, JobStatus, configure_log, setup_globals
 from hydra.experimental.callback import Callback
 from hydra.plugins.launcher import Launcher
@@ -88,8 +87,8 @@ class ProcessLauncher(Launcher):
             log.info("sweep %s: %d jobs", sweep, len(jobs))
         if initial_job_idx == 0:
             # Jobs of an earlier, longer sweep are not part of this sweep's table.
-            for old in read_jobs(sweep)[len(jobs) :]:
-                (sweep / str(old["job"]) / JOB_FILE).unlink()
+            for number in [old["job"] for old in read_jobs(sweep) if old["job"] >= len(jobs)]:
+                (sweep / str(number) / JOB_FILE).unlink()
         with closing(self.run([job for job in jobs if not self._is_finished(job)])) as ended:
             for job, succeeded in ended:
                 _record_end(job, succeeded)
@@ -130,19 +129,16 @@ class ProcessLauncher(Launcher):
         return Job(Path(hydra.sweep.dir) / str(number), f"#{number} {title}", overrides, command)
 
     def _is_finished(self, job: Job) -> bool:
-        settings = job_settings(self.loader, self.config, job.overrides)
-        if not (job.folder / "metrics.json").exists() or differences(job.folder, settings):
+        """Whether the job has run to its end before, with the settings of this sweep."""
+        if not (job.folder / "metrics.json").exists():
+            return False
+        cfg = self.loader.load_sweep_config(self.config, job.overrides)
+        own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+        if differences(job.folder, OmegaConf.to_container(own, resolve=True)):
             return False
         log.info("%s: already finished, skipped", job.title)
         _record(job, "done")
         return True
-
-
-def job_settings(loader: ConfigLoader, config: DictConfig, overrides: list[str]) -> Any:
-    """The composed and resolved settings of one job of a sweep."""
-    cfg = loader.load_sweep_config(config, overrides)
-    own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
-    return OmegaConf.to_container(own, resolve=True)
 
 
 def start_process(command: list[str], output: Path, gpu: str | None = None) -> subprocess.Popen:

@@ -99,6 +99,10 @@ def test_sweep_survives_a_failed_job_and_resumes(folder):
     assert "#1 x=1 end=bug: started" in again.stderr
     assert json.loads((runs / "0/run.json").read_text())["earlier_starts"] == []
 
+    shorter = toy(folder, "-m", "x=1", "end=well", "run=s")
+    assert shorter.returncode == 0
+    assert [row["job"] for row in rows(runs)] == ["0"]
+
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("env", "concurrent"), [(NO_GPU, 1), (TWO_GPUS, 2)])

@@ -50,10 +50,10 @@ def main(cfg: ToyCommand, run: Run) -> dict[str, float]:
 
 def _meet(run: Run) -> None:
     """Wait for another job of the sweep that runs at the same time, in vain if none does."""
-    (run.folder / "here").touch()
-    until = time.monotonic() + 60
-    while len(list(run.folder.parent.glob("*/here"))) < 2:
-        if time.monotonic() > until:
+    (run.folder / "ready").touch()
+    deadline = time.monotonic() + 60
+    while len(list(run.folder.parent.glob("*/ready"))) < 2:
+        if time.monotonic() > deadline:
             raise RuntimeError("alone")
         time.sleep(0.05)
 
