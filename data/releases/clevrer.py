@@ -12,7 +12,6 @@ convention of Bullet's getEulerFromQuaternion and of Blender's rotation mode XYZ
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,6 +27,7 @@ from data.releases.validation import (
     check_unique_scenes,
     finite_array,
     get_field,
+    load_json,
     scene_id,
 )
 from data.world.camera import Camera
@@ -69,7 +69,7 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     Raises:
         RecordError: The annotation or its video does not have the layout of CLEVRER's release.
     """
-    record = _load_annotation(path)
+    record = load_json(path)
     if "collisions" in record:
         raise RecordError(
             f"{path} has the key 'collisions' instead of CLEVRER's 'collision': the file is from "
@@ -101,16 +101,6 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     )
     check_frames(scene, folder)
     return scene
-
-
-def _load_annotation(path: Path) -> dict[str, Any]:
-    try:
-        record = json.loads(path.read_bytes())
-    except ValueError as error:
-        raise RecordError(f"{path} is cut off or not JSON: {error}", "damaged-file") from error
-    if not isinstance(record, dict):
-        raise RecordError(f"{path} contains a {type(record).__name__}, expected an object")
-    return record
 
 
 def _read_objects(record: dict[str, Any], path: Path) -> dict[int, SceneObject]:

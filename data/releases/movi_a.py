@@ -18,7 +18,7 @@ from PIL import Image
 
 from data.records import Landing, Scene
 from data.releases.movi_a_formats import FPS, FRAMES, MoviExample, read_folder, read_record
-from data.releases.tfrecord import read_example, record_offsets
+from data.releases.tfrecord import feature_values, read_example, record_offsets
 from data.releases.validation import RecordError, check_unique_scenes, decode_image, scene_id
 from data.world.events import first_contacts
 
@@ -154,4 +154,5 @@ def _read_video(footage: Path) -> list[bytes]:
     """The encoded frames of a record, by a shard's path and the record's number."""
     if not footage.parent.is_file():
         raise RecordError(f"{footage} is missing", "missing-file")
-    return list(read_example(footage.parent, int(footage.name), ("video",)).get("video", []))
+    features = read_example(footage.parent, int(footage.name))
+    return list(feature_values(features["video"])) if "video" in features else []

@@ -8,16 +8,14 @@ certainly at or after the contact.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from data.records import SceneObject
-from data.releases.tfrecord import read_example
-from data.releases.validation import RecordError, check_choice, finite_array, get_field
+from data.releases.tfrecord import feature_values, read_example
+from data.releases.validation import RecordError, check_choice, finite_array, get_field, load_json
 
 FRAMES, FPS = 24, 12
 APPEARANCE = {
@@ -72,51 +70,42 @@ def read_folder(folder: Path) -> MoviExample:
     Raises:
         RecordError: A file is missing, damaged or does not have the published layout.
     """
-    metadata, events = (_load_json(folder / name) for name in ("metadata.json", "events.json"))
     where, where_events = str(folder / "metadata.json"), str(folder / "events.json")
+    metadata, events = load_json(where), load_json(where_events)
     video = get_field(metadata, "metadata", dict, where)
-    _check_clock(
-        *(get_field(video, key, int, where) for key in ("num_frames", "frame_rate")), where
-    )
-    size = finite_array(get_field(video, "resolution", list, where), (2,), f"{where}: resolution")
+    frames, rate = (get_field(video, key, int, where) for key in ("num_frames", "frame_rate"))
+    _check_clock(frames, rate, where)
     instances = get_field(metadata, "instances", list, where)
     contacts = get_field(events, "collisions", list, where_events)
-
-    def attributes(instance: dict[str, Any]) -> SceneObject:
-        return SceneObject(
-            **{
-                name: check_choice(get_field(instance, key, str, where), APPEARANCE[name], where)
-                for name, key in KUBRIC_KEYS.items()
-            }
-        )
-
-    def array(key: str, *tail: int) -> np.ndarray:
-        values = [get_field(instance, key, list, where) for instance in instances]
-        return finite_array(values, (len(instances), FRAMES, *tail), f"{where}: {key}")
+    objects = []
+    for instance in instances:
+        look = {name: get_field(instance, key, str, where) for name, key in KUBRIC_KEYS.items()}
+        for name, word in look.items():
+            check_choice(word, APPEARANCE[name], f"{where}: {name}")
+        objects.append(SceneObject(**look))
 
     def contact_array(key: str, *tail: int) -> np.ndarray:
         kind = list if tail else float
         values = [get_field(contact, key, kind, where_events) for contact in contacts]
         return finite_array(values, (len(contacts), *tail), f"{where_events}: {key}")
 
+    size = finite_array(get_field(video, "resolution", list, where), (2,), f"{where}: resolution")
     return MoviExample(
-        objects=tuple(map(attributes, instances)),
+        objects=tuple(objects),
         image_size=(int(size[0]), int(size[1])),
-        arrays={key: array(key, *tail) for key, tail in ARRAYS.items()},
+        arrays={
+            key: finite_array(
+                [get_field(instance, key, list, where) for instance in instances],
+                (len(instances), FRAMES, *tail),
+                f"{where}: {key}",
+            )
+            for key, tail in ARRAYS.items()
+        },
         pairs=contact_array("instances", 2).astype(int),
         frames=np.maximum(np.ceil(contact_array("frame")).astype(int) - 1, 0),
         contact_positions=contact_array("position", 3),
         normals=contact_array("contact_normal", 3),
     )
-
-
-def _load_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_bytes())
-    except FileNotFoundError as error:
-        raise RecordError(f"{path} is missing", "missing-file") from error
-    except ValueError as error:
-        raise RecordError(f"{path} is cut off or not JSON: {error}", "damaged-file") from error
 
 
 def _check_clock(frames: int, rate: int, where: str) -> None:
@@ -130,41 +119,34 @@ def read_record(path: Path) -> MoviExample:
     Raises:
         RecordError: The record is damaged or does not have the published layout.
     """
-    video = [f"metadata/{key}" for key in ("num_frames", "num_instances", "width", "height")]
-    labels = {f"instances/{name}_label": words for name, words in APPEARANCE.items()}
-    contacts = ("instances", "frame", "position", "contact_normal")
-    names = [
-        *video,
-        *labels,
-        *(f"instances/{key}" for key in ARRAYS),
-        *(f"events/collisions/{key}" for key in contacts),
-    ]
-    features = read_example(path.parent, int(path.name), names)
+    features = read_example(path.parent, int(path.name))
     where = f"{path.parent}: record {int(path.name)}"
-    if missing := [name for name in names if name not in features]:
-        raise RecordError(f"{where} has no feature {missing[0]!r}, which MoVi-A's release has")
+
+    def values(name: str) -> list[bytes] | np.ndarray:
+        return feature_values(get_field(features, name, object, where))
 
     def array(name: str, *shape: int) -> np.ndarray:
-        if len(features[name]) != np.prod(shape, dtype=int):
-            raise RecordError(
-                f"{where} has {len(features[name])} values of {name!r}, expected "
-                f"{np.prod(shape, dtype=int)}"
-            )
-        return finite_array(np.reshape(features[name], shape), shape, f"{where}: {name}")
+        flat, size = values(name), int(np.prod(shape))
+        if len(flat) != size:
+            raise RecordError(f"{where} has {len(flat)} values of {name!r}, expected {size}")
+        return finite_array(np.reshape(flat, shape), shape, f"{where}: {name}")
 
-    frames, count, width, height = (int(array(name)) for name in video)
+    frames, count, width, height = (
+        int(array(f"metadata/{key}")) for key in ("num_frames", "num_instances", "width", "height")
+    )
     _check_clock(frames, FPS, where)
-    rows = len(features["events/collisions/frame"])
-    columns = []
-    for name, words in labels.items():
-        numbers = array(name, count).astype(int)
+    looks = {}
+    for name, words in APPEARANCE.items():
+        numbers = array(f"instances/{name}_label", count).astype(int)
         if not ((numbers >= 0) & (numbers < len(words))).all():
-            raise RecordError(f"{where}: {name} is {numbers.max()}, expected 0 to {len(words) - 1}")
-        columns.append([words[n] for n in numbers])
+            raise RecordError(
+                f"{where}: {name}_label has {numbers.max()}, expected 0 to {len(words) - 1}"
+            )
+        looks[name] = [words[n] for n in numbers]
+    rows = len(values("events/collisions/frame"))
     return MoviExample(
         objects=tuple(
-            SceneObject(**dict(zip(APPEARANCE, words, strict=True)))
-            for words in zip(*columns, strict=True)
+            SceneObject(**{name: words[k] for name, words in looks.items()}) for k in range(count)
         ),
         image_size=(width, height),
         arrays={k: array(f"instances/{k}", count, FRAMES, *tail) for k, tail in ARRAYS.items()},

@@ -11,7 +11,6 @@ The checksum of the data is not verified: in Python that takes longer than every
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -45,9 +44,6 @@ message_type { name: "Example"
 """
 """tf.train.Example as a protocol buffer descriptor."""
 
-Feature = list[bytes] | np.ndarray
-"""A list of bytes, or a float32 or int64 array (length,)."""
-
 
 def record_offsets(path: Path) -> list[int]:
     """Return the byte at which each record begins.
@@ -66,8 +62,8 @@ def record_offsets(path: Path) -> list[int]:
     return offsets
 
 
-def read_example(path: Path, number: int, names: Collection[str]) -> dict[str, Feature]:
-    """Return the features of record `number` that are among `names`.
+def read_example(path: Path, number: int) -> dict[str, Any]:
+    """Return the features of record `number` by name, for `feature_values`.
 
     Raises:
         RecordError: The record does not exist, is cut off or is damaged.
@@ -90,7 +86,7 @@ def read_example(path: Path, number: int, names: Collection[str]) -> dict[str, F
         example = _example_class().FromString(data)
     except DecodeError as error:
         raise RecordError(f"{where} is not a tf.train.Example: {error}", "damaged-file") from error
-    return {e.key: _values(e.value) for e in example.features.feature if e.key in names}
+    return {entry.key: entry.value for entry in example.features.feature}
 
 
 @cache
@@ -103,7 +99,8 @@ def _example_class() -> type:
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("dynapix.Example"))
 
 
-def _values(feature: Any) -> Feature:
+def feature_values(feature: Any) -> list[bytes] | np.ndarray:
+    """Return a feature as a list of bytes, or as a float32 or int64 array (length,)."""
     if feature.HasField("bytes_list"):
         return list(feature.bytes_list.value)
     if feature.HasField("float_list"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -55,6 +56,23 @@ def check_unique_scenes(
                 code="duplicate-scene",
             )
     return list(paths)
+
+
+def load_json(path: str | Path) -> dict[str, Any]:
+    """Return the object in a JSON file.
+
+    Raises:
+        RecordError: The file is missing, damaged or contains something else.
+    """
+    try:
+        record = json.loads(Path(path).read_bytes())
+    except FileNotFoundError as error:
+        raise RecordError(f"{path} is missing", "missing-file") from error
+    except ValueError as error:
+        raise RecordError(f"{path} is cut off or not JSON: {error}", "damaged-file") from error
+    if not isinstance(record, dict):
+        raise RecordError(f"{path} contains a {type(record).__name__}, expected an object")
+    return record
 
 
 def get_field(record: Any, key: str, kind: type, where: str) -> Any:
