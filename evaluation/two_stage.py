@@ -57,7 +57,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     precision = resolve_precision(frozen.train.precision)
     matcher = next(embedders(matched_by, frozen.retriever, precision, store, run.folder))
     student = trained.student
-    sample_of = partial(text_sample, FrameReader(store, student.image_size), student)
+    sample_of = partial(text_sample, FrameReader(store, student.image_size), student.frames)
     model = open_generator(cfg, folder, trained)
     name = model.name
     log.info("asking %s", name)

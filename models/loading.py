@@ -1,4 +1,4 @@
-"""Load a student, its base, 4-bit weights and adapters, and write what was trained."""
+"""Load a student with its base, 4-bit weights and adapters, and save what was trained."""
 
 from __future__ import annotations
 
@@ -25,19 +25,20 @@ from conf.errors import UserError
 from conf.schema import LoraConfig, StudentConfig
 from models.attention import choose_attention
 from models.checks import check_adapters, check_processor, check_tower
+from models.compat import keep_differentiable
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
 
 UNQUANTIZED = ["model.visual", "visual", "lm_head"]
-"""Modules that keep their precision. Matching is anchored at the name's start, so the tower is
-named both as it stands in the generative model and in the bare one."""
+"""Modules that are not quantised. Names match from their start: the tower has the first in a
+generative model, the second in a bare one."""
 DTYPES = {"bf16": torch.bfloat16, "fp32": torch.float32}
 UNREADABLE = (OSError, ValueError, KeyError, TypeError, SafetensorError)
-"""What the libraries raise at files that are missing, cut or of another kind."""
+"""Errors of the libraries for files that are missing, cut off or of another kind."""
 
 Corpus = Callable[[], Iterable[str]]
 
-# A model's shards load in moments, and peft asks transformers by a name that is about to go.
+# Loading a model's shards takes moments, and peft uses a name that transformers deprecates.
 transformers_logging.disable_progress_bar()
 warnings.filterwarnings("ignore", "`is_gradient_checkpointing`", FutureWarning)
 
@@ -45,13 +46,14 @@ warnings.filterwarnings("ignore", "`is_gradient_checkpointing`", FutureWarning)
 def load_base(
     cfg: StudentConfig, precision: str, corpus: Corpus
 ) -> tuple[PreTrainedModel, ProcessorMixin]:
-    """The base that a preset names, or builds from a seed, with its processor.
+    """Load the base that a preset names, or build it from a seed, with its processor.
 
-    `corpus` gives the texts that a built model's tokenizer is trained on.
+    Args:
+        corpus: Returns the texts that a built model's tokenizer is trained on.
 
     Raises:
-        UserError: the model is neither a folder here nor in the hub's cache, and cannot be fetched;
-            it has no vision tower, or a processor of another model.
+        UserError: the model is neither a local folder nor in the hub's cache and cannot be
+            downloaded, it has no vision tower, or its processor belongs to another model.
     """
     if cfg.architecture is not None:
         processor = build_processor(corpus(), cfg.architecture.vocabulary, cfg.image_size)
@@ -61,7 +63,7 @@ def load_base(
         return model, processor
     check_reachable("student", cfg.model)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
-    # Weights that are trained stay fp32 and are computed in lower precision by autocast.
+    # Weights that are trained are fp32; autocast computes in lower precision.
     whole = cfg.quantization == "none" and cfg.lora.rank == 0
     dtype = torch.float32 if whole else DTYPES[precision]
     quantization = nf4_config(dtype) if cfg.quantization == "nf4" else None
@@ -86,7 +88,7 @@ def load_base(
 
 
 def nf4_config(compute: torch.dtype) -> BitsAndBytesConfig:
-    """4-bit NF4 for the language tower; vision tower and head keep their precision."""
+    """Return 4-bit NF4 for the language tower; vision tower and head keep their precision."""
     return BitsAndBytesConfig(
         load_in_4bit=True,
         bnb_4bit_quant_type="nf4",
@@ -95,58 +97,18 @@ def nf4_config(compute: torch.dtype) -> BitsAndBytesConfig:
     )
 
 
-def check_reachable(group: str, model: str, key: str = "model") -> None:
-    """Ask once whether a model can be had, before libraries try again and again for minutes.
-
-    Raises:
-        UserError: it is no folder here, not in the hub's cache, and cannot be fetched.
-    """
-    from huggingface_hub import model_info, try_to_load_from_cache
-
-    if Path(model).is_dir():
-        return
-    try:
-        # Adapters have no settings of a whole model beside them.
-        files = ("config.json", "adapter_config.json")
-        if not any(isinstance(try_to_load_from_cache(model, file), str) for file in files):
-            model_info(model, timeout=10)
-    except Exception as error:
-        # The hub's client raises errors of whichever HTTP library it has; all mean the same here.
-        raise load_error(group, model, error, key) from error
-
-
-def load_error(group: str, model: str, error: Exception, key: str = "model") -> UserError:
-    """What to tell a user whose model did not load."""
-    first = next(iter(str(error).strip().splitlines()), type(error).__name__)
-    if Path(model).is_dir():
-        return UserError(f"{group}.{key}={model} cannot be loaded from that folder: {first}")
-    if Path(model).is_absolute() or model.startswith("."):
-        return UserError(f"{group}.{key}={model}: there is no such folder; give the one it is in")
-    return UserError(
-        f"{group}.{key}={model} is not on this machine and cannot be fetched: there is no "
-        f"folder of that name, and the hub's cache does not hold it. Point at a local copy with "
-        f"{group}.{key}=FOLDER (config.json, *.safetensors, tokenizer and processor files), or "
-        f"fetch it where there is a network with: hf download {model}"
-    )
-
-
-def damaged_error(
-    folder: Path, error: Exception, mend: str = "delete the run's folder and train again"
-) -> UserError:
-    """What to tell a user whose trained model cannot be read back."""
-    first = next(iter(str(error).strip().splitlines()), type(error).__name__)
-    return UserError(f"{folder} is damaged and cannot be read ({first}): {mend}")
-
-
 def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
-    """Keep frames of image_size x image_size px at the nearest size on the tower's grid, in an
-    image and in a video of up to `frames` alike. By default a video is shrunk to a budget that an
-    image does not have, and one frame comes in two sizes."""
+    """Resize frames of image_size x image_size px to the nearest size on the tower's grid, in
+    images and in videos of up to `frames` alike.
+
+    By default a video is shrunk to a pixel budget that images do not have, and one frame gets two
+    sizes.
+    """
     step = processor.image_processor.patch_size * processor.image_processor.merge_size
     edge = round(image_size / step) * step
     smallest = step * step
     processor.image_processor.size = {"shortest_edge": smallest, "longest_edge": edge * edge}
-    # Twice the pixels there are: frames of a shorter or odd video fall under no budget either.
+    # Twice the pixels of the frames: the budget then shrinks no video with an odd number of them.
     processor.video_processor.size = {
         "shortest_edge": smallest,
         "longest_edge": 2 * frames * edge * edge,
@@ -155,12 +117,24 @@ def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
     processor.video_processor.cap_pixels_per_frame = False
 
 
+def load_student(
+    cfg: StudentConfig, precision: str, corpus: Corpus
+) -> tuple[nn.Module, ProcessorMixin]:
+    """Load a student to train: its base, with adapters if the preset has them."""
+    base, processor = load_base(cfg, precision, corpus)
+    # Each tower has its own setting.
+    base.config.use_cache = base.config.get_text_config().use_cache = False
+    keep_differentiable(base)
+    return (add_adapters(base, cfg.lora) if cfg.lora.rank else base), processor
+
+
 def add_adapters(model: PreTrainedModel, lora: LoraConfig) -> nn.Module:
-    """Freeze the base and add LoRA to the language tower's projections. Adapters are fp32 even
-    over a bf16 base: updates of this size vanish in bf16's steps.
+    """Freeze the base and add LoRA to the projections of its language tower.
+
+    Adapters are fp32 even over a bf16 base: updates of their size vanish in bf16's rounding.
 
     Raises:
-        UserError: the pattern is none, or matches no module that can be adapted.
+        UserError: the pattern is invalid or matches no module that can be adapted.
     """
     import peft
 
@@ -178,54 +152,24 @@ def add_adapters(model: PreTrainedModel, lora: LoraConfig) -> nn.Module:
         raise no_targets_error("student", lora) from error
 
 
-def no_targets_error(group: str, lora: LoraConfig) -> UserError:
-    """What to tell a user whose pattern matches nothing that can be adapted."""
-    return UserError(
-        f"{group}.lora.targets={lora.targets} adapts nothing in this model: give a pattern that "
-        "matches whole names of linear layers, such as "
-        "model.language_model.layers.0.self_attn.q_proj"
-    )
-
-
-def load_student(
-    cfg: StudentConfig, precision: str, corpus: Corpus
-) -> tuple[nn.Module, ProcessorMixin]:
-    """A student ready to train: its base, with adapters where the preset has them."""
-    base, processor = load_base(cfg, precision, corpus)
-    # Each tower has a setting of its own.
-    base.config.use_cache = base.config.get_text_config().use_cache = False
-    keep_differentiable(base)
-    return (add_adapters(base, cfg.lora) if cfg.lora.rank else base), processor
-
-
-def keep_differentiable(model: nn.Module) -> None:
-    """Keep bitsandbytes from repacking 4-bit weights on a CPU with AVX-512 BF16. It does so at the
-    first evaluation, and what is packed passes no gradient on: every later step would silently
-    train on a part of it."""
-    for module in model.modules():
-        if hasattr(module, "support_avx512bf16_for_cpu"):
-            module.support_avx512bf16_for_cpu = False
-
-
 def load_trained(
     cfg: StudentConfig, precision: str, folder: Path
 ) -> tuple[nn.Module, ProcessorMixin]:
-    """A trained student as `save` wrote it, ready to answer: adapters over their base, or a whole
-    model.
+    """Load a trained student for inference: adapters over their base, or a whole model.
 
     Raises:
-        UserError: `folder` holds no student, or one of another base or rank, or its base is not on
-            this machine.
+        UserError: `folder` holds no student or one of another base or rank, or its base cannot be
+            loaded.
     """
     import peft
 
     if (folder / "adapter_config.json").exists():
-        # peft would read a pickle where there are no safetensors.
+        # Without safetensors, peft would read a pickle.
         if not (weights := folder / "adapter_model.safetensors").exists():
-            raise UserError(f"{folder} holds no student: {weights} is missing")
+            raise UserError(f"{folder} holds no student: {weights} is missing", code="missing-run")
         base, processor = load_base(cfg, precision, list)
         try:
-            check_adapters(folder, base, cfg)
+            check_adapters(folder, base, cfg.lora.rank, cfg.model)
             return for_inference(peft.PeftModel.from_pretrained(base, folder)), processor
         except UNREADABLE as error:
             raise damaged_error(folder, error) from error
@@ -238,29 +182,12 @@ def load_trained(
     return for_inference(model), processor
 
 
-def merge_adapters(
-    base: PreTrainedModel, adapters: Path, quantization: str, precision: str
-) -> PreTrainedModel:
-    """A base as its 4-bit weights say it, with the adapters in a folder added in `precision`.
-
-    Merged into the 4-bit weights themselves, most of what was trained would be rounded away; over
-    the base as it was before it was quantised, the adapters would miss what they were trained to
-    make up for.
-    """
-    import peft
-
-    dtype = DTYPES[precision]
-    if quantization == "nf4":
-        base = base.dequantize(dtype)
-    return peft.PeftModel.from_pretrained(base.to(dtype), adapters).merge_and_unload()
-
-
 def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
-    """A student merged into its base, as `train.export` wrote it: in the precision of its weights,
-    and with nothing that the standard classes do not read themselves.
+    """Load a student that `train.export` merged into its base, in the precision of its weights and
+    with the standard classes only.
 
     Raises:
-        UserError: it cannot be read.
+        UserError: the folder is damaged.
     """
     try:
         processor = AutoProcessor.from_pretrained(folder)
@@ -273,9 +200,25 @@ def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
     return for_inference(model), processor
 
 
+def merge_adapters(
+    base: PreTrainedModel, adapters: Path, quantization: str, precision: str
+) -> PreTrainedModel:
+    """Dequantise a base and add the adapters in a folder, in `precision`.
+
+    Merged into the 4-bit weights, most of the training would be rounded away; over the base as it
+    was before quantisation, the adapters would miss the errors that they were trained with.
+    """
+    import peft
+
+    dtype = DTYPES[precision]
+    if quantization == "nf4":
+        base = base.dequantize(dtype)
+    return peft.PeftModel.from_pretrained(base.to(dtype), adapters).merge_and_unload()
+
+
 def for_inference(model: nn.Module) -> nn.Module:
-    """A model ready to answer, on the GPU where there is one: unlike a 4-bit model, one that is not
-    quantised is loaded beside the CPU."""
+    """Move a model to the GPU, if there is one, and switch it to inference. A quantised model is
+    loaded on the GPU, others are loaded on the CPU."""
     return model.to("cuda" if torch.cuda.is_available() else "cpu").eval()
 
 
@@ -286,12 +229,13 @@ def save_student(
     precision: str,
     weights: dict[str, torch.Tensor] | None = None,
 ) -> None:
-    """Write what was trained, the adapters or the whole model, and the processor that goes with
-    it. A whole model is written in the precision that it computed in. `weights` are the model's
-    where it holds a part of them.
+    """Save the adapters, or the whole model in `precision`, and the processor.
+
+    Args:
+        weights: The model's weights if the model itself holds a part of them.
 
     Raises:
-        UserError: the disk does not take it.
+        UserError: the files cannot be written.
     """
     import peft
 
@@ -309,11 +253,10 @@ def write_model(
     folder: Path,
     weights: dict[str, torch.Tensor] | None = None,
 ) -> None:
-    """Write a model, or its adapters, and its processor as they are; `weights` where the model
-    holds a part of them.
+    """Save a model, or its adapters, and its processor unchanged.
 
     Raises:
-        UserError: the disk does not take it.
+        UserError: the files cannot be written.
     """
     try:
         model.save_pretrained(folder, state_dict=weights)
@@ -322,10 +265,74 @@ def write_model(
     processor.save_pretrained(folder)
 
 
-def unwritable_error(folder: Path, why: str) -> UserError:
-    """What to tell a user whose disk did not take the weights. Unlike a full disk's OSError, what
-    the libraries raise names no file, and what filled the disk may be gone again."""
+def check_reachable(group: str, model: str, key: str = "model") -> None:
+    """Check once that a model is available; the libraries would retry for minutes.
+
+    Raises:
+        UserError: it is no local folder, not in the hub's cache, and cannot be downloaded.
+    """
+    from huggingface_hub import model_info, try_to_load_from_cache
+
+    if Path(model).is_dir():
+        return
+    try:
+        # A repository of adapters has no config.json.
+        files = ("config.json", "adapter_config.json")
+        if not any(isinstance(try_to_load_from_cache(model, file), str) for file in files):
+            model_info(model, timeout=10)
+    except Exception as error:
+        # The hub's client raises the errors of whichever HTTP library is installed.
+        raise load_error(group, model, error, key) from error
+
+
+def load_error(group: str, model: str, error: Exception, key: str = "model") -> UserError:
+    """Return the error for a model that did not load."""
+    cause = _first_line(error)
+    if Path(model).is_dir():
+        return UserError(
+            f"{group}.{key}={model} cannot be loaded from that folder: {cause}",
+            code="unloadable-model",
+        )
+    if Path(model).is_absolute() or model.startswith("."):
+        return UserError(f"{group}.{key}={model}: this folder does not exist", code="missing-model")
     return UserError(
-        f"the weights cannot be written to {folder} ({why}); once that is mended, run the same "
-        "command again"
+        f"{group}.{key}={model} is neither a local folder nor in the hub's cache, and cannot be "
+        f"downloaded ({cause}). Give a local copy with {group}.{key}=FOLDER (config.json, "
+        "*.safetensors, tokenizer and processor files), or download it on a machine with network "
+        f"access: hf download {model}",
+        code="missing-model",
     )
+
+
+def damaged_error(
+    folder: Path, error: Exception, advice: str = "delete the run's folder and train again"
+) -> UserError:
+    """Return the error for a trained model that cannot be read."""
+    return UserError(
+        f"{folder} is damaged and cannot be read ({_first_line(error)}): {advice}",
+        code="damaged-file",
+    )
+
+
+def no_targets_error(group: str, lora: LoraConfig) -> UserError:
+    """Return the error for a pattern that matches no module that can be adapted."""
+    return UserError(
+        f"{group}.lora.targets={lora.targets} adapts nothing in this model: give a pattern that "
+        "matches whole names of linear layers, such as "
+        "model.language_model.layers.0.self_attn.q_proj",
+        code="no-lora-targets",
+    )
+
+
+def unwritable_error(folder: Path, why: str) -> UserError:
+    """Return the error for weights that cannot be written. Unlike the OSError of a full disk, those
+    of the libraries name no file, and the disk may have space again by now."""
+    return UserError(
+        f"the weights cannot be written to {folder} ({why}); correct this, then run the same "
+        "command again",
+        code="cannot-write",
+    )
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)

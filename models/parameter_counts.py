@@ -1,4 +1,4 @@
-"""A model's parameters by tower: what is quantised, adapted and trained in each."""
+"""Counts of a model's parameters by tower: quantised, adapted and trained ones."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import dataclass, fields
 from torch import nn
 
 from conf.errors import UserError
-from conf.schema import RetrieverConfig, StudentConfig
+from models.compat import four_bit_entries
 
 TOWERS = ("vision", "language", "embeddings and head")
 PROJECTION = "projection"
-"""Of a multi-vector retriever: no tower of its base's, so it is always trained, and whole."""
+"""The module of a multi-vector retriever after its base, which is always trained whole."""
 
 
 @dataclass
@@ -26,26 +26,17 @@ class Tower:
 
 
 def count_towers(model: nn.Module) -> dict[str, Tower]:
-    """Parameters by tower. A 4-bit weight counts as the entries it stands for, not its bytes."""
+    """Count parameters by tower. A 4-bit weight counts as the entries that it stands for."""
     towers = {name: Tower() for name in TOWERS}
     for name, parameter in model.named_parameters():
         tower = towers.setdefault(_tower_of(name), Tower())
-        entries, four_bit = _entries(parameter)
+        four_bit = four_bit_entries(parameter)
+        entries = parameter.numel() if four_bit is None else four_bit
         tower.parameters += entries
-        tower.four_bit += entries if four_bit else 0
+        tower.four_bit += four_bit or 0
         tower.lora += entries if "lora_" in name else 0
         tower.trainable += entries if parameter.requires_grad else 0
     return towers
-
-
-def _entries(parameter: nn.Parameter) -> tuple[int, bool]:
-    """How many entries a parameter stands for, and whether it holds them in 4 bits."""
-    if type(parameter).__name__ != "Params4bit":
-        return parameter.numel(), False
-    if parameter.quant_state is not None:
-        return parameter.quant_state.shape.numel(), True
-    # Weights are packed as they are loaded; on the meta device they keep their own shape.
-    return parameter.numel(), parameter.is_meta
 
 
 def _tower_of(name: str) -> str:
@@ -56,34 +47,39 @@ def _tower_of(name: str) -> str:
     return "language" if re.search(r"(^|\.)layers\.\d+\.", name) else "embeddings and head"
 
 
-def check_towers(towers: dict[str, Tower], cfg: StudentConfig | RetrieverConfig) -> None:
-    """Hold what was loaded against what the preset says.
+def check_towers(towers: dict[str, Tower], preset: str, quantization: str, rank: int) -> None:
+    """Compare a loaded model with its preset.
+
+    Args:
+        preset: Name of the preset.
+        quantization: nf4 or none.
+        rank: Of the adapters; 0 for a whole model.
 
     Raises:
-        UserError: a tower is quantised, adapted or trained that should not be, or is not that
-            should.
+        UserError: a tower is quantised, adapted or trained that should not be, or the reverse.
     """
-    nf4, lora = cfg.quantization == "nf4", cfg.lora.rank > 0
+    nf4, lora = quantization == "nf4", rank > 0
     problems = []
     for name, tower in towers.items():
         language, projection = name == "language", name == PROJECTION
-        for what, found, wanted in (
+        for what, actual, expected in (
             ("4-bit", tower.four_bit > 0, nf4 and language),
             ("LoRA", tower.lora > 0, lora and language),
             ("trainable", tower.trainable > 0, language or projection or not lora),
         ):
-            if found != wanted:
-                problems.append(f"{name} has {'some' if found else 'no'} {what} parameters")
+            if actual != expected:
+                problems.append(f"{name} has {'some' if actual else 'no'} {what} parameters")
         if lora and not projection and tower.trainable != tower.lora:
             problems.append(f"{name} trains {tower.trainable - tower.lora} that are not LoRA")
     if problems:
         raise UserError(
-            f"the loaded model is not what preset {cfg.name} says: {'; '.join(problems)}. Look at "
-            "the quantization and lora.targets of the preset"
+            f"the loaded model differs from preset {preset}: {'; '.join(problems)}. Check the "
+            "quantization and lora.targets of the preset",
+            code="other-parameters",
         )
 
 
-def tower_table(towers: dict[str, Tower]) -> str:
+def format_towers(towers: dict[str, Tower]) -> str:
     columns = [f.name for f in fields(Tower)]
     lines = [f"{'':<22}" + "".join(f"{c.replace('four_bit', '4-bit'):>14}" for c in columns)]
     for name, tower in towers.items():

@@ -34,7 +34,7 @@ from benchmarks.speed.sft_runs import SEED, device_name
 from conf.compose import compose
 from conf.schema import ArchitectureConfig, ContrastiveCommand
 from data.records import FPS, FRAMES, FrameRef, RetrievalQuery
-from models import memory, parameter_counts
+from models import compat, parameter_counts
 from models.retriever import embedder
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -60,7 +60,7 @@ def main() -> None:
     logging.disable(logging.WARNING)
     if torch.cuda.device_count() > 1:
         parser.error("one card is measured: set CUDA_VISIBLE_DEVICES=0")
-    memory.keep_freed_memory()
+    compat.keep_freed_memory()
     measure(args.retriever, args.base, args.batch, args.steps)
 
 
@@ -73,7 +73,7 @@ def measure(name: str, base: str, batch: int, steps: int) -> None:
     recomputed = "recomputed" if cfg.train.gradient_checkpointing else "kept"
     print(f"activations {recomputed}, mini-batches of {cfg.train.mini_batch}")
     print(f"{name} over {base} on {device_name()}, batches of {batch} queries")
-    print(parameter_counts.tower_table(parameter_counts.count_towers(model)))
+    print(parameter_counts.format_towers(parameter_counts.count_towers(model)))
     print(f"{'':<40}{'queries/s':>11}{'peak GiB':>10}{'loss':>10}", flush=True)
     kept = {n: p.detach().clone() for n, p in model.named_parameters() if p.requires_grad}
     for line, switches in VARIANTS.items():

@@ -28,11 +28,11 @@ from conf.schema import ContrastiveCommand
 from data.build import ensure_benchmark
 from data.records import RetrievalQuery
 from data.render.frame_cache import FrameReader
-from models import memory
+from models import compat
 from models.lora_kernels import fuse, unfuse
 from models.precision import resolve_precision
 from models.retriever import embedder
-from train.common import training_loop
+from train.common.arguments import common_arguments
 from train.retriever.batches import QueryBatchSampler, batch_columns
 from train.retriever.run import build_loss
 from train.retriever.trainer import NUMBER, IndexCollator, RetrieverTrainer, numbered_rows
@@ -64,7 +64,7 @@ def train(
     """Train the settings' retriever on their benchmark for some steps in `folder`. Without
     `helped`, attention is transformers' default, and freed memory returns to the system."""
     if helped:
-        memory.keep_freed_memory()
+        compat.keep_freed_memory()
     set_seed(SEED)
     cfg.train.precision = resolve_precision(cfg.train.precision)
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
@@ -151,7 +151,7 @@ def plain_trainer(cfg, model, queries, frames, folder, order, tokens) -> Trainer
 
 
 def arguments(cfg: ContrastiveCommand, folder: Path) -> SentenceTransformerTrainingArguments:
-    shared = training_loop.arguments(cfg.train, Run("benchmark", folder), SEED, None)
+    shared = common_arguments(cfg.train, Run("benchmark", folder), SEED, None)
     never = {"eval_strategy": "no", "eval_on_start": False, "save_strategy": "no"}
     return SentenceTransformerTrainingArguments(
         **shared | never | {"dataloader_num_workers": 0, "disable_tqdm": True},

@@ -46,7 +46,7 @@ MALLOC = {
     "MALLOC_TRIM_THRESHOLD_": str((1 << 31) - 1),
     "MALLOC_TOP_PAD_": str(64 << 20),
 }
-"""What `models.memory.keep_freed_memory` sets, as a user can before a process starts."""
+"""What `models.compat.keep_freed_memory` sets, as a user can before a process starts."""
 OURS, DEFAULT = "ours", "TRL as it comes"
 PLAIN = {"trainer": "trl"}
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -247,12 +247,11 @@ def train_one(
 
     from benchmarks.speed import sft_runs
     from data.build import ensure_benchmark
-    from data.render.frame_cache import FrameReader
-    from models import loading, memory
+    from models import compat, loading
     from models.precision import resolve_precision
     from teacher.narrate import ensure_rationales
-    from train.student import dataset
-    from train.student.lazy_samples import LengthSampler
+    from train.student.length_sampler import LengthSampler
+    from train.student.run import load_datasets
 
     variant = sft_runs.Variant(**switches)
     cfg = compose("train.sft", SftCommand, OVERRIDES)
@@ -260,10 +259,10 @@ def train_one(
     built = ensure_benchmark(cfg.benchmark, Path(store), cfg.workers)
     rationales = ensure_rationales(built, cfg.teacher)
     if variant.trainer == "ours":
-        memory.keep_freed_memory()
+        compat.keep_freed_memory()
     set_seed(sft_runs.SEED)
     model, processor = loading.load_student(cfg.student, cfg.train.precision, list)
-    training, _ = dataset.splits(built, rationales, cfg, FrameReader(built, cfg.student.image_size))
+    training, _ = load_datasets(cfg, built, rationales)
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
     order = islice(LengthSampler(lengths, cfg.train.batch, cfg.seed), steps * cfg.train.batch)
     shown = sft_runs.AsImages(training) if images else training

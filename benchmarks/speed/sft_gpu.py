@@ -26,7 +26,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import bitsandbytes as bnb
@@ -43,13 +43,11 @@ from conf.compose import compose
 from conf.errors import UserError
 from conf.schema import SftCommand, StudentConfig
 from data.records import LETTERS
-from models import loading, memory, parameter_counts
+from models import compat, loading, parameter_counts
 from models.attention import choose_attention, flash_attention
 from models.student.collator import Collator
 from models.student.prompts import Clip, Sample, answer_line, conversation, instruction
 from models.tiny_qwen3_vl import SPECIAL_TOKENS, build_processor
-from train.common import memory_probe
-from train.student.packing import PackingCollator, rope_of
 from train.student.trainer import token_mean
 
 ROOT = Path(__file__).parents[2]
@@ -113,7 +111,7 @@ def main() -> None:
     logging.disable(logging.WARNING)
     if torch.cuda.device_count() > 1:
         parser.error("one card is measured: set CUDA_VISIBLE_DEVICES=0")
-    memory.keep_freed_memory()
+    compat.keep_freed_memory()
     for base in args.base or ["nf4", "bf16"]:
         measure(args.student, base, args.steps)
 
@@ -129,11 +127,16 @@ def measure(name: str, base: str, steps: int) -> None:
     work = Work(model, processor, Subset(shown, places), settings.train, student.max_length)
     bench = Bench(work, student, step_flops(model, processor, shown, student), product_rate(device))
     print(f"\n{name} over {base} on {device_name()}, {bench.limit / 1e12:.1f} TFLOP/s of products")
-    print(parameter_counts.tower_table(parameter_counts.count_towers(model)))
+    print(parameter_counts.format_towers(parameter_counts.count_towers(model)))
     print(f"{len(shown)} samples a step, {bench.flops / 1e12:.1f} TFLOP")
     print(f"{'':<48}{'s/step':>9}{'samples/s':>11}{'of peak':>9}{'peak GiB':>10}", flush=True)
     found = [(variant.trainer, bench.line(variant, steps)) for variant in variants()]
-    chosen = bench.line(bench.chosen(shown), steps)
+    preset = Variant(
+        "ours, as in the preset",
+        micro_batch=settings.train.micro_batch,
+        recompute=settings.train.gradient_checkpointing,
+    )
+    chosen = bench.line(preset, steps)
     if chosen is not None and device.type == "cuda":
         hours.add("sft_gpu", name, base, settings.train.batch / chosen, device_name())
     found.append(("ours", chosen))
@@ -160,25 +163,6 @@ class Bench:
     def __post_init__(self) -> None:
         trained = dict(self.work.model.named_parameters())
         self._adapters = {n: p.detach().clone() for n, p in trained.items() if p.requires_grad}
-
-    def chosen(self, shown: list[Sample]) -> Variant:
-        """What the trainer takes where the settings leave both to it."""
-        self.renew()
-        work = self.work
-        collator = Collator(work.processor, work.max_length)
-        lengths = [collator([sample])["input_ids"].shape[1] for sample in shown]
-        rope = rope_of(work.model, work.train.packing)
-        packs = PackingCollator(work.processor, work.max_length, rope) if rope else collator
-        auto = replace(work.train, micro_batch="auto", gradient_checkpointing="auto")
-        started = time.perf_counter()
-        with tempfile.TemporaryDirectory() as folder:
-            found = memory_probe.settle(auto, Path(folder), work.model, packs, shown, lengths)
-        told = "recomputed" if found.gradient_checkpointing else "kept"
-        return Variant(
-            f"ours, auto: {found.micro_batch}, {told}, in {time.perf_counter() - started:.0f} s",
-            micro_batch=found.micro_batch,
-            recompute=found.gradient_checkpointing,
-        )
 
     def line(self, variant: Variant, steps: int) -> float | None:
         """Train some steps and print what they took; gives the median step's seconds."""
@@ -224,9 +208,11 @@ def built(name: str, cfg: StudentConfig, device: torch.device) -> tuple[nn.Modul
     """A student of a released shape with random bf16 or 4-bit weights, and adapters."""
     model = random_model(name, cfg.quantization, device)
     model.config.use_cache = False
-    loading.keep_differentiable(model)
+    compat.keep_differentiable(model)
     student = loading.add_adapters(model, cfg.lora).to(device)
-    parameter_counts.check_towers(parameter_counts.count_towers(student), cfg)
+    parameter_counts.check_towers(
+        parameter_counts.count_towers(student), cfg.name, cfg.quantization, cfg.lora.rank
+    )
     said = [instruction("reasoning", "cot"), *(answer_line(x) for x in LETTERS), SAID]
     processor = build_processor(said * 20, 512, cfg.image_size)
     loading.pin_sizes(processor, cfg.image_size, cfg.frames)

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -30,16 +29,19 @@ from transformers import (
     TrainingArguments,
 )
 
+from benchmarks.speed.peak_memory import peak_bytes, reset_peak
 from conf.entry import Run
 from conf.schema import SftTrainConfig
 from models.lora_kernels import fuse, unfuse
-from models.memory import peak_bytes, reset_peak
+from models.memory import available_cpu_bytes
 from models.student.collator import Collator, encode, letter_ids, pad
 from models.student.prompts import Sample
-from train.common import training_loop
-from train.student.packing import PackingCollator, rope_of
-from train.student.trainer import LetterChoice, StudentTrainer, token_mean
-from train.student.vision_cache import Features, Keyed
+from train.common.arguments import SCHEDULES, common_arguments, prefetch_factor
+from train.student.metrics import LetterAccuracy
+from train.student.packing import PackingCollator, packing_rope
+from train.student.regimes import TrainerCollator
+from train.student.trainer import StudentTrainer, token_mean
+from train.student.vision_cache import VisionCache
 
 SEED = 0
 
@@ -119,30 +121,31 @@ def ours(
         work.model.get_base_model().set_attn_implementation(variant.attention)
     kind = EveryRow if variant.collator == "every row" else Collator
     collator = kind(work.processor, work.max_length)
-    rope = rope_of(work.model, train.packing)
+    rope = packing_rope(work.model, train.packing)
     packs = rope and PackingCollator(work.processor, work.max_length, rope)
-    features = Features.of(work.model, train) if train.reuse_features else None
-    made = Keyed if features else attrgetter("named")
+    cache = None
+    if train.reuse_features:
+        cache = VisionCache(work.model, train.precision, available_cpu_bytes() // 2)
     accumulation = train.batch // train.micro_batch
-    arguments = training_loop.arguments(train, Run("benchmark", folder), SEED, None)
+    common = common_arguments(train, Run("benchmark", folder), SEED, None)
     never = {"eval_strategy": "no", "eval_on_start": False, "save_strategy": "no"}
     return StudentTrainer(
         model=work.model,
         args=TrainingArguments(
-            **{**arguments, **never, "disable_tqdm": True},
+            **{**common, **never, "disable_tqdm": True},
             per_device_train_batch_size=train.micro_batch,
             gradient_accumulation_steps=accumulation,
-            dataloader_prefetch_factor=training_loop.prefetched(train.workers, accumulation),
+            dataloader_prefetch_factor=prefetch_factor(train.workers, accumulation),
             label_names=["labels"],
         ),
-        data_collator=made(collator),
-        training_collator=made(packs or collator),
+        data_collator=TrainerCollator(collator, cache is not None),
+        training_collator=TrainerCollator(packs or collator, cache is not None),
         train_dataset=work.samples,
         compute_loss_func=loss,
         callbacks=[clock],
-        order=SequentialSampler(work.samples),
-        choice=LetterChoice(letter_ids(work.processor)),
-        features=features,
+        sampler=SequentialSampler(work.samples),
+        accuracy=LetterAccuracy(letter_ids(work.processor)),
+        vision_cache=cache,
     )
 
 
@@ -165,7 +168,7 @@ def trls(variant: Variant, work: Work, clock: Clock, folder: Path) -> Trainer:
             output_dir=str(folder),
             seed=SEED,
             learning_rate=train.lr,
-            lr_scheduler_type=training_loop.SCHEDULES[train.schedule],
+            lr_scheduler_type=SCHEDULES[train.schedule],
             warmup_steps=train.warmup,
             weight_decay=train.weight_decay,
             adam_beta2=train.adam_beta2,

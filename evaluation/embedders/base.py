@@ -12,7 +12,7 @@ from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery, SelectionItem
 from data.render.frame_cache import FrameReader
 from evaluation.retrieval.late_interaction import embedded_rows
-from models.memory import keep_freed_memory
+from models.compat import keep_freed_memory
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
 
 if TYPE_CHECKING:

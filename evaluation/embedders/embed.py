@@ -23,7 +23,6 @@ from data.render.frame_cache import FrameReader, resize_frames
 from data.store import Store
 from evaluation.embedders.cache import EmbeddingCache
 from evaluation.reporting.results import UNTRAINED
-from models.checks import check_pooling, check_widths
 from models.fingerprints import (
     image_model_id,
     model_id,
@@ -32,6 +31,7 @@ from models.fingerprints import (
     weights_digest,
 )
 from models.resolved import check_base
+from models.retriever.checks import check_pooling, check_widths
 from models.trained_runs import product_folder, run_title
 
 if TYPE_CHECKING:

@@ -38,7 +38,7 @@ def say(
         UserError: memory runs out.
     """
     collator = Collator(processor, cfg.max_length, cfg.thinking)
-    limit = response_token_limit(mode, cfg)
+    limit = response_token_limit(mode, cfg.max_new_tokens, cfg.thinking)
     grammar = record_grammar(model, processor) if mode == "constrained" else None
     for start in range(0, len(things), batch):
         group = things[start : start + batch]

@@ -18,7 +18,7 @@ from evaluation.generators import local, openai_server
 from evaluation.generators.response_log import RECORD_MODES, Respond, SaveResponses, Subject
 from evaluation.generators.response_schema import instruction as record_instruction
 from evaluation.generators.response_schema import schema
-from models import fingerprints, loading, memory
+from models import compat, fingerprints, loading
 from models.precision import resolve_precision
 from models.resolved import check_base
 from models.student.generation import response_token_limit
@@ -85,7 +85,7 @@ def model_here(
 
     @cache
     def loaded() -> tuple[nn.Module, ProcessorMixin]:
-        memory.keep_freed_memory()
+        compat.keep_freed_memory()
         if weights is None:
             model, processor = loading.load_base(student, precision, list)
             return loading.for_inference(model), processor
@@ -179,7 +179,7 @@ def shown(
     item: SelectionItem,
 ) -> Sample:
     """A selection item as a student of a regime is asked about it in a mode."""
-    return instructed_sample(item, mode, told(mode, regime), frames, cfg, control=control)
+    return instructed_sample(item, mode, told(mode, regime), frames, cfg.frames, control=control)
 
 
 def response_settings(
@@ -192,7 +192,9 @@ def response_settings(
     control: str | None,
 ) -> dict[str, Any]:
     """All that an answer in a mode depends on besides its item."""
-    sampling: dict[str, Any] = {"max_new_tokens": response_token_limit(mode, student)}
+    sampling: dict[str, Any] = {
+        "max_new_tokens": response_token_limit(mode, student.max_new_tokens, student.thinking)
+    }
     sampling |= {"thinking": student.thinking, "temperature": student.temperature}
     if student.temperature:
         sampling |= {"top_p": student.top_p, "top_k": student.top_k, "seed": seed}

@@ -136,7 +136,7 @@ def request_of(cfg: StudentConfig, mode: str, clip: Clip | None) -> RequestField
     request = {
         "temperature": cfg.temperature,
         "top_p": cfg.top_p,
-        "max_tokens": response_token_limit(mode, cfg),
+        "max_tokens": response_token_limit(mode, cfg.max_new_tokens, cfg.thinking),
         "extra_body": extra,
     }
     if mode == "constrained":

@@ -31,7 +31,7 @@ from evaluation.reporting.runs import (
     reading,
 )
 from evaluation.reporting.table import Table
-from train.common.curves import curves_figure
+from train.common.curves import plot_curves
 
 Rows = Sequence[Measurement]
 T = TypeVar("T")
@@ -321,7 +321,7 @@ def training(runs: Sequence[FinishedRun], draw: Callable) -> Section:
         if records := [*json_lines(run.folder / "metrics.jsonl")]:
             name = f"training-{run.kind}-{run.name.replace('/', '-')}"
             caption = f"Training of {run.kind}/{run.name}."
-            section.figures.append(draw(name, curves_figure, records, caption))
+            section.figures.append(draw(name, plot_curves, records, caption))
     return section
 
 

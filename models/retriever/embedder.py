@@ -27,28 +27,21 @@ from conf.schema import LoraConfig, RetrieverConfig
 from data.records import FrameRef, RetrievalQuery, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from models.attention import choose_attention
-from models.checks import (
-    PEFT,
-    check_family,
-    check_modules,
-    check_pooling,
-    check_processor,
-    check_tower,
-    is_retriever,
-)
+from models.checks import PEFT, check_processor, check_tower
+from models.compat import keep_differentiable
 from models.distributed import from_main
 from models.loading import (
     DTYPES,
     UNREADABLE,
     check_reachable,
     damaged_error,
-    keep_differentiable,
     load_error,
     nf4_config,
     no_targets_error,
     pin_sizes,
 )
 from models.nonfinite_guard import check_finite
+from models.retriever.checks import check_family, check_modules, check_pooling, is_retriever
 from models.retriever.multi_vector import keep_head_fp32, load_multi_vector, multi_vector_modules
 from models.student.prompts import load_clip
 from models.tiny_qwen3_vl import build_model, build_processor

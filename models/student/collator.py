@@ -1,9 +1,9 @@
-"""Conversations become tensors: prompt ids from the processor, labels on the assistant's tokens.
+"""Turn conversations into tensors.
 
-The prompt's ids are exactly those that the processor gives at inference. The response is encoded
-on its own and appended, so what is supervised is what has to be generated, token for token.
-Batches are padded on the left, so that the supervised tokens stand together at the end and only
-their rows pass the head.
+The ids of a prompt are exactly those that the processor returns at inference. The response is
+encoded separately and appended, so that the supervised tokens are those that have to be generated.
+Batches are padded on the left: the supervised tokens are then the last ones of every row, and only
+their positions pass the head.
 """
 
 from __future__ import annotations
@@ -21,12 +21,20 @@ from data.records import LETTERS
 from models.student.prompts import Sample, answer_line
 
 IGNORED = -100
-"""The label of a token that is not supervised, as torch's cross entropy has it."""
+"""Label of an unsupervised token, torch's default `ignore_index`."""
+
+
+MEDIA = {
+    "image": ("pixel_values", "image_grid_thw"),
+    "video": ("pixel_values_videos", "video_grid_thw"),
+}
+"""The processor's outputs for each kind of media: pixels and their grid."""
+MEDIA_INPUTS = tuple(name for names in MEDIA.values() for name in names)
 
 
 @dataclass(frozen=True)
 class Encoded:
-    """One conversation's token ids, labels and media tensors, unpadded."""
+    """Token ids, labels and media tensors of one conversation, without padding."""
 
     input_ids: list[int]
     labels: list[int]
@@ -37,20 +45,22 @@ class Encoded:
 def encode(
     sample: Sample, processor: ProcessorMixin, max_length: int, thinking: bool = False
 ) -> Encoded:
-    """Token ids and pixels of a conversation; without a response, of its prompt alone. `thinking`
-    is told to chat templates that know of it.
+    """Encode a conversation; without a response, only its prompt.
+
+    Args:
+        thinking: Value of `enable_thinking` for chat templates that have it.
 
     Raises:
-        UserError: it is longer than `max_length` tokens. It is never cut, since a cut could fall
-            within a frame.
+        UserError: the conversation is longer than `max_length` tokens. It is never truncated, since
+            the cut could fall within an image.
     """
-    # What a template does not know of would be taken for the processor's.
-    known = "enable_thinking" in str(processor.chat_template)
+    # The processor would receive a variable that the template does not use.
+    options = {"enable_thinking": thinking}
     text = processor.apply_chat_template(
         [{"role": "user", "content": sample.content}],
         tokenize=False,
         add_generation_prompt=True,
-        **({"enable_thinking": thinking} if known else {}),
+        **(options if "enable_thinking" in str(processor.chat_template) else {}),
     )
     prompt = processor(
         text=[text],
@@ -71,26 +81,19 @@ def encode(
         raise UserError(
             f"sample {sample.sample_id} has {len(ids) + len(response)} tokens, more than "
             f"student.max_length={max_length}: raise it, or lower student.image_size or "
-            "student.frames"
+            "student.frames",
+            code="sample-too-long",
         )
     media = {name: prompt[name] for name in MEDIA_INPUTS if name in prompt}
     labels = [IGNORED] * len(ids) + response
     return Encoded(ids + response, labels, types + [0] * len(response), media)
 
 
-MEDIA = {
-    "image": ("pixel_values", "image_grid_thw"),
-    "video": ("pixel_values_videos", "video_grid_thw"),
-}
-"""What the processor gives of each kind of media: its pixels and their grid."""
-MEDIA_INPUTS = tuple(name for names in MEDIA.values() for name in names)
-
-
 class Collator:
-    """Makes a batch of conversations: what the model's `forward` takes, and `labels`.
+    """Makes left-padded batches of conversations: tensors that the model's `forward` takes.
 
-    `labels` (B, K) belong to the last K positions, which `logits_to_keep` (K,) names; position j's
-    logits predict label j + 1.
+    Batches with responses also have `labels` (B, K) for the last K positions, which
+    `logits_to_keep` (K,) lists; the logits of position j predict label j + 1.
     """
 
     def __init__(self, processor: ProcessorMixin, max_length: int, thinking: bool = False) -> None:
@@ -100,24 +103,23 @@ class Collator:
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
         encoded = [encode(s, self._processor, self._max_length, self._thinking) for s in samples]
+        return self._batch(encoded, [s.supervised for s in samples])
+
+    def _batch(self, encoded: Sequence[Encoded], supervised: Sequence[bool]) -> dict[str, Any]:
         batch = pad(encoded, self._processor.tokenizer.pad_token_id)
         labels = batch.pop("labels")
         if (labels == IGNORED).all():
             return batch
         # The position before the first supervised token predicts it.
         start = int((labels != IGNORED).any(dim=0).nonzero()[0]) - 1
-        labels[[not s.supervised for s in samples]] = IGNORED
+        labels[[not learned for learned in supervised]] = IGNORED
         batch["labels"] = labels[:, start:]
         batch["logits_to_keep"] = torch.arange(start, labels.shape[1])
         return batch
 
-    def named(self, samples: Sequence[Sample]) -> dict[str, Any]:
-        """The batch with its samples' ids, as `sample_ids`."""
-        return {**self(samples), "sample_ids": [s.sample_id for s in samples]}
-
 
 def pad(encoded: Sequence[Encoded], pad_id: int) -> dict[str, Any]:
-    """Left-pad to the longest; media of all samples in order."""
+    """Left-pad to the longest conversation and concatenate the media in order."""
     longest = max(len(e.input_ids) for e in encoded)
 
     def stack(rows: list[list[int]], filler: int) -> torch.Tensor:
@@ -133,23 +135,24 @@ def pad(encoded: Sequence[Encoded], pad_id: int) -> dict[str, Any]:
 
 
 def stacked_media(encoded: Sequence[Encoded]) -> dict[str, torch.Tensor]:
-    """The media tensors of all samples in order."""
+    """Concatenate the media tensors of all samples in order."""
     parts = {name: [e.media[name] for e in encoded if name in e.media] for name in MEDIA_INPUTS}
-    return {name: torch.cat(found) for name, found in parts.items() if found}
+    return {name: torch.cat(tensors) for name, tensors in parts.items() if tensors}
 
 
 def letter_ids(processor: ProcessorMixin) -> list[int]:
-    """The token of each letter as it stands in an answer's line.
+    """Return the token of each letter in an answer line.
 
     Raises:
-        UserError: the tokenizer splits a letter, so that no one token is the choice.
+        UserError: the tokenizer has no single token for each letter.
     """
     encode_text = processor.tokenizer.encode
     lines = [encode_text(answer_line(letter), add_special_tokens=False) for letter in LETTERS]
     last = [line[-1] for line in lines]
     if len({tuple(line[:-1]) for line in lines}) != 1 or len(set(last)) != len(LETTERS):
         raise UserError(
-            f"the tokenizer of {processor.tokenizer.name_or_path} does not give each answer "
-            "letter one token of its own; student.model needs another tokenizer"
+            f"the tokenizer of {processor.tokenizer.name_or_path} has no single token for each "
+            "answer letter: give a student.model with another tokenizer",
+            code="unsuitable-tokenizer",
         )
     return last

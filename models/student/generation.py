@@ -1,4 +1,4 @@
-"""Text generation with a model that is loaded in this process."""
+"""Generate text with a model that is loaded in this process."""
 
 from __future__ import annotations
 
@@ -8,23 +8,22 @@ import torch
 from torch import nn
 from transformers import LogitsProcessorList, ProcessorMixin
 
-from conf.schema import StudentConfig
 from models.loading import DTYPES
 
 ANSWER_TOKENS = 16
-"""New tokens at most in answer mode: the one line, and room to miss it."""
+"""Most new tokens in answer mode: the answer line, and some more for a malformed one."""
 THOUGHT, OPENING = "<think>", 8
-"""What opens a thought, and how many tokens at a prompt's end are looked at for it."""
+"""The tag that opens a thought, and how many tokens at the end of a prompt may hold it."""
 
 
-def response_token_limit(mode: str, cfg: StudentConfig) -> int:
-    """How many tokens a student may write in a mode."""
-    return ANSWER_TOKENS if mode == "answer" and not cfg.thinking else cfg.max_new_tokens
+def response_token_limit(mode: str, max_new_tokens: int, thinking: bool = False) -> int:
+    """Return how many tokens a response may have: few in answer mode without a thought."""
+    return ANSWER_TOKENS if mode == "answer" and not thinking else max_new_tokens
 
 
 @dataclass(frozen=True)
 class GeneratedText:
-    """What a model wrote; whether it was stopped before its end."""
+    """A model's text, and whether generation stopped before its end."""
 
     text: str
     cut: bool = False
@@ -38,12 +37,22 @@ def generate(
     precision: str,
     steps: LogitsProcessorList | None = None,
 ) -> list[GeneratedText]:
-    """What a model writes after left-padded prompts, `limit` tokens at most: greedily, after the
-    logits have passed the `steps`. A thought that the prompt opens is opened in the text."""
+    """Generate a response to each of a batch of left-padded prompts.
+
+    Decoding is greedy, on the logits that `steps` return.
+
+    Args:
+        inputs: What `Collator` returns for samples without responses.
+        limit: Most new tokens of a response.
+        precision: bf16 or fp32.
+
+    Returns:
+        The texts; one whose prompt opens a thought begins with the opening tag.
+    """
     device = next(model.parameters()).device
     inputs = {name: value.to(device) for name, value in inputs.items() if name != "labels"}
     autocast = torch.autocast(device.type, DTYPES[precision], enabled=precision == "bf16")
-    # No inference mode: what it leaves in a model could not be trained on.
+    # Inference mode would leave tensors in the model that cannot be trained on.
     with torch.no_grad(), autocast:
         ids = model.generate(
             **inputs,

@@ -1,12 +1,12 @@
-"""An item becomes a conversation: the one place that knows how a student is asked and answers.
+"""Build the conversations that a student reads and writes.
 
-The prompt is the prefix as a video with its true times, the question, the four candidates as
-labelled images, and what to write. In reasoning mode the response is the rationale as the regime
-has it, whether each candidate matches it (the match layout, where the regime has that), and the
-answer's line; in answer mode it is that line alone.
+A selection prompt is the prefix as a video with its true times, the question, the four candidates
+as labelled images, and an instruction. In reasoning mode the response is the rationale as the
+regime keeps it, one line per candidate that says whether it matches (the match layout, in regimes
+that have it), and the answer line; in answer mode it is the answer line alone.
 
-What has no candidates is asked for a text alone: what a query's future frame will show, reasoned
-out or described at once, or what a frame shows.
+Prompts without candidates ask for text: a description of the future frame of a retrieval query,
+with or without reasoning, or of a single frame.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from conf.schema import StudentConfig
 from data.records import (
     FPS,
     FRAMES,
@@ -40,13 +39,19 @@ TEXT_INSTRUCTIONS = {
     "caption": "Describe in a sentence or two the objects that the frame shows, and where each of "
     "them is.",
 }
-"""What a model is asked for, of a query or of a frame, where it has no candidates."""
+"""Instructions for prompts without candidates."""
 
 
 @dataclass(frozen=True)
 class Clip:
-    """(T, S, S, 3) uint8 pixels of a prefix, shown at the times of the scene's frames `indices`;
-    the scene's frames a second, and how many it has."""
+    """A prefix as a video.
+
+    Attributes:
+        pixels: (T, S, S, 3) uint8.
+        indices: The scene's frame that each of the T frames is.
+        fps: Frames per second of the scene.
+        total: Frames of the scene.
+    """
 
     pixels: np.ndarray
     indices: list[int]
@@ -55,7 +60,7 @@ class Clip:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """The video's true times, so that a processor neither samples again nor assumes a rate."""
+        """The true times, so that a processor neither samples frames nor assumes a frame rate."""
         return {
             "fps": float(self.fps),
             "total_num_frames": self.total,
@@ -65,8 +70,13 @@ class Clip:
 
 @dataclass(frozen=True)
 class Sight:
-    """An object that one of a sample's pictures shows: which picture (pairs of a clip's frames
-    first, then images), where, as shares of its width and height, and the object's words."""
+    """An object that is visible in one of a sample's pictures.
+
+    Attributes:
+        picture: Index of the picture: pairs of a clip's frames first, then images.
+        place: Column and row of the object as shares of the picture's width and height.
+        words: The words that name the object.
+    """
 
     picture: int
     place: tuple[float, float]
@@ -75,15 +85,15 @@ class Sight:
 
 @dataclass(frozen=True)
 class Sample:
-    """A conversation with its media, before any tokenizer has seen it.
+    """A conversation with its media, before tokenization.
 
     Attributes:
-        content: the user message's parts in the chat template's form; media as bare placeholders.
-        clip: the prefix; None where none is shown.
+        content: Parts of the user message as chat templates take them; media are placeholders.
+        clip: The prefix, or None for a prompt without video.
         images: (S, S, 3) uint8 pixels of each image in order, such as the candidates.
-        response: what the assistant should say, or None where it is to be generated.
-        sights: what the pictures show, where a model is to be taught to see.
-        supervised: whether the response is learnt; else the sample only fills a place.
+        response: The assistant's text, or None if it is to be generated.
+        supervised: Whether the response is trained on. An unsupervised sample only fills a batch.
+        sights: Visible objects, for the training of the tiny base.
     """
 
     sample_id: str
@@ -105,24 +115,28 @@ def answer_line(letter: str) -> str:
 
 
 def instruction(mode: str, regime: str) -> str:
-    """What a student is told to write."""
+    """Return the instruction that ends a prompt."""
     if mode in TEXT_INSTRUCTIONS:
         return TEXT_INSTRUCTIONS[mode]
     if mode == "answer":
         return 'Reply with one line, "Answer:" and the letter.'
     steps = ["scene parse", "motion analysis", "prediction"]
     steps += ["candidate analysis"] * has_analysis(regime)
-    layout = "Then say of each candidate, in a line of its own, whether it matches and why. "
+    match_layout = "Then say of each candidate, in a line of its own, whether it matches and why. "
     return (
         f"Reason about the scene step by step: {', '.join(steps)} and outcome. "
-        f"{layout * has_matches(regime)}"
+        f"{match_layout * has_matches(regime)}"
         'End with a line "Answer:" and the letter.'
     )
 
 
 def response(rationale: str, matches: Sequence[str], letter: str, mode: str, regime: str) -> str:
-    """What a student of a regime answers: `rationale` in its full form, `matches` a line for each
-    candidate in order."""
+    """Return the response that a student of a regime is trained on.
+
+    Args:
+        rationale: The teacher's full text; unused in answer mode.
+        matches: One line per candidate, in order.
+    """
     if mode == "answer":
         return answer_line(letter)
     text = remove_section(rationale, "Answer")
@@ -133,12 +147,12 @@ def response(rationale: str, matches: Sequence[str], letter: str, mode: str, reg
 
 
 def has_analysis(regime: str) -> bool:
-    """Whether a regime's rationales hold their candidate analysis."""
+    """Whether a regime's rationales keep their candidate analysis."""
     return regime != "cot_no_candidate_analysis"
 
 
 def has_matches(regime: str) -> bool:
-    """Whether a regime's answers have the match layout."""
+    """Whether a regime's responses have the match layout."""
     return regime in ("cot", "cot_no_candidate_analysis")
 
 
@@ -147,51 +161,58 @@ def selection_sample(
     mode: str,
     regime: str,
     frames: FrameReader,
-    cfg: StudentConfig,
+    frame_count: int,
     response: str | None = None,
     control: str | None = None,
 ) -> Sample:
-    """A selection item asked in `mode` ("reasoning" or "answer") as a student of `regime` is, its
-    prefix shown as a `control` asks (see `data.tracks.controls`)."""
-    asked = instruction(mode, regime)
-    return instructed_sample(item, mode, asked, frames, cfg, response, control)
+    """Return the conversation about a selection item.
+
+    Args:
+        mode: reasoning or answer.
+        frame_count: Frames of the prefix that are visible.
+        response: The assistant's text, or None if it is to be generated.
+        control: How the prefix is altered (see `data.tracks.controls`).
+    """
+    text = instruction(mode, regime)
+    return instructed_sample(item, mode, text, frames, frame_count, response, control)
 
 
 def instructed_sample(
     item: SelectionItem,
     mode: str,
-    asked: str,
+    instruction: str,
     frames: FrameReader,
-    cfg: StudentConfig,
+    frame_count: int,
     response: str | None = None,
     control: str | None = None,
 ) -> Sample:
-    """A selection item with what is `asked` about it, as `selection_sample` shows it."""
-    shown = prefix_under_control(item, cfg.frames, control)
+    """Return the conversation about a selection item with another instruction."""
+    visible = prefix_under_control(item, frame_count, control)
     parts: list[str | np.ndarray] = [item.question]
     for letter, c in zip(LETTERS, item.candidates, strict=True):
         parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
-    clip = load_clip(item.scene_id, shown, frames) if shown else None
-    return conversation(f"{item.item_id} ({mode})", [*parts, f"\n{asked}"], response, clip)
+    clip = load_clip(item.scene_id, visible, frames) if visible else None
+    return conversation(f"{item.item_id} ({mode})", [*parts, f"\n{instruction}"], response, clip)
 
 
 def text_sample(
-    frames: FrameReader, cfg: StudentConfig, mode: str, thing: RetrievalQuery | FrameRef
+    frames: FrameReader, frame_count: int, mode: str, subject: RetrievalQuery | FrameRef
 ) -> Sample:
-    """A prompt of `TEXT_INSTRUCTIONS` about a query (its prefix and question) or about a frame."""
-    name, asked = f"{thing.name} ({mode})", f"\n{TEXT_INSTRUCTIONS[mode]}"
-    if isinstance(thing, FrameRef):
-        pixels = frames.array(thing.scene_id, thing.frame)
-        return conversation(name, [pixels, asked], None)
-    shown = sample_prefix_frames(thing.prefix_start, thing.prefix_stop, cfg.frames)
-    clip = load_clip(thing.scene_id, shown, frames)
-    return conversation(name, [thing.question, asked], None, clip)
+    """Return the prompt of a mode of `TEXT_INSTRUCTIONS` about a query (its prefix and question) or
+    about a frame."""
+    name, text = f"{subject.name} ({mode})", f"\n{TEXT_INSTRUCTIONS[mode]}"
+    if isinstance(subject, FrameRef):
+        pixels = frames.array(subject.scene_id, subject.frame)
+        return conversation(name, [pixels, text], None)
+    visible = sample_prefix_frames(subject.prefix_start, subject.prefix_stop, frame_count)
+    clip = load_clip(subject.scene_id, visible, frames)
+    return conversation(name, [subject.question, text], None, clip)
 
 
-def load_clip(scene_id: str, shown: list[int], frames: FrameReader) -> Clip:
-    """Frames of a scene as a clip, whose times run on in whatever order they are `shown`."""
+def load_clip(scene_id: str, indices: list[int], frames: FrameReader) -> Clip:
+    """Return frames of a scene as a clip. The times increase whatever the order of `indices`."""
     scene = frames.scene(scene_id)
-    return Clip(frames.stack(scene_id, shown), sorted(shown), scene.fps, scene.frames)
+    return Clip(frames.stack(scene_id, indices), sorted(indices), scene.fps, scene.frames)
 
 
 def conversation(
@@ -201,7 +222,7 @@ def conversation(
     clip: Clip | None = None,
     sights: Sequence[Sight] = (),
 ) -> Sample:
-    """A clip, if there is one, and then `parts`: texts and (S, S, 3) uint8 pixels of images."""
+    """Return a sample of a clip, if any, followed by `parts`: texts and (S, S, 3) uint8 images."""
     content: list[dict[str, Any]] = [{"type": "video"}] if clip else []
     content += [
         {"type": "text", "text": part} if isinstance(part, str) else {"type": "image"}

@@ -1,5 +1,8 @@
-"""Draws a model's tokens so that an answer is a function of its own seed, whichever answers are
-written beside it and however often a command is killed."""
+"""Sample tokens with one seed per response.
+
+A response then depends on its seed only, not on the other responses of its batch or on where a
+killed command resumed.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,8 @@ from conf.schema import StudentConfig
 
 
 def sampling_processors(cfg: StudentConfig, seeds: Sequence[int]) -> LogitsProcessorList:
-    """What makes greedy decoding draw as `cfg` says, each row by its own seed; nothing where the
-    temperature is 0."""
+    """Return logits processors that make greedy decoding sample, each row with its own seed; none
+    at temperature 0."""
     steps = LogitsProcessorList()
     if cfg.temperature:
         steps.append(TemperatureLogitsWarper(float(cfg.temperature)))
@@ -32,7 +35,7 @@ def sampling_processors(cfg: StudentConfig, seeds: Sequence[int]) -> LogitsProce
 
 
 class GumbelNoise(LogitsProcessor):
-    """Adds Gumbel noise to the logits (B, V): the greatest sum is a draw from their softmax."""
+    """Adds Gumbel noise to the logits (B, V): the argmax is then a sample from their softmax."""
 
     def __init__(self, seeds: Sequence[int]) -> None:
         self._seeds = seeds
@@ -40,7 +43,7 @@ class GumbelNoise(LogitsProcessor):
 
     def __call__(self, input_ids: torch.LongTensor, scores: torch.FloatTensor) -> torch.FloatTensor:
         if self._generators is None:
-            # The device is known only here.
+            # The device is not known earlier.
             self._generators = [
                 torch.Generator(scores.device).manual_seed(seed) for seed in self._seeds
             ]

@@ -28,7 +28,7 @@ def samples(micro_store, frames, student_cfg) -> list[Sample]:
     items = micro_store.selection("train")[:2]
     texts = ("Answer: A", "Scene parse: stationary. " * 6 + "\nAnswer: B")
     return [
-        selection_sample(i, "reasoning", "cot", frames, student_cfg, t)
+        selection_sample(i, "reasoning", "cot", frames, student_cfg.frames, t)
         for i, t in zip(items, texts, strict=True)
     ]
 

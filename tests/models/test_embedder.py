@@ -13,7 +13,7 @@ from conf.errors import UserError
 from conf.schema import LateConfig, LoraConfig
 from data.records import FPS, FRAMES, FrameRef, sample_prefix_frames
 from data.tracks.retrieval.database import UniqueFrames
-from models.loading import keep_differentiable
+from models.compat import keep_differentiable
 from models.parameter_counts import count_towers
 from models.retriever import embedder
 from models.retriever.embedder import frame_input, query_input

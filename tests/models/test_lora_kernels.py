@@ -33,7 +33,7 @@ def student(request, nf4_cfg, micro_store, frames):
         if "lora_B" in name:
             nn.init.normal_(weight, std=0.1)
     items = micro_store.selection("train")[:2]
-    shown = [selection_sample(i, "answer", "cot", frames, cfg, "Answer: A") for i in items]
+    shown = [selection_sample(i, "answer", "cot", frames, cfg.frames, "Answer: A") for i in items]
     batch = Collator(processor, 1500)(shown)
     return model.train(), batch, cfg.lora.rank > 0
 

@@ -14,7 +14,7 @@ from transformers import dynamic_module_utils
 
 from conf.compose import compose, register
 from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
-from models.loading import keep_differentiable
+from models.compat import keep_differentiable
 from models.retriever.embedder import (
     frame_input,
     load_retriever,

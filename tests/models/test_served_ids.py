@@ -23,7 +23,7 @@ LENGTH = 1500
 @pytest.fixture(scope="module")
 def sample(micro_store, frames, student_cfg) -> Sample:
     item = micro_store.selection("train")[0]
-    return selection_sample(item, "reasoning", "cot", frames, student_cfg, "near\nAnswer: B")
+    return selection_sample(item, "reasoning", "cot", frames, student_cfg.frames, "near\nAnswer: B")
 
 
 def test_a_prompts_ids_are_those_of_its_parts(sample, processor) -> None:

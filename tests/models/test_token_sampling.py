@@ -66,7 +66,9 @@ def test_a_models_answer_is_its_items_own(
     items = micro_store.selection("test")[:4]
 
     def asked(group: list[int], seed: int = 0) -> list[str]:
-        samples = [selection_sample(items[k], "answer", "cot", frames, student_cfg) for k in group]
+        samples = [
+            selection_sample(items[k], "answer", "cot", frames, student_cfg.frames) for k in group
+        ]
         steps = sampling_processors(drawing(top_k=50), [100 * seed + k for k in group])
         inputs = Collator(processor, 1500)(samples)
         return [w.text for w in generate(model.eval(), processor, inputs, 12, "fp32", steps)]
@@ -84,7 +86,7 @@ def test_a_thought_that_the_prompt_opens_is_opened_in_the_text(
     thinker = deepcopy(processor)
     thinker.chat_template += "{{ '<think>\n' if enable_thinking else '<think>\n\n</think>\n\n' }}"
     [item, *_] = micro_store.selection("test")
-    sample = selection_sample(item, "answer", "cot", frames, student_cfg)
+    sample = selection_sample(item, "answer", "cot", frames, student_cfg.frames)
     [written] = generate(
         model.eval(), thinker, Collator(thinker, 1500, thinking)([sample]), 4, "fp32"
     )

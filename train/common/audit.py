@@ -14,8 +14,8 @@ from conf.errors import UserError
 from conf.schema import RetrieverConfig, StudentConfig
 from data.records import RetrievalQuery
 from data.render.frame_cache import FrameReader
-from models.checks import check_widths
-from models.parameter_counts import check_towers, count_towers, tower_table
+from models.parameter_counts import check_towers, count_towers, format_towers
+from models.retriever.checks import check_widths
 from models.retriever.embedder import Retriever, frame_input, query_input
 from models.retriever.multi_vector import find_scored_tokens
 from models.student.collator import IGNORED, Collator
@@ -36,7 +36,7 @@ def audit(
         UserError: the counts are not what the preset says, or the sample is too long.
     """
     towers = count_towers(model)
-    check_towers(towers, cfg)
+    check_towers(towers, cfg.name, cfg.quantization, cfg.lora.rank)
     batch = collator([sample])
     ids = batch["input_ids"][0]
     supervised = int((batch["labels"] != IGNORED).sum())
@@ -45,7 +45,7 @@ def audit(
     return "\n".join(
         [
             f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'whole'})",
-            tower_table(towers),
+            format_towers(towers),
             f"frames of {cfg.image_size} x {cfg.image_size} px become {grids(batch, processor)}",
             f"the longest sample has {len(ids)} tokens, {supervised} of them supervised:",
             f"{squeeze(decode(prompt))}>>>{squeeze(decode(response))}<<<",
@@ -64,7 +64,7 @@ def audit_retriever(
             width, or the query is too long.
     """
     towers = count_towers(model)
-    check_towers(towers, cfg)
+    check_towers(towers, cfg.name, cfg.quantization, cfg.lora.rank)
     if cfg.late is None:
         check_widths(cfg, model.get_embedding_dimension())
     processor = model[0].processor
@@ -79,7 +79,7 @@ def audit_retriever(
     return "\n".join(
         [
             f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'whole'})",
-            tower_table(towers),
+            format_towers(towers),
             f"frames of {cfg.image_size} x {cfg.image_size} px become "
             f"{grids(asked | {k: shown[k] for k in ('image_grid_thw',)}, processor)}",
             *(embedded_at_last if cfg.late is None else embedded_at_scored)(model, asked, shown),

@@ -1,4 +1,4 @@
-"""Which of a run's checkpoints can be gone on from."""
+"""Find the checkpoint that a run resumes from."""
 
 from __future__ import annotations
 
@@ -26,39 +26,40 @@ NEEDED = {
     "random state": ("rng_state*.pth",),
     "trainer's state": (STATE,),
 }
-"""What a checkpoint must hold, each under one of its patterns: without some of them the trainer
-would go on all the same, from a new optimizer or another chance. Where several ranks write parts
-of one, the list of the parts is written last."""
+"""Parts of a checkpoint, each with the patterns of its files. Without some of them the trainer would
+resume without an error, with a new optimizer or other random numbers. If several ranks write a part
+each, the list of the parts (.metadata) is written last."""
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """The newest whole checkpoint below a run's folder, and None where there is none. Those that a
-    kill, a crash or a full disk cut off are told and passed over."""
+    """Return the newest complete checkpoint in a run's folder, or None. A warning names those that
+    a kill, a crash or a full disk left incomplete."""
     named = [(re.fullmatch(r"checkpoint-(\d+)", p.name), p) for p in folder.glob("checkpoint-*")]
     numbered = sorted(((int(m[1]), p) for m, p in named if m), reverse=True)
     for k, (_, path) in enumerate(numbered):
-        if (problem := cut_off(path)) is None:
+        if (problem := find_damage(path)) is None:
             return path
-        instead = "going on from the one before it" if k + 1 < len(numbered) else "starting anew"
+        instead = "resuming from the one before" if k + 1 < len(numbered) else "starting again"
         log.warning("%s was cut off (%s): %s", path, problem, instead)
     return None
 
 
 def check_best(checkpoint: Path) -> None:
-    """Raises UserError where the checkpoint that was the best before `checkpoint` is not whole: the
-    library would keep the last weights in its place without a word, or fail in the end."""
+    """Raise UserError if the best checkpoint up to `checkpoint` is missing or incomplete: the library
+    would silently keep the last weights instead, or fail at the end."""
     best = json.loads((checkpoint / STATE).read_text())["best_global_step"]
-    if best and (problem := cut_off(kept := checkpoint.with_name(f"checkpoint-{best}"))):
+    if best and (problem := find_damage(kept := checkpoint.with_name(f"checkpoint-{best}"))):
         raise UserError(
-            f"{kept}, the best checkpoint so far, was lost or cut off ({problem}): put it back, or "
-            f"delete {checkpoint.parent} and train again"
+            f"{kept}, the best checkpoint so far, is missing or incomplete ({problem}): restore it, "
+            f"or delete {checkpoint.parent} and train again",
+            code="damaged-file",
         )
 
 
-def cut_off(checkpoint: Path) -> str | None:
-    """What of a checkpoint is missing or not whole; None where nothing is.
+def find_damage(checkpoint: Path) -> str | None:
+    """Return what is missing or incomplete in a checkpoint, or None.
 
-    The trainer writes its state last, but a machine that goes down may lose any of the files.
+    The trainer writes its state last, but a machine that crashes may lose any file.
     """
     for what, patterns in NEEDED.items():
         if not any(True for pattern in patterns for _ in checkpoint.glob(pattern)):
@@ -70,7 +71,7 @@ def cut_off(checkpoint: Path) -> str | None:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a file of weights, of pickled state or of JSON has its end; others count as whole."""
+    """Whether a file of weights, pickled state or JSON is complete; other files always are."""
     try:
         if path.suffix == ".json":
             json.loads(path.read_bytes())
@@ -78,7 +79,7 @@ def is_whole(path: Path) -> bool:
             with safe_open(path, "pt"):
                 pass
         elif path.suffix in (".pt", ".pth", ".bin"):
-            # torch writes zip archives, whose table of contents stands at the end.
+            # torch writes zip archives, whose table of contents is at the end.
             zipfile.ZipFile(path).close()
     except (OSError, ValueError, SafetensorError, zipfile.BadZipFile):
         return False

@@ -32,7 +32,7 @@ def empty_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def curves_figure(records: Sequence[dict[str, float]], path: Path | str) -> None:
+def plot_curves(records: Sequence[dict[str, float]], path: Path | str) -> None:
     """Training and evaluation losses over steps; then, where they were evaluated, the measures of
     all items, each on axes of its own where they are many, and the letter accuracy by family.
 

@@ -13,8 +13,7 @@ from conf.errors import UserError
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
 from data.tracks.retrieval.checks import check_training
-from train.common.training_loop import check_not_empty
-from train.student.dataset import held_out_scenes, shuffled
+from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 
 
 def split_queries(

@@ -11,7 +11,7 @@ from conf.schema import ContrastiveCommand, LoraConfig
 from data.build import ensure_benchmark
 from data.records import RetrievalQuery
 from data.render.frame_cache import FrameReader
-from models import loading
+from models import compat, loading
 from models.retriever.embedder import (
     Retriever,
     embed,
@@ -55,7 +55,7 @@ class RetrieverMerge:
     def trained_outputs(self, items: Items) -> ModelOutputs:
         model = load_trained(self._preset, self._precision, self._saved)
         # Some CPUs round 4-bit products differently once the weights are packed for inference.
-        loading.keep_differentiable(model)
+        compat.keep_differentiable(model)
         return self._outputs(model, items)
 
     def write(self, folder: Path, format: str) -> None:

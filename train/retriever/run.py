@@ -20,7 +20,7 @@ from conf.runs import rank
 from conf.schema import ContrastiveCommand, ContrastiveTrainConfig, RetrieverConfig
 from data.render.frame_cache import FrameReader
 from data.store import Store
-from models import distributed, memory
+from models import compat, distributed
 from models.lora_kernels import fuse
 from models.resolved import data_digest, resolve_run
 from models.retriever.embedder import (
@@ -30,7 +30,7 @@ from models.retriever.embedder import (
     longest_query,
     tokenizer_texts,
 )
-from train.common import checkpoints, journal, training_loop
+from train.common import arguments, callbacks, checkpoints, journal, training_loop
 from train.common.audit import audit_retriever
 from train.retriever.batches import QueryBatchSampler, batch_columns, split_queries
 from train.retriever.evaluator import (
@@ -56,7 +56,7 @@ def train_retriever(
 ) -> dict[str, float]:
     """Train a retriever in its run's folder and return its final metrics. `rank_batch` is the
     number of queries that each rank contributes to a step."""
-    memory.keep_freed_memory()
+    compat.keep_freed_memory()
     # New adapters are initialised before the trainer sets its seed.
     set_seed(cfg.seed)
     checkpoint = checkpoints.newest_checkpoint(run.folder)
@@ -71,7 +71,7 @@ def train_retriever(
     log.info("loading retriever %s, which computes in %s", preset.name, precision)
     frames = FrameReader(store, preset.image_size)
     texts = tokenizer_texts(store.retrieval("train"), preset)
-    with training_loop.loading(run.folder, "retriever"):
+    with training_loop.explain_load_errors(run.folder, "retriever"):
         model = load_retriever(preset, precision, texts, run.folder / "untrained")
     fuse(model)
     log.info(audit_retriever(model, preset, longest_query(training, model.tokenizer), frames))
@@ -93,7 +93,7 @@ def train_retriever(
     trainer = (MultiVectorTrainer if late else RetrieverTrainer)(
         model=model,
         args=arguments_class(
-            **training_loop.arguments(train, run, cfg.seed, checkpoint)
+            **arguments.common_arguments(train, run, cfg.seed, checkpoint)
             # A batch is a list of numbers: the loss loads its pixels.
             | {"dataloader_num_workers": 0},
             per_device_train_batch_size=rank_batch,
@@ -105,17 +105,17 @@ def train_retriever(
         ),
         loss=build_loss(train, preset, model, frames),
         data_collator=IndexCollator(preprocess_fn=model.preprocess),
-        callbacks=[miner, training_loop.Epochs(sampler)],
+        callbacks=[miner, callbacks.EpochCallback(sampler)],
         sampler=sampler,
         columns_of=lambda numbers: batch_columns(
             [miner.update(training[k]) for k in numbers], train.hard_negatives
         ),
     )
-    best = training_loop.train_and_log(trainer, run, checkpoint, memory_advice(train))
+    best = training_loop.run_training(trainer, run, checkpoint, memory_advice(train))
     if rank() == 0:
         model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)
     log.info("the retriever is in %s", run.folder / "retriever")
-    return journal.evaluated(run.folder, best)
+    return journal.run_metrics(run.folder, best)
 
 
 def build_loss(

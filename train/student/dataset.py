@@ -1,15 +1,10 @@
-"""What a regime trains on and is measured on: lists of samples that are made when asked for."""
+"""The training and held-out datasets of a student."""
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar
 
-import numpy as np
-
-from conf.schema import SftCommand, SftTrainConfig, StudentConfig
 from data.records import LETTERS, Rationale, SelectionItem
 from data.render.frame_cache import FrameReader
 from data.store import Store
@@ -25,151 +20,148 @@ from models.student.prompts import (
 from teacher.candidate_letters import relabel_text, reorder_candidates
 from teacher.narrator import write_match_lines
 from teacher.predicates import extract_predicates
-from train.student.lazy_samples import LazySample, Samples, seeded_rng
+from train.common.held_out import check_not_empty, held_out_scenes, shuffled
+from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
 from train.tiny_base import questions
 
-HELD_OUT = 0.1
-"""Share of the training scenes whose items measure a run."""
-
-Row = TypeVar("Row")
+WITHOUT_RATIONALES = ("answer_only", "describe")
+"""Regimes that train on no rationales."""
 
 
 @dataclass(frozen=True)
 class Supervised:
-    """An item in one mode, with what a student of `regime` is to answer. Where there is a `seed`,
-    its candidates stand in an order of their own in each epoch."""
+    """A selection item in one mode, with its rationale and match lines (empty in answer mode)."""
 
     item: SelectionItem
-    rationale: str
-    matches: tuple[str, ...]
     mode: str
     regime: str
-    seed: int | None = None
+    rationale: str = ""
+    matches: tuple[str, ...] = ()
 
+    @property
+    def response(self) -> str:
+        return response(self.rationale, self.matches, self.item.letter, self.mode, self.regime)
+
+    @property
     def text(self) -> str:
-        told = response(self.rationale, self.matches, self.item.letter, self.mode, self.regime)
-        return f"{self.item.question} {instruction(self.mode, self.regime)} {told}"
+        return f"{self.item.question} {instruction(self.mode, self.regime)} {self.response}"
 
-    def in_epoch(self, epoch: int) -> Supervised:
-        """The same with its candidates in the epoch's order, and all letters with them."""
-        if self.seed is None:
-            return self
-        rng = seeded_rng(self.seed, epoch, self.item.item_id)
-        order = rng.permutation(len(LETTERS)).tolist()
+    def permuted(self, seed: int, epoch: int) -> Supervised:
+        """Permute the candidates, and the letters in the texts with them, by seed and epoch."""
+        order = seeded_rng(seed, epoch, self.item.item_id).permutation(len(LETTERS)).tolist()
         return replace(
             self,
             item=reorder_candidates(self.item, order),
             rationale=relabel_text(self.rationale, order),
-            # The letters again stand in their own order.
+            # One line per candidate, in the order of the letters.
             matches=tuple(sorted(relabel_text(line, order) for line in self.matches)),
         )
 
-    def sample(self, frames: FrameReader, cfg: StudentConfig, epoch: int) -> Sample:
-        shown = self.in_epoch(epoch)
-        told = response(shown.rationale, shown.matches, shown.item.letter, self.mode, self.regime)
-        return selection_sample(shown.item, self.mode, self.regime, frames, cfg, told)
-
-    def planned(self, frames: FrameReader, cfg: StudentConfig) -> LazySample:
-        media = cfg.frames // 2 + len(LETTERS)
-        make = partial(self.sample, frames, cfg)
-        return LazySample(self.text(), media, make, self.item.family)
-
-
-def held_out_scenes(store: Store) -> set[str]:
-    """A share of the training scenes, kept from training to measure it. Test scenes are never
-    touched here.
-
-    It goes by each scene's name alone, not by a run's seed or the store's other scenes: a base must
-    not have been trained on what measures a student that is trained over it.
-    """
-    names = store.scene_ids("train")
-    # A store of a few scenes may have none below the bound.
-    return {name for name in names if lot(name) < HELD_OUT} or {min(names, key=lot)}
-
-
-def lot(name: str) -> float:
-    """A number in [0, 1) that follows from a name alone."""
-    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") / 2**64
-
-
-def shows_only(item: SelectionItem, scenes: set[str]) -> bool:
-    """Whether all that an item shows is of these scenes."""
-    return {item.scene_id, *(c.scene_id for c in item.candidates)} <= scenes
-
-
-def shuffled(rows: list[Row], seed: int) -> list[Row]:
-    """The rows in a seeded order."""
-    return [rows[k] for k in np.random.default_rng([seed, 2]).permutation(len(rows))]
-
 
 def supervised_items(
-    store: Store,
-    items: list[SelectionItem],
-    rationales: dict[str, Rationale],
-    train: SftTrainConfig,
-    seed: int | None,
+    store: Store, items: list[SelectionItem], rationales: dict[str, Rationale], regime: str
 ) -> dict[str, list[Supervised]]:
-    """Each item in reasoning mode, where it has a rationale, and in answer mode. A `seed` permutes
-    candidates from epoch to epoch."""
-    made: dict[str, list[Supervised]] = {mode: [] for mode in MODES}
+    """Return each item in answer mode and, if it has a rationale, in reasoning mode.
+
+    A CoT student learns both modes, so that it can be prompted in either.
+    """
+    by_mode: dict[str, list[Supervised]] = {mode: [] for mode in MODES}
     for item in items:
         if rationale := rationales.get(item.item_id):
-            told = rationale.text, _matches(store, item, train.regime)
-            made["reasoning"].append(Supervised(item, *told, "reasoning", train.regime, seed))
-        made["answer"].append(Supervised(item, "", (), "answer", train.regime, seed))
-    return made
+            lines = match_lines(store, item) if has_matches(regime) else ()
+            by_mode["reasoning"].append(
+                Supervised(item, "reasoning", regime, rationale.text, lines)
+            )
+        by_mode["answer"].append(Supervised(item, "answer", regime))
+    return by_mode
 
 
-def _matches(store: Store, item: SelectionItem, regime: str) -> tuple[str, ...]:
-    if not has_matches(regime):
-        return ()
+def match_lines(store: Store, item: SelectionItem) -> tuple[str, ...]:
+    """Return the match layout's line for each candidate of an item that has a rationale."""
     predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
-    # An item with too short a prefix has no rationale either.
+    # An item whose prefix is too short for predicates has no rationale either.
     assert predicates is not None
     return write_match_lines(predicates, item)
 
 
-def splits(
-    store: Store, rationales: list[Rationale], cfg: SftCommand, frames: FrameReader
-) -> tuple[Samples, dict[str, Samples]]:
-    """Training samples of a regime, and what measures it on held-out training scenes, by mode."""
+def load_supervised(
+    supervised: Supervised, frames: FrameReader, frame_count: int, seed: int | None, epoch: int
+) -> Sample:
+    """Render a sample, with its candidates permuted from epoch to epoch if there is a seed."""
+    one = supervised if seed is None else supervised.permuted(seed, epoch)
+    return selection_sample(one.item, one.mode, one.regime, frames, frame_count, one.response)
+
+
+def build_datasets(
+    store: Store,
+    rationales: list[Rationale],
+    frames: FrameReader,
+    *,
+    regime: str,
+    frame_count: int,
+    seed: int,
+    validation_items: int,
+    permute_candidates: bool = False,
+) -> tuple[StudentDataset, dict[str, StudentDataset]]:
+    """Return a regime's training dataset, and its held-out datasets by mode.
+
+    Args:
+        frame_count: Frames of a prefix that are visible.
+        validation_items: Items of held-out training scenes, at most.
+        permute_candidates: Whether the candidates' order changes from epoch to epoch in training.
+
+    Raises:
+        UserError: a dataset is empty.
+    """
+    if regime not in WITHOUT_RATIONALES:
+        check_not_empty(len(rationales), "accepted rationales")
     held_out = held_out_scenes(store)
     others = set(store.scene_ids("train")) - held_out
-    limit = cfg.train.validation_items
     items = store.selection("train")
-    # A training item may show, among its candidates, no frame of what measures the run.
+    # No frame of a held-out scene is visible in training, not even as a distractor.
     trained = [item for item in items if shows_only(item, others)]
-    if cfg.train.regime == "describe":
+    if regime == "describe":
         kept = [item for item in items if shows_only(item, held_out)]
-        told, measuring = (
-            questions.build_questions(store, part, cfg.student, frames, cfg.seed)
+        training, validation = (
+            questions.build_questions(store, part, frame_count, frames, seed)
             for part in (trained, kept)
         )
-        return Samples([sample for made in told.values() for sample in made]), {
-            kind: Samples(shuffled(made, cfg.seed)[:limit])
-            for kind, made in measuring.items()
-            if made
-        }
-    by_item = {r.item_id: r for r in rationales}
-    # The items of every family stand together: a shuffled slice measures all of them.
-    kept = shuffled([i for i in items if i.scene_id in held_out], cfg.seed)[:limit]
-    seed = cfg.seed if cfg.train.permute_candidates else None
-    training = supervised_items(store, trained, by_item, cfg.train, seed)
-    validation = supervised_items(store, kept, by_item, cfg.train, None)
+        validation = {kind: shuffled(v, seed)[:validation_items] for kind, v in validation.items()}
+    else:
+        by_item = {r.item_id: r for r in rationales}
+        # The items are sorted by family: a shuffled slice measures all of them.
+        kept = shuffled([i for i in items if i.scene_id in held_out], seed)[:validation_items]
 
-    def planned(supervised: list[Supervised]) -> list[LazySample]:
-        return [s.planned(frames, cfg.student) for s in supervised]
+        def lazy(items: list[SelectionItem], seed: int | None) -> dict[str, list[LazySample]]:
+            media = frame_count // 2 + len(LETTERS)
+            return {
+                mode: [
+                    LazySample(
+                        one.text,
+                        media,
+                        partial(load_supervised, one, frames, frame_count, seed),
+                        one.item.family,
+                    )
+                    for one in supervised
+                ]
+                for mode, supervised in supervised_items(store, items, by_item, regime).items()
+            }
 
-    # A CoT student learns both modes, so that it can be asked in either.
-    return (
-        Samples([sample for mode in MODES for sample in planned(training[mode])]),
-        {mode: Samples(planned(made)) for mode, made in validation.items() if made},
-    )
+        training, validation = lazy(trained, seed if permute_candidates else None), lazy(kept, None)
+    samples = [sample for part in training.values() for sample in part]
+    check_not_empty(len(samples), f"samples for train.regime={regime}")
+    check_not_empty(sum(map(len, validation.values())), "items of held-out training scenes")
+    return StudentDataset(samples), {m: StudentDataset(v) for m, v in validation.items() if v}
 
 
-def corpus(store: Store, rationales: list[Rationale]) -> list[str]:
-    """Texts for a tokenizer built from nothing: all that a student reads and writes."""
-    asked_questions = sorted({item.question for item in store.selection("train")})
+def shows_only(item: SelectionItem, scenes: set[str]) -> bool:
+    """Whether all frames of an item belong to these scenes."""
+    return {item.scene_id, *(c.scene_id for c in item.candidates)} <= scenes
+
+
+def tokenizer_corpus(store: Store, rationales: list[Rationale]) -> list[str]:
+    """Return texts to train a tokenizer on: everything that a student reads and writes."""
+    item_questions = sorted({item.question for item in store.selection("train")})
     letters = [
         f"\nCandidate {x}: \nCandidate {x} matches: every object is where it should be.\n"
         f"Candidate {x} does not match: it shows other objects and lacks\n{answer_line(x)}"
@@ -177,14 +169,7 @@ def corpus(store: Store, rationales: list[Rationale]) -> list[str]:
     ]
     # Every digit and the timestamps' frame, often enough to be worth merges.
     clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
-    asked = [instruction(mode, "cot") for mode in MODES]
-    prompts = [
-        *asked_questions,
-        *letters,
-        *asked,
-        *questions.QUESTIONS,
-        "user",
-        "assistant",
-        "Later: ",
-    ]
+    instructions = [instruction(mode, "cot") for mode in MODES]
+    roles = ["user", "assistant", "Later: "]
+    prompts = [*item_questions, *letters, *instructions, *questions.QUESTIONS, *roles]
     return [*prompts * 20, *clock, *(r.text for r in rationales)]

@@ -1,4 +1,4 @@
-"""Answers that a student generates for held-out items at each evaluation of a training run."""
+"""Answers that a student generates for held-out items at each evaluation of its training."""
 
 from __future__ import annotations
 
@@ -12,53 +12,62 @@ from typing import Any
 from torch import nn
 from transformers import ProcessorMixin
 
-from conf.schema import StudentConfig
 from models.memory import explain_out_of_memory
 from models.student.answer_parser import parse_choice
 from models.student.collator import Collator
 from models.student.generation import GeneratedText, generate, response_token_limit
-from train.common.journal import WRITTEN
-from train.student.lazy_samples import Samples
+from train.common.journal import ANSWERS
+from train.student.lazy_samples import StudentDataset
 
 log = logging.getLogger(__name__)
 
 
 class HeldOutAnswers:
-    """Asks a student for its answers to the first held-out samples of a mode, all at once, and
-    keeps them in the run's samples.jsonl. Decoding is greedy: the run's chance is not touched."""
+    """Generates a student's answers to the first held-out samples of a mode, in one batch, and
+    appends them to the run's samples.jsonl. Decoding is greedy and uses no random numbers.
+
+    Args:
+        max_length: Most tokens of a prompt.
+        max_new_tokens: Most tokens of a response in reasoning mode.
+        count: Samples of each mode.
+    """
 
     def __init__(
         self,
         processor: ProcessorMixin,
-        cfg: StudentConfig,
+        folder: Path,
+        *,
+        max_length: int,
+        max_new_tokens: int,
         precision: str,
         count: int,
-        folder: Path,
     ) -> None:
-        self._processor, self._cfg, self._precision = processor, cfg, precision
+        self._processor = processor
+        self._path = folder / ANSWERS
+        self._collator = Collator(processor, max_length)
+        self._max_new_tokens = max_new_tokens
+        self._precision = precision
         self._count = count
-        self._path = folder / WRITTEN
-        self._collator = Collator(processor, cfg.max_length)
 
     def measure(
-        self, model: nn.Module, mode: str, samples: Samples, step: int, keep: bool = True
+        self, model: nn.Module, mode: str, samples: StudentDataset, step: int, keep: bool = True
     ) -> dict[str, float]:
-        """The share of answers whose letter can be read, and of those that are right, over the
-        items that ask for a letter; nothing where none does. `keep` writes the answers down.
+        """Return the share of answers that can be parsed and the share that is right, over the
+        items that ask for a letter; empty if none does. `keep` writes the answers to the file.
 
         Raises:
-            UserError: memory runs out.
+            UserError: out of memory.
         """
-        asked = [samples[k] for k in range(min(self._count, len(samples)))]
-        inputs = self._collator([replace(sample, response=None) for sample in asked])
-        limit = response_token_limit(mode, self._cfg)
-        when = f"where the student answers {len(asked)} held-out items after step {step}"
-        lower = "lower train.generated_items, or set it to 0, in a run of its own (run=NAME)"
+        held_out = [samples[k] for k in range(min(self._count, len(samples)))]
+        inputs = self._collator([replace(sample, response=None) for sample in held_out])
+        limit = response_token_limit(mode, self._max_new_tokens)
+        when = f"while generating {len(held_out)} answers after step {step}"
+        lower = "lower train.generated_items, or set it to 0, in another run (run=NAME)"
         with explain_out_of_memory(when, lower):
             texts = generate(model, self._processor, inputs, limit, self._precision)
         rows = [
-            _row(step, mode, sample.sample_id, written, sample.response)
-            for sample, written in zip(asked, texts, strict=True)
+            _row(step, mode, sample.sample_id, text, sample.response)
+            for sample, text in zip(held_out, texts, strict=True)
         ]
         if keep:
             self._keep(rows)
@@ -73,25 +82,25 @@ class HeldOutAnswers:
     def _keep(self, rows: list[dict[str, Any]]) -> None:
         with open(self._path, "a") as file:
             file.writelines(json.dumps(row) + "\n" for row in rows)
-        # Another item at each evaluation, so that the log shows several of them.
-        shown = rows[rows[0]["step"] % len(rows)]
-        told = f"; the answer is {shown['answer']}" if shown["answer"] else ""
-        text = indent(shown["text"] or "(nothing)", "    ")
-        log.info("step %d, %s%s:\n%s", shown["step"], shown["sample"], told, text)
+        # The log prints another item at each evaluation.
+        row = rows[rows[0]["step"] % len(rows)]
+        answer = f"; the answer is {row['answer']}" if row["answer"] else ""
+        text = indent(row["text"] or "(empty)", "    ")
+        log.info("step %d, %s%s:\n%s", row["step"], row["sample"], answer, text)
 
 
 def _row(
-    step: int, mode: str, sample: str, written: GeneratedText, response: str
+    step: int, mode: str, sample: str, generated: GeneratedText, response: str
 ) -> dict[str, Any]:
-    """One line of samples.jsonl; `answer` is the right letter, as it stands in the response that
-    is held out, and null where none is asked for."""
-    choice = parse_choice(written.text, cut=written.cut)
+    """Return a line of samples.jsonl; `answer` is the letter of the held-out response, or None if
+    it has no answer line."""
+    parsed = parse_choice(generated.text, cut=generated.cut)
     return {
         "step": step,
         "mode": mode,
         "sample": sample,
-        "text": written.text,
-        "letter": choice.letter,
-        "reason": None if choice.letter else choice.reason and str(choice.reason),
+        "text": generated.text,
+        "letter": parsed.letter,
+        "reason": None if parsed.letter else parsed.reason and str(parsed.reason),
         "answer": parse_choice(response).letter,
     }

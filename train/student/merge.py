@@ -10,18 +10,18 @@ from transformers import ProcessorMixin
 from conf.errors import UserError
 from conf.schema import SftCommand
 from data.build import ensure_benchmark
-from data.render.frame_cache import FrameReader
-from models import loading
+from models import compat, loading
 from models.student.collator import Collator, letter_ids
 from teacher.narrate import JOURNAL_FILE, ensure_rationales
 from train.common.merge import ModelOutputs, check_benchmark
-from train.student.dataset import Samples, splits
-from train.student.trainer import LetterChoice
+from train.student.lazy_samples import StudentDataset
+from train.student.metrics import LetterAccuracy
+from train.student.run import load_datasets
 
 MAX_SAMPLES = 16
 """Held-out samples of each mode that are compared: at 8B, their logits take 3 GB."""
 
-Items = dict[str, Samples]
+Items = dict[str, StudentDataset]
 
 
 class StudentMerge:
@@ -52,14 +52,12 @@ class StudentMerge:
                 code="missing-rationales",
             )
         rationales = ensure_rationales(opened, settings.teacher) if reasons else []
-        return splits(opened, rationales, settings, FrameReader(opened, self._student.image_size))[
-            1
-        ]
+        return load_datasets(settings, opened, rationales)[1]
 
     def trained_outputs(self, items: Items) -> ModelOutputs:
         model, processor = loading.load_trained(self._student, self._precision, self._saved)
         # Some CPUs round 4-bit products differently once the weights are packed for inference.
-        loading.keep_differentiable(model)
+        compat.keep_differentiable(model)
         return self._outputs(model, processor, items, self._precision == "bf16")
 
     def write(self, folder: Path, format: str) -> None:
@@ -76,7 +74,7 @@ class StudentMerge:
     ) -> ModelOutputs:
         """`bf16`: whether passes are autocast; otherwise they compute as the weights are."""
         describes = self._settings.train.regime == "describe"
-        letters = None if describes else LetterChoice(letter_ids(processor))
+        letters = None if describes else LetterAccuracy(letter_ids(processor))
         collator = Collator(processor, self._student.max_length)
         device = next(model.parameters()).device
         outputs = ModelOutputs({})
@@ -91,5 +89,5 @@ class StudentMerge:
                 logits.append(predicted[0, :-1].cpu())
                 if letters:
                     choices = outputs.choices.setdefault(f"{mode}_letter", [])
-                    choices.append(int(letters.shrink(predicted, labels)[0, 0]))
+                    choices.append(int(letters.reduce(predicted, labels)[0, 0]))
         return outputs

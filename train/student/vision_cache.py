@@ -1,8 +1,8 @@
-"""The frozen vision tower's outputs, kept from the first time that a frame is shown.
+"""A cache of the frozen vision tower's outputs.
 
-The tower sees an image, or two frames of a clip that share a patch in time, by itself: what it
-makes of them is the same in every sample, epoch and evaluation that shows them. They go by their
-pixels, so that what is not the same is never taken for it.
+The tower attends within one image, or within two frames of a clip that share a temporal patch: its
+output for such a slice is the same in every sample, epoch and evaluation. The cache is keyed by the
+pixels, so that no slice is mistaken for another.
 """
 
 from __future__ import annotations
@@ -19,31 +19,19 @@ from torch import nn
 from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
 
 from conf.errors import UserError
-from conf.runs import local_world_size
-from conf.schema import SftTrainConfig
-from models.memory import available_bytes
-from models.student.collator import MEDIA, Collator
+from models.distributed import is_sharded
+from models.student.collator import MEDIA
 from models.student.prompts import Sample
 
 log = logging.getLogger(__name__)
 
-KEYS = "slices"
-"""Names what each slice of a batch's media shows: first those of the images, then of the clips."""
+SLICES = "slices"
+"""Name of a batch's slice digests: images first, then pairs of the clips' frames."""
 
 
-class Keyed:
-    """A collator whose batches name, as `slices`, what each slice of their media shows."""
-
-    def __init__(self, collator: Collator) -> None:
-        self._collator = collator
-
-    def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
-        return {**self._collator.named(samples), KEYS: keys_of(samples)}
-
-
-def keys_of(samples: Sequence[Sample]) -> list[bytes]:
-    """Of the images in order, then of the clips' pairs of frames in order."""
-    # An image passes the tower as two frames that are the same; so does a clip's odd last one.
+def slice_digests(samples: Sequence[Sample]) -> list[bytes]:
+    """Return a digest of each image in order, then of each pair of the clips' frames in order."""
+    # The tower takes an image as two equal frames; so it does with the odd last frame of a clip.
     pairs = [(image, image) for sample in samples for image in sample.images]
     for sample in samples:
         if sample.clip is not None:
@@ -54,26 +42,39 @@ def keys_of(samples: Sequence[Sample]) -> list[bytes]:
 
 
 def _digest(first: np.ndarray, second: np.ndarray) -> bytes:
-    told = hashlib.blake2b(repr(first.shape).encode(), digest_size=16)
-    told.update(np.ascontiguousarray(first))
-    told.update(np.ascontiguousarray(second))
-    return told.digest()
+    digest = hashlib.blake2b(repr(first.shape).encode(), digest_size=16)
+    digest.update(np.ascontiguousarray(first))
+    digest.update(np.ascontiguousarray(second))
+    return digest.digest()
 
 
-class Features:
-    """Gives a batch its tower's outputs in place of its pixels. What was made first is kept, in the
-    machine's memory, up to `limit` bytes: the rest passes the tower each time."""
+class VisionCache:
+    """Replaces a batch's pixels by the tower's outputs, which it keeps in the machine's memory.
 
-    def __init__(self, base: nn.Module, precision: str, limit: int) -> None:
-        """`base` is the generative model, without adapters around it.
+    Once `limit` bytes are reached nothing more is kept: other slices pass the tower each time.
 
-        Raises:
-            UserError: its tower is trained.
-        """
+    Args:
+        model: The student, with or without adapters.
+        precision: bf16 or fp32.
+        limit: In bytes.
+
+    Raises:
+        UserError: the vision tower is trained, or sharded over ranks.
+    """
+
+    def __init__(self, model: nn.Module, precision: str, limit: int) -> None:
+        base = model.get_base_model() if isinstance(model, peft.PeftModel) else model
         if any(weight.requires_grad for weight in base.model.visual.parameters()):
             raise UserError(
-                "train.reuse_features=true: the vision tower is trained here, and what it makes of "
-                "a frame changes; give adapters with student.lora.rank above 0, or leave it false"
+                "train.reuse_features=true needs a frozen vision tower, and this one is trained: "
+                "set student.lora.rank above 0, or train.reuse_features=false",
+                code="vision-tower-trained",
+            )
+        if is_sharded():
+            raise UserError(
+                "train.reuse_features=true does not work with FSDP, which leaves no rank a whole "
+                "vision tower: set it to false, or start without --use_fsdp",
+                code="unsupported-with-fsdp",
             )
         self._base = base
         self._precision = precision
@@ -81,42 +82,34 @@ class Features:
         self._kept: dict[bytes, torch.Tensor] = {}
         self.bytes = 0
 
-    @classmethod
-    def of(cls, model: nn.Module, train: SftTrainConfig) -> Features:
-        """For a student, in this rank's part of half of the machine's free memory."""
-        base = model.get_base_model() if isinstance(model, peft.PeftModel) else model
-        return cls(
-            base, train.precision, available_bytes(torch.device("cpu")) // 2 // local_world_size()
-        )
-
-    def give(self, inputs: dict[str, Any]) -> None:
-        """Put a batch's outputs, as `mm_encoder_outputs`, in the place of its pixels."""
-        keys = inputs.pop(KEYS)
-        shown, counts = self._slices(inputs, keys)
-        missing = {key: rows for key, rows in shown.items() if key not in self._kept}
-        made = self._made(missing, inputs)
+    def replace_pixels(self, inputs: dict[str, Any]) -> None:
+        """Put the tower's outputs, as `mm_encoder_outputs`, in the place of a batch's pixels."""
+        digests = inputs.pop(SLICES)
+        slices, counts = self._slices(inputs, digests)
+        missing = {key: patches for key, patches in slices.items() if key not in self._kept}
+        new = self._encode(missing, inputs)
         device = inputs["input_ids"].device
         outputs, start = {}, 0
         for kind, count in counts.items():
-            slices = [
-                made[key] if key in made else self._kept[key].to(device, non_blocking=True)
-                for key in keys[start : start + count]
+            features = [
+                new[key] if key in new else self._kept[key].to(device, non_blocking=True)
+                for key in digests[start : start + count]
             ]
             start += count
-            merged, *deepstack = torch.cat(slices, dim=1).unbind()
+            merged, *deepstack = torch.cat(features, dim=1).unbind()
             outputs[kind] = BaseModelOutputWithDeepstackFeatures(
                 pooler_output=(merged,), deepstack_features=[(layer,) for layer in deepstack]
             )
         inputs["mm_encoder_outputs"] = outputs
-        for key, features in made.items():
+        for key, features in new.items():
             self._keep(key, features)
 
     @staticmethod
     def _slices(
-        inputs: dict[str, Any], keys: Sequence[bytes]
+        inputs: dict[str, Any], digests: Sequence[bytes]
     ) -> tuple[dict[bytes, torch.Tensor], dict[str, int]]:
-        """The patches of each distinct slice, and how many slices there are of each kind."""
-        rows, counts = [], {}
+        """Return the patches of each distinct slice, and the number of slices by kind of media."""
+        patches, counts = [], {}
         for kind, (name, grid) in MEDIA.items():
             if name in inputs:
                 each = [
@@ -124,32 +117,33 @@ class Features:
                     for time, height, width in inputs[grid].tolist()
                     for _ in range(time)
                 ]
-                rows += inputs.pop(name).split(each)
+                patches += inputs.pop(name).split(each)
                 counts[kind] = len(each)
-        return dict(zip(keys, rows, strict=True)), counts
+        return dict(zip(digests, patches, strict=True)), counts
 
-    def _made(
-        self, missing: dict[bytes, torch.Tensor], inputs: dict[str, Any]
+    def _encode(
+        self, slices: dict[bytes, torch.Tensor], inputs: dict[str, Any]
     ) -> dict[bytes, torch.Tensor]:
-        """(1 + deepstack layers, tokens, hidden) of each slice that is new; all have one size."""
-        if not missing:
+        """Return (1 + deepstack layers, tokens, hidden) for each slice; all have one size."""
+        if not slices:
             return {}
         height, width = next(inputs[g] for _, g in MEDIA.values() if g in inputs)[0, 1:].tolist()
-        grid = torch.tensor([[1, height, width]] * len(missing))
-        rows = torch.cat(list(missing.values()))
+        grid = torch.tensor([[1, height, width]] * len(slices))
+        patches = torch.cat(list(slices.values()))
+        device = patches.device
         with (
             torch.no_grad(),
-            torch.autocast(rows.device.type, torch.bfloat16, enabled=self._precision == "bf16"),
+            torch.autocast(device.type, torch.bfloat16, enabled=self._precision == "bf16"),
         ):
-            found = self._base.get_image_features(rows, grid.to(rows.device))
-        layers = [found.pooler_output, *found.deepstack_features]
-        return {key: torch.stack([layer[k] for layer in layers]) for k, key in enumerate(missing)}
+            encoded = self._base.get_image_features(patches, grid.to(device))
+        layers = [encoded.pooler_output, *encoded.deepstack_features]
+        return {key: torch.stack([layer[k] for layer in layers]) for k, key in enumerate(slices)}
 
     def _keep(self, key: bytes, features: torch.Tensor) -> None:
         size = features.nbytes
         if self.bytes + size > self._limit:
             if self.bytes <= self._limit:
-                log.info("the features kept fill %.1f GiB; no more are", self.bytes / 2**30)
+                log.info("the vision cache is full (%.1f GiB)", self.bytes / 2**30)
                 self._limit = 0
             return
         self._kept[key] = features.cpu()

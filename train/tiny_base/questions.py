@@ -14,7 +14,6 @@ from functools import partial
 
 import numpy as np
 
-from conf.schema import StudentConfig
 from data.records import LETTERS, Scene, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from data.store import Store
@@ -65,10 +64,10 @@ NAMED = 4
 
 
 def build_questions(
-    store: Store, items: list[SelectionItem], cfg: StudentConfig, frames: FrameReader, seed: int
+    store: Store, items: list[SelectionItem], frame_count: int, frames: FrameReader, seed: int
 ) -> dict[str, list[LazySample]]:
     """Samples by kind of question. Frames, candidates and their order are random in each epoch."""
-    make = _SampleBuilder(store, cfg, frames, seed, items)
+    make = _SampleBuilder(store, frame_count, frames, seed, items)
     return {
         "frame": [make.frame(item, k) for item in items for k in range(FRAMES)],
         "candidates": [make.candidates(item, k) for item in items for k in range(SETS)],
@@ -94,14 +93,15 @@ class _SampleBuilder:
     def __init__(
         self,
         store: Store,
-        cfg: StudentConfig,
+        frame_count: int,
         frames: FrameReader,
         seed: int,
         items: list[SelectionItem],
     ) -> None:
-        self.store, self.cfg, self.frames, self.seed = store, cfg, frames, seed
+        self.store, self.frames, self.seed = store, frames, seed
+        self.frame_count = frame_count
         self.items = items
-        self.media = cfg.frames // 2
+        self.media = frame_count // 2
         """Pairs of frames in a clip."""
 
     def frame(self, item: SelectionItem, k: int) -> LazySample:
@@ -292,7 +292,7 @@ class _SampleBuilder:
         return frames[rng.integers(len(frames))]
 
     def _prefix_frames(self, item: SelectionItem) -> list[int]:
-        return sample_prefix_frames(item.prefix_start, item.prefix_stop, self.cfg.frames)
+        return sample_prefix_frames(item.prefix_start, item.prefix_stop, self.frame_count)
 
     def _label(self, pictures: list[Picture]) -> Iterator[str | np.ndarray]:
         for scene_id, frame, letter in pictures:

@@ -51,7 +51,7 @@ def runs(tmp_path_factory, micro, micro_store) -> Path:
     folder = root / "sft" / "run"
     folder.mkdir(parents=True)
     model, processor = loading.load_student(
-        student, "bf16", lambda: dataset.corpus(micro_store, [])
+        student, "bf16", lambda: dataset.tokenizer_corpus(micro_store, [])
     )
     loading.save_student(model, processor, folder / "student", "bf16")
     OmegaConf.save(OmegaConf.structured(sft), folder / "config.yaml")

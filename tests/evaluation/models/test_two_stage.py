@@ -258,7 +258,9 @@ def log_of(store: Store) -> Path:
 @pytest.mark.slow
 def test_a_student_writes_once_for_every_matcher(world, store, micro, clip, tmp_path) -> None:
     folder = tmp_path / "sft"
-    model, processor = loading.load_student(STUDENT, "bf16", lambda: dataset.corpus(store, []))
+    model, processor = loading.load_student(
+        STUDENT, "bf16", lambda: dataset.tokenizer_corpus(store, [])
+    )
     loading.save_student(model, processor, folder / "student", "bf16")
     settings = SftCommand(benchmark=micro, teacher=TeacherConfig(name="template"), student=STUDENT)
     OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")

@@ -42,7 +42,9 @@ def base(tmp_path_factory, micro_store):
     """A base on disk, whose processor has sizes of its own, as a released one's has, and sees
     single images in other shades than clips, as the tiny base's does."""
     folder = tmp_path_factory.mktemp("base")
-    model, processor = loading.load_base(STUDENT, "fp32", lambda: dataset.corpus(micro_store, []))
+    model, processor = loading.load_base(
+        STUDENT, "fp32", lambda: dataset.tokenizer_corpus(micro_store, [])
+    )
     processor.image_processor.image_mean = [0.4, 0.45, 0.5]
     loading.save_student(model, processor, folder, "fp32")
     return folder

@@ -32,7 +32,7 @@ from evaluation.reporting.tables import (
 )
 from evaluation.retrieval.exact_search import Ranks
 from tests.evaluation.metrics.reference import scene_interval
-from train.common.curves import curves_figure
+from train.common.curves import plot_curves
 
 SCENES = 15
 
@@ -252,12 +252,12 @@ def test_figures_are_written(selections, retrievals, ranks, queries, tmp_path):
     figures.retrieval_figure(retrievals, tmp_path / "retrieval.png")
     curves = recall_curves("contrastive", ranks, queries)
     figures.builders_figure(retrievals, curves, tmp_path / "builders.png")
-    curves_figure(
+    plot_curves(
         [{"step": 2, "loss": 1.0}, {"step": 1, "loss": 2.0}, {"step": 2, "eval_loss": 1.5,
          "eval_accuracy": 0.4, "eval_runtime": 3.0}, {"step": 2, "train_runtime": 9.0}],
         tmp_path / "losses.png",
     )  # fmt: skip
-    curves_figure([], tmp_path / "no_losses.png")
+    plot_curves([], tmp_path / "no_losses.png")
     for path in tmp_path.iterdir():
         with Image.open(path) as image:
             assert image.width > 800

@@ -18,11 +18,12 @@ from conf.errors import UserError
 from conf.schema import LateConfig, LoraConfig, SftCommand
 from tests.user_errors import raises_user_error
 from train import contrastive, sft
+from train.common.callbacks import EpochCallback
 from train.common.checkpoints import newest_checkpoint
 from train.common.journal import read_journal
-from train.common.training_loop import Epochs
 from train.student import dataset
-from train.student.lazy_samples import LazySample, LengthSampler, Samples
+from train.student.lazy_samples import LazySample, StudentDataset
+from train.student.length_sampler import LengthSampler
 
 DRAWING = LoraConfig(rank=4, dropout=0.1)
 """Adapters that draw numbers in each pass, as a run that goes on must too."""
@@ -81,10 +82,12 @@ def test_a_run_does_not_go_on_with_other_data(sft_settings, tmp_path, monkeypatc
     sft.main.__wrapped__(sft_settings, Run("whole", whole))
     ignored = shutil.ignore_patterns("metrics.json", "student")
     shutil.copytree(whole, killed.folder, ignore=ignored)
-    told = dataset.supervised_items
-    monkeypatch.setattr(
-        dataset, "supervised_items", lambda *given: {m: s[:-1] for m, s in told(*given).items()}
-    )
+    build = dataset.supervised_items
+
+    def one_less(*arguments):
+        return {mode: items[:-1] for mode, items in build(*arguments).items()}
+
+    monkeypatch.setattr(dataset, "supervised_items", one_less)
     with raises_user_error("other-data"):
         sft.main.__wrapped__(sft_settings, killed)
     assert not (killed.folder / "student").exists()
@@ -106,9 +109,9 @@ def test_a_student_goes_on_within_a_later_epoch(
     shown: dict[str, set[str]] = {}
     ask = dataset.selection_sample
 
-    def noted(item, mode, regime, frames, cfg, response):
+    def noted(item, mode, regime, frames, frame_count, response):
         shown.setdefault(f"{item.item_id} {mode}", set()).add(item.letter)
-        return ask(item, mode, regime, frames, cfg, response)
+        return ask(item, mode, regime, frames, frame_count, response)
 
     monkeypatch.setattr(dataset, "supervised_items", fewer)
     monkeypatch.setattr(dataset, "selection_sample", noted)
@@ -123,11 +126,13 @@ def test_a_student_goes_on_within_a_later_epoch(
 def test_each_epoch_reaches_the_samples_and_their_order() -> None:
     """As the trainer tells it: at an epoch's start, and within one that is gone on with."""
     shown: list[int] = []
-    training = Samples([LazySample("", 0, shown.append)])
+    training = StudentDataset([LazySample("", 0, shown.append)])
     order = LengthSampler(range(100), 4, seed=0)
     orders = []
     for told, epoch in ((None, 0), (1.0, 1), (1.4, 1), (2.0, 2)):
-        Epochs(training, order).on_epoch_begin(None, TrainerState(epoch=told), TrainerControl())
+        EpochCallback(training, order).on_epoch_begin(
+            None, TrainerState(epoch=told), TrainerControl()
+        )
         training[0]
         assert shown[-1] == epoch
         orders.append(list(order))

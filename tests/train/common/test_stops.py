@@ -12,13 +12,14 @@ import torch
 
 from conf import gpus
 from conf.entry import Run
-from conf.errors import UserError
 from conf.schema import SftCommand
 from data.records import SelectionItem
 from data.store import Store
+from tests.user_errors import raises_user_error
 from train import sft
-from train.student import dataset
-from train.student.dataset import shows_only, splits
+from train.common.held_out import held_out_scenes
+from train.student.dataset import shows_only
+from train.student.run import load_datasets
 from train.student.trainer import token_mean
 
 
@@ -30,7 +31,7 @@ def settings(few_steps) -> SftCommand:
 @pytest.mark.slow
 def test_a_loss_that_is_no_number_stops_with_its_samples(settings, micro_store, tmp_path) -> None:
     too_fast = replace(settings, train=replace(settings.train, lr=1e30, warmup=0.0))
-    with pytest.raises(UserError, match=r"the loss is nan after step \d; .*stopped\.json names"):
+    with raises_user_error("non-finite-loss", contains="stopped.json"):
         sft.main.__wrapped__(too_fast, Run("run", tmp_path))
     told = json.loads((tmp_path / "stopped.json").read_text())
     named = {f"{item.item_id} (answer)" for item in micro_store.selection("train")}
@@ -58,7 +59,7 @@ def test_a_gradient_that_is_no_number_stops_with_its_steps_samples(
         return Spoilt.apply(token_mean(*given, **named))
 
     monkeypatch.setattr("train.student.run.token_mean", spoilt)
-    with pytest.raises(UserError, match=r"the gradient is nan after step 1; .*stopped\.json names"):
+    with raises_user_error("non-finite-gradient", contains="stopped.json"):
         sft.main.__wrapped__(settings, Run("run", tmp_path))
     told = json.loads((tmp_path / "stopped.json").read_text())
     assert len(told["samples"]) == settings.train.batch
@@ -71,7 +72,7 @@ def test_too_little_memory_is_told_with_the_key_to_lower(settings, tmp_path, mon
         return torch.empty(1 << 50)
 
     monkeypatch.setattr("train.student.run.token_mean", greedy)
-    with pytest.raises(UserError, match=r"out of memory after step 0: lower train\.micro_batch"):
+    with raises_user_error("out-of-memory", contains="train.micro_batch"):
         sft.main.__wrapped__(settings, Run("run", tmp_path))
 
 
@@ -92,7 +93,7 @@ class OneMore:
 def test_nothing_is_trained_on_that_shows_a_held_out_scene(
     settings, micro_store, frames, regime
 ) -> None:
-    held_out = dataset.held_out_scenes(micro_store)
+    held_out = held_out_scenes(micro_store)
     others = set(micro_store.scene_ids("train")) - held_out
     item = next(i for i in micro_store.selection("train") if shows_only(i, others))
     stranger = replace(item.candidates[item.answer - 1], scene_id=next(iter(held_out)))
@@ -100,9 +101,9 @@ def test_nothing_is_trained_on_that_shows_a_held_out_scene(
     candidates[item.answer - 1] = stranger
     crossed = replace(item, item_id="crossed", candidates=tuple(candidates))
     told = replace(settings, train=replace(settings.train, regime=regime))
-    plain, _ = splits(micro_store, [], told, frames)
-    more, _ = splits(OneMore(micro_store, crossed), [], told, frames)
-    again, _ = splits(OneMore(micro_store, replace(item, item_id="again")), [], told, frames)
+    plain, _ = load_datasets(told, micro_store, [])
+    more, _ = load_datasets(told, OneMore(micro_store, crossed), [])
+    again, _ = load_datasets(told, OneMore(micro_store, replace(item, item_id="again")), [])
     assert len(plain) == len(more) < len(again)
 
 

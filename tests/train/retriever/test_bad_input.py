@@ -20,7 +20,7 @@ from conf.errors import UserError
 from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
 from data import store
 from data.store import add_checksum, load_rows, save_rows
-from models.checks import check_pooling
+from models.retriever.checks import check_pooling
 from tests.user_errors import raises_user_error
 from train import contrastive
 

@@ -28,7 +28,7 @@ from conf.schema import (
     RetrieverConfig,
 )
 from evaluation import retrieve
-from models import loading
+from models import compat, loading
 from models.resolved import resolve_run
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
 from tests.user_errors import raises_user_error
@@ -151,7 +151,7 @@ def test_the_library_alone_computes_the_same_embeddings(
         cwd=tmp_path, check=True, env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
     )  # fmt: skip
     model = load_trained(preset, "fp32", runs / "contrastive" / "run" / "retriever")
-    loading.keep_differentiable(model)
+    compat.keep_differentiable(model)
     wanted = model.encode_query(given["queries"]), model.encode_document(given["frames"])
     for found, expected in zip(torch.load(tmp_path / "outputs.pt"), wanted, strict=True):
         for one, two in zip(found, expected, strict=True):

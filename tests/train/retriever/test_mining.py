@@ -15,9 +15,9 @@ from data.world.displacement import frame_displacements
 from models.retriever.embedder import embed, load_trained
 from tests.user_errors import raises_user_error
 from train import contrastive
+from train.common.held_out import held_out_scenes
 from train.common.journal import read_journal
 from train.retriever.mining import read_negatives, select_negatives
-from train.student.dataset import held_out_scenes
 
 MARGIN = 24.0
 

@@ -67,10 +67,10 @@ def test_adapters_of_another_rank_are_told(settings, trained, tmp_path) -> None:
     other = of_rank(settings, 8)
     with raises_user_error("other-settings", contains="student.lora.rank was 4 and is now 8"):
         open_run(Run("trained", trained), asdict(other), "train.sft", [])
-    with pytest.raises(UserError, match=r"student holds adapters of rank 4, and student\.lora"):
+    with raises_user_error("other-rank", contains="student.lora.rank"):
         loading.load_trained(other.student, "fp32", trained / "student")
     shutil.copytree(trained / "checkpoint-1", tmp_path / "checkpoint-1")
-    with pytest.raises(UserError, match=r"checkpoint-1 holds adapters of rank 4, .* is 8"):
+    with raises_user_error("other-rank", contains="checkpoint-1"):
         sft.main.__wrapped__(other, Run("run", tmp_path))
 
 
@@ -85,14 +85,16 @@ def wider(saved_base: str, student_cfg, processor, tmp_path_factory) -> str:
 
 
 @pytest.mark.slow
-def test_adapters_of_another_base_are_told(settings, trained, wider, saved_base, tmp_path) -> None:
+def test_adapters_of_another_base_are_refused(
+    settings, trained, wider, saved_base, tmp_path
+) -> None:
     over = replace(settings.student, model=wider)
-    with pytest.raises(UserError, match=r"another base than .* 64 wide there and 128 here"):
+    with raises_user_error("other-base", contains=("64", "128")):
         loading.load_trained(over, "fp32", trained / "student")
-    with pytest.raises(UserError, match=r"are not those that .* is trained over"):
+    with raises_user_error("other-base", contains=str(trained)):
         resolved.check_base(trained, over)
     shutil.copytree(trained / "checkpoint-1", tmp_path / "checkpoint-1")
-    with pytest.raises(UserError, match="checkpoint-1 holds adapters of another base than"):
+    with raises_user_error("other-base", contains="checkpoint-1"):
         sft.main.__wrapped__(replace(settings, student=over), Run("run", tmp_path))
     # The same base elsewhere is the same base.
     shutil.copytree(saved_base, tmp_path / "moved")
@@ -113,20 +115,20 @@ def test_a_checkpoint_cut_off_in_any_file_is_passed_over(trained, tmp_path, capl
             (last / name).write_bytes(whole[:left])
             caplog.clear()
             assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-1"
-            assert f"cut off ({name} is not whole): going on from the one before" in caplog.text
+            assert f"cut off ({name} is not whole): resuming from the one before" in caplog.text
         (last / name).write_bytes(whole)
     for name in names - {"adapter_config.json", "training_args.bin"}:
         whole = (last / name).read_bytes()
         (last / name).unlink()
         caplog.clear()
         assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-1"
-        assert "is missing): going on" in caplog.text
+        assert "is missing): resuming" in caplog.text
         (last / name).write_bytes(whole)
     assert newest_checkpoint(tmp_path) == last
     shutil.rmtree(tmp_path / "checkpoint-1")
     (last / "optimizer.pt").unlink()
     assert newest_checkpoint(tmp_path) is None
-    assert "(its optimizer is missing): starting anew" in caplog.text
+    assert "(its optimizer is missing): starting again" in caplog.text
 
 
 def over(student: StudentConfig, folder: Path) -> StudentConfig:
@@ -137,16 +139,15 @@ def retriever_over(folder: Path) -> RetrieverConfig:
     return RetrieverConfig(name="small", model=str(folder), quantization="none", widths=[64])
 
 
-def test_a_base_that_sees_nothing_is_told(nf4_cfg, processor, tmp_path) -> None:
+def test_a_base_without_a_vision_tower_is_refused(nf4_cfg, processor, tmp_path) -> None:
     sizes = {"hidden_size": 64, "intermediate_size": 64, "num_hidden_layers": 1}
     heads = {"num_attention_heads": 2, "num_key_value_heads": 2, "head_dim": 32}
     config = Qwen3Config(vocab_size=len(processor.tokenizer), **sizes, **heads)
     Qwen3ForCausalLM(config).save_pretrained(tmp_path)
     processor.tokenizer.save_pretrained(tmp_path)
-    said = rf"student\.model={tmp_path} \(qwen3\) has no vision tower: give a vision-language model"
-    with pytest.raises(UserError, match=said):
+    with raises_user_error("unsupported-model", contains=f"student.model={tmp_path}"):
         loading.load_student(over(nf4_cfg, tmp_path), "fp32", list)
-    with pytest.raises(UserError, match=r"retriever\.model=.* has no vision tower"):
+    with raises_user_error("unsupported-model", contains="retriever.model"):
         embedder.load_retriever(retriever_over(tmp_path), "fp32", [], tmp_path)
 
 
@@ -173,21 +174,23 @@ def other_tokenizer(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "code", "named"),
     [
-        (other_processor, r"CLIPProcessor \(it has no video processor\)"),
-        (no_processor, r"\(it has no tokenizer\)|cannot be loaded from that folder"),
-        (other_grid, r"\(its patch size is 14, that of the vision tower 16\)"),
-        (other_tokenizer, r"\(its tokenizer has \d+ tokens, the model \d+\)"),
+        (other_processor, "other-processor", "CLIPProcessor"),
+        (no_processor, "unloadable-model", "student.model"),
+        (other_grid, "other-processor", "patch size"),
+        (other_tokenizer, "other-processor", "tokenizer"),
     ],
 )
-def test_a_processor_of_another_model_is_told(nf4_cfg, saved_base, tmp_path, change, said) -> None:
+def test_a_processor_of_another_model_is_refused(
+    nf4_cfg, saved_base, tmp_path, change, code, named
+) -> None:
     base = tmp_path / "base"
     shutil.copytree(saved_base, base)
     change(base)
-    with pytest.raises(UserError, match=said):
+    with raises_user_error(code, contains=named):
         loading.load_student(over(nf4_cfg, base), "fp32", list)
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError):
         embedder.load_retriever(retriever_over(base), "fp32", [], tmp_path)
 
 

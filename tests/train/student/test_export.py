@@ -30,7 +30,7 @@ from conf.schema import (
     TeacherConfig,
 )
 from evaluation import select
-from models import loading
+from models import compat, loading
 from models.resolved import resolve_run
 from models.student.collator import encode
 from models.student.prompts import selection_sample
@@ -160,7 +160,7 @@ def test_transformers_alone_computes_the_same_logits(
 ) -> None:
     """As the trained student, the adapters over their 4-bit base."""
     item = micro_store.selection("test")[0]
-    sample = selection_sample(item, "answer", "cot", frames, settings.student)
+    sample = selection_sample(item, "answer", "cot", frames, settings.student.frames)
     given = {"content": sample.content, "images": sample.images}
     given |= {"video": sample.clip.pixels, "metadata": sample.clip.metadata}
     torch.save(given, tmp_path / "inputs.pt")
@@ -173,7 +173,7 @@ def test_transformers_alone_computes_the_same_logits(
     student = runs / "sft" / "run" / "student"
     model, processor = loading.load_trained(settings.student, "fp32", student)
     # Packed for inference, some CPUs round 4-bit products another way.
-    loading.keep_differentiable(model)
+    compat.keep_differentiable(model)
     asked = encode(sample, processor, 1500)
     assert ids[0].tolist() == asked.input_ids
     types = torch.tensor([asked.mm_token_type_ids])

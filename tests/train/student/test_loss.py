@@ -9,12 +9,14 @@ import pytest
 import torch
 from transformers import EvalPrediction
 
-from conf.errors import UserError
 from data.records import FPS, SelectionItem, sample_prefix_frames
 from models.student.collator import IGNORED, Collator, encode, letter_ids, pad
 from models.student.prompts import Sample, selection_sample
-from train.student.lazy_samples import LazySample, LengthSampler, Samples
-from train.student.trainer import LetterChoice, TokenChoice, token_mean
+from tests.user_errors import raises_user_error
+from train.student.lazy_samples import LazySample, StudentDataset
+from train.student.length_sampler import LengthSampler
+from train.student.metrics import LetterAccuracy, TokenAccuracy
+from train.student.trainer import token_mean
 
 
 @pytest.fixture
@@ -27,7 +29,7 @@ def lines(micro_store, frames, student_cfg) -> list[Sample]:
         "near the top\nAnswer: C",
     ]
     return [
-        selection_sample(i, "reasoning", "cot", frames, student_cfg, t)
+        selection_sample(i, "reasoning", "cot", frames, student_cfg.frames, t)
         for i, t in zip(items, texts, strict=True)
     ]
 
@@ -83,7 +85,9 @@ def test_the_prompt_holds_every_shown_frame_at_its_true_time(
     micro_store, frames, student_cfg, processor
 ) -> None:
     item = micro_store.selection("train")[0]
-    encoded = encode(selection_sample(item, "answer", "cot", frames, student_cfg), processor, 1500)
+    encoded = encode(
+        selection_sample(item, "answer", "cot", frames, student_cfg.frames), processor, 1500
+    )
     assert encoded.media["video_grid_thw"].tolist() == [[6, 6, 6]]
     assert encoded.media["image_grid_thw"].tolist() == [[1, 6, 6]] * 4
     shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, 12)
@@ -97,7 +101,7 @@ def test_the_prompt_holds_every_shown_frame_at_its_true_time(
 def test_a_sample_over_the_limit_is_refused_with_its_length(lines, processor) -> None:
     length = len(encode(lines[1], processor, 1500).input_ids)
     encode(lines[1], processor, length)
-    with pytest.raises(UserError, match=f"{length} tokens, more than student.max_length"):
+    with raises_user_error("sample-too-long", contains=(str(length), "student.max_length")):
         encode(lines[1], processor, length - 1)
 
 
@@ -109,10 +113,10 @@ def test_lengths_rank_samples_without_making_them(
 
     items = micro_store.selection("train")[:4]
     texts = ["near the top " * words + "\nAnswer: A" for words in (3, 9, 27, 1)]
-    made = Samples([LazySample(text, 10, refuse) for text in texts])
+    made = StudentDataset([LazySample(text, 10, refuse) for text in texts])
     guessed = made.lengths(processor.tokenizer, 96)
     real = [
-        len(encode(selection_sample(i, "answer", "cot", frames, student_cfg, t), processor, 1500)
+        len(encode(selection_sample(i, "answer", "cot", frames, student_cfg.frames, t), processor, 1500)
             .input_ids)
         for i, t in zip(items, texts, strict=True)
     ]  # fmt: skip
@@ -125,7 +129,7 @@ def test_the_letters_logits_choose_the_answer(
     items: list[SelectionItem] = micro_store.selection("train")[:6]
     batch = Collator(processor, 1500)(
         [
-            selection_sample(i, "answer", "cot", frames, student_cfg, f"Answer: {i.letter}")
+            selection_sample(i, "answer", "cot", frames, student_cfg.frames, f"Answer: {i.letter}")
             for i in items
         ]
     )
@@ -135,13 +139,13 @@ def test_the_letters_logits_choose_the_answer(
     at = labels.shape[1] - 3
     for k in range(len(items)):
         logits[k, at, letters[(items[k].answer + (k == 0)) % 4]] = 1.0
-    chosen, right = LetterChoice(letters).shrink(logits, labels).T
+    chosen, right = LetterAccuracy(letters).reduce(logits, labels).T
     assert right.tolist() == [i.answer for i in items]
     assert (chosen == right).tolist() == [False] + [True] * 5
-    measured = Samples(
+    measured = StudentDataset(
         [LazySample("", 0, lambda epoch: None, f) for f in ("event",) * 4 + ("time",) * 2]
     )
-    told = LetterChoice.measure(
+    told = LetterAccuracy.measure(
         EvalPrediction(torch.stack([chosen, right], dim=1).numpy(), None), measured
     )
     assert told == {
@@ -153,7 +157,7 @@ def test_controls_reach_the_prompt(micro_store, frames, student_cfg, processor) 
     item = micro_store.selection("test")[0]
     plain, alone, shuffled = (
         encode(
-            selection_sample(item, "answer", "cot", frames, student_cfg, control=control),
+            selection_sample(item, "answer", "cot", frames, student_cfg.frames, control=control),
             processor,
             1500,
         )
@@ -188,10 +192,10 @@ def test_an_order_is_of_its_epoch_and_sorts_each_step(count) -> None:
 def test_the_right_tokens_are_counted() -> None:
     labels = torch.tensor([[5, 6, 7, 8], [IGNORED, IGNORED, 7, 8]])
     logits = torch.nn.functional.one_hot(torch.tensor([[6, 7, 0, 0], [3, 7, 8, 0]]), 10).float()
-    choice = TokenChoice({"color": [6, 9], "shape": [8], "place": [9]})
-    counts = choice.shrink(logits, labels)
+    choice = TokenAccuracy({"color": [6, 9], "shape": [8], "place": [9]})
+    counts = choice.reduce(logits, labels)
     # A position's logits tell the next one's token; what is not supervised is not counted.
     assert counts[:, :2].tolist() == [[2, 3], [2, 2]]
-    told = choice.measure(EvalPrediction(counts.numpy(), None), Samples([]))
+    told = choice.measure(EvalPrediction(counts.numpy(), None), StudentDataset([]))
     # No word of the last kind stands there.
     assert told == {"token_accuracy": 4 / 5, "color_accuracy": 1, "shape_accuracy": 1 / 2}

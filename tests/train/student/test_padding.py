@@ -12,15 +12,15 @@ from transformers import AttentionInterface, PreTrainedModel, ProcessorMixin
 from transformers.integrations.sdpa_attention import sdpa_attention_forward
 
 from conf.entry import Run
-from conf.errors import UserError
 from conf.schema import LoraConfig, SftCommand, SftTrainConfig, TeacherConfig
 from models import loading
 from models.attention import BY_FRAME
 from models.student.collator import IGNORED, Collator, Encoded, encode, pad
 from models.student.prompts import Sample, selection_sample
+from tests.user_errors import raises_user_error
 from train import sft
 from train.common.journal import read_journal
-from train.student.packing import PackingCollator, pack, rope_of
+from train.student.packing import PackingCollator, pack, packing_rope
 from train.student.trainer import token_mean
 
 LENGTH = 1500
@@ -43,7 +43,7 @@ def samples(micro_store, frames, student_cfg) -> list[Sample]:
     items = micro_store.selection("train")[: len(TEXTS)]
     controls = (None, None, "candidate_only")
     return [
-        selection_sample(i, "reasoning", "cot", frames, student_cfg, t, c)
+        selection_sample(i, "reasoning", "cot", frames, student_cfg.frames, t, c)
         for i, t, c in zip(items, TEXTS, controls, strict=True)
     ]
 
@@ -89,7 +89,7 @@ def test_alone_padded_left_padded_right_and_packed_are_one(samples, processor, a
     together = {
         "left": collate(samples),
         "right": right_padded(encoded, processor),
-        "packed": PackingCollator(processor, LENGTH, rope_of(attending, "true"))(samples),
+        "packed": PackingCollator(processor, LENGTH, packing_rope(attending, "true"))(samples),
     }
     count = sum(sum(label != IGNORED for label in e.labels) for e in encoded)
     mean = sum(summed(attending, collate([s])) for s in samples) / count
@@ -104,7 +104,7 @@ def test_alone_padded_left_padded_right_and_packed_are_one(samples, processor, a
 
 
 def test_each_packed_samples_loss_is_its_own(samples, processor, attending) -> None:
-    rope = rope_of(attending, "true")
+    rope = packing_rope(attending, "true")
     encoded = [encode(s, processor, LENGTH) for s in samples]
     for k, sample in enumerate(samples):
         others = [
@@ -128,7 +128,7 @@ def test_each_packed_samples_loss_is_its_own(samples, processor, attending) -> N
 def test_a_packed_samples_logits_know_nothing_of_its_neighbours(
     samples, processor, attending
 ) -> None:
-    rope = rope_of(attending, "true")
+    rope = packing_rope(attending, "true")
     first, second, third = (encode(s, processor, LENGTH) for s in samples)
     told = replace(first, input_ids=[*first.input_ids[:-3], 9, 9, 9])
     shown = replace(
@@ -169,7 +169,7 @@ NEAR_MISSES = {
 @pytest.mark.parametrize("miss", NEAR_MISSES)
 def test_a_near_miss_of_packing_leaks(miss, samples, processor, model) -> None:
     model.eval()
-    batch = PackingCollator(processor, LENGTH, rope_of(model, "true"))(samples)
+    batch = PackingCollator(processor, LENGTH, packing_rope(model, "true"))(samples)
     exact, leaking = (
         summed(model, b) / int((b["labels"] != IGNORED).sum())
         for b in (batch, NEAR_MISSES[miss](batch))
@@ -180,7 +180,7 @@ def test_a_near_miss_of_packing_leaks(miss, samples, processor, model) -> None:
 
 def test_packed_rows_stand_where_the_model_itself_would_put_them(samples, processor, model) -> None:
     encoded = [encode(s, processor, LENGTH) for s in samples]
-    packed = pack(encoded, rope_of(model, "true"), [True] * len(encoded))["position_ids"]
+    packed = pack(encoded, packing_rope(model, "true"), [True] * len(encoded))["position_ids"]
     assert packed.shape == (4, 1, sum(len(e.input_ids) for e in encoded))
     for one, place in zip(
         encoded, packed.split([len(e.input_ids) for e in encoded], -1), strict=True
@@ -198,19 +198,19 @@ def test_packing_that_would_leak_is_refused(model) -> None:
     # Its mask is not registered, so that none would come.
     AttentionInterface.register("maskless", sdpa_attention_forward)
     model.set_attn_implementation({"text_config": "maskless", "vision_config": "sdpa"})
-    with pytest.raises(UserError, match=r"train\.packing=true: .*\(maskless\); give"):
-        rope_of(model, "true")
-    assert rope_of(model, "auto") is None
+    with raises_user_error("cannot-pack", contains="maskless"):
+        packing_rope(model, "true")
+    assert packing_rope(model, "auto") is None
 
 
 def test_packing_is_chosen_where_flash_attention_is(model, monkeypatch) -> None:
-    assert rope_of(model, "auto") is None
-    assert rope_of(model, "false") is None
-    assert rope_of(model, "True") == model.model.get_rope_index
+    assert packing_rope(model, "auto") is None
+    assert packing_rope(model, "false") is None
+    assert packing_rope(model, "True") == model.model.get_rope_index
     monkeypatch.setattr(
         model.config.text_config, "_attn_implementation_internal", "flash_attention_2"
     )
-    assert rope_of(model, "auto") == model.model.get_rope_index
+    assert packing_rope(model, "auto") == model.model.get_rope_index
 
 
 @pytest.mark.slow

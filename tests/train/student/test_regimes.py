@@ -1,45 +1,41 @@
-"""What each regime has a student write, and that it stays right in every order of candidates."""
+"""Each regime's responses, which stay right in every order of the candidates."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import partial
 
 import pytest
 
-from conf.schema import SftTrainConfig, TeacherConfig
+from conf.schema import TeacherConfig
 from conf.schema.training import REGIMES
 from data.records import LETTERS
 from data.store import Store
 from models.student.answer_parser import parse_choice
-from models.student.prompts import answer_line, instruction, response
+from models.student.prompts import answer_line, instruction
 from teacher.narrate import ensure_rationales
 from teacher.predicates import extract_predicates
 from teacher.sections import SECTIONS, split_sections
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
-from train.student.dataset import HELD_OUT, Supervised, held_out_scenes, supervised_items
-from train.student.lazy_samples import Samples
+from train.common.held_out import HELD_OUT, held_out_scenes
+from train.student.dataset import Supervised, load_supervised, supervised_items
+from train.student.lazy_samples import LazySample, StudentDataset
 
 TEACHER = TeacherConfig(name="template")
-ASKED = [r for r in REGIMES if r not in ("answer_only", "describe")]
+COT = [r for r in REGIMES if r not in ("answer_only", "describe")]
 
 
-def made(store: Store, regime: str, seed: int | None = None) -> dict[str, list[Supervised]]:
+def items_of(store: Store, regime: str) -> dict[str, list[Supervised]]:
     rationales = {r.item_id: r for r in ensure_rationales(store, TEACHER)}
-    train = SftTrainConfig(regime=regime)
-    return supervised_items(store, store.selection("train"), rationales, train, seed)
+    return supervised_items(store, store.selection("train"), rationales, regime)
 
 
-def told(s: Supervised) -> str:
-    return response(s.rationale, s.matches, s.item.letter, s.mode, s.regime)
-
-
-@pytest.mark.parametrize("regime", ASKED)
-def test_a_regime_is_the_whole_without_its_part(micro_store, regime) -> None:
-    asked = made(micro_store, regime)["reasoning"]
-    assert asked
-    for s in asked:
-        text = told(s)
+@pytest.mark.parametrize("regime", COT)
+def test_a_regime_leaves_out_its_part_only(micro_store, regime) -> None:
+    supervised = items_of(micro_store, regime)["reasoning"]
+    assert supervised
+    for s in supervised:
+        text = s.response
         headings = [name for name, _, _ in split_sections(text)]
         left_out = {"Candidate analysis"} if regime == "cot_no_candidate_analysis" else set()
         assert headings == [*(name for name in SECTIONS if name not in left_out), "Answer"]
@@ -47,81 +43,86 @@ def test_a_regime_is_the_whole_without_its_part(micro_store, regime) -> None:
             if name not in ("Answer", *left_out):
                 assert s.rationale[start:stop].strip() in text
         lines = text.splitlines()
-        told_of = [line.split()[1] for line in lines if line.startswith("Candidate ") and
+        candidates = [line.split()[1] for line in lines if line.startswith("Candidate ") and
                    not line.startswith("Candidate analysis")]  # fmt: skip
-        assert told_of == ([] if regime == "cot_no_match_layout" else list(LETTERS))
+        assert candidates == ([] if regime == "cot_no_match_layout" else list(LETTERS))
         assert lines[-1] == answer_line(s.item.letter)
 
 
-@pytest.mark.parametrize("regime", [*ASKED, "answer_only"])
-def test_both_modes_are_trained_and_answer_alike(micro_store, regime) -> None:
-    asked = made(micro_store, regime)
-    answers = {s.item.item_id: s for s in asked["answer"]}
-    assert all(told(s) == answer_line(s.item.letter) for s in answers.values())
+@pytest.mark.parametrize("regime", [*COT, "answer_only"])
+def test_both_modes_are_trained_with_the_same_answer(micro_store, regime) -> None:
+    by_mode = items_of(micro_store, regime)
+    answers = {s.item.item_id: s for s in by_mode["answer"]}
+    assert all(s.response == answer_line(s.item.letter) for s in answers.values())
     assert {i.item_id for i in micro_store.selection("train")} == answers.keys()
-    for s in asked["reasoning"]:
-        assert parse_choice(told(s)).letter == answers[s.item.item_id].item.letter
+    for s in by_mode["reasoning"]:
+        assert parse_choice(s.response).letter == answers[s.item.item_id].item.letter
         assert instruction(s.mode, regime) != instruction("answer", regime)
 
 
-def test_what_is_supervised_is_right_in_every_epochs_order(micro_store) -> None:
-    """Every item, in the orders of several epochs: the rationale stands before the validator, the
-    matches hold against the predicates, and the answer is the same frame."""
-    asked = made(micro_store, "cot", seed=0)
+def test_responses_are_right_in_every_epochs_order(micro_store) -> None:
+    """For every item in the orders of several epochs, the validator accepts the rationale, the
+    match lines agree with the predicates, and the answer is the same frame."""
+    by_mode = items_of(micro_store, "cot")
     orders = set()
-    for s in asked["reasoning"] + asked["answer"]:
+    for s in by_mode["reasoning"] + by_mode["answer"]:
         right = s.item.candidates[s.item.answer]
         for epoch in range(4):
-            shown = s.in_epoch(epoch)
-            item = shown.item
+            permuted = s.permuted(0, epoch)
+            item = permuted.item
             assert item.candidates[item.answer] == right
             assert sorted(item.candidates, key=repr) == sorted(s.item.candidates, key=repr)
-            assert parse_choice(told(shown)).letter == LETTERS[item.candidates.index(right)]
+            assert parse_choice(permuted.response).letter == LETTERS[item.candidates.index(right)]
             orders.add(tuple(s.item.candidates.index(c) for c in item.candidates))
             if s.mode == "reasoning":
                 predicates = extract_predicates(
                     item, micro_store.scene(item.scene_id), micro_store.scene
                 )
-                assert validate_rationale(shown.rationale, predicates, item, TEACHER).reasons == ()
-                matching = [line for line in shown.matches if " matches: " in line]
+                assert (
+                    validate_rationale(permuted.rationale, predicates, item, TEACHER).reasons == ()
+                )
+                matching = [line for line in permuted.matches if " matches: " in line]
                 assert [line.split()[1] for line in matching] == [item.letter]
-                assert [line.split()[1] for line in shown.matches] == list(LETTERS)
-                analysis = "Candidate analysis: " + "\n".join(shown.matches)
+                assert [line.split()[1] for line in permuted.matches] == list(LETTERS)
+                analysis = "Candidate analysis: " + "\n".join(permuted.matches)
                 verdicts = {c.verdict for c in extract_claims(analysis, predicates)}
                 assert "contradicted" not in verdicts
                 assert "supported" in verdicts
     assert len(orders) == 24
 
 
-def test_an_order_is_of_its_seed_epoch_and_item(micro_store) -> None:
-    first, second = made(micro_store, "answer_only", seed=0)["answer"][:2]
-    orders = [first.in_epoch(e).item.candidates for e in range(8)]
-    assert orders == [first.in_epoch(e).item.candidates for e in range(8)]
-    assert len(set(orders)) > 1
-    other = replace(first, seed=1)
-    assert orders != [other.in_epoch(e).item.candidates for e in range(8)]
+def test_an_order_depends_on_seed_epoch_and_item(micro_store) -> None:
+    first, second = items_of(micro_store, "answer_only")["answer"][:2]
 
-    def places(s: Supervised) -> list[list[int]]:
-        shown = [s.in_epoch(e).item.candidates for e in range(8)]
-        return [[s.item.candidates.index(c) for c in order] for order in shown]
+    def orders(s: Supervised, seed: int = 0) -> list[list[int]]:
+        permuted = [s.permuted(seed, epoch).item.candidates for epoch in range(8)]
+        return [[s.item.candidates.index(c) for c in candidates] for candidates in permuted]
 
-    assert places(first) != places(second)
-    assert made(micro_store, "answer_only")["answer"][0].in_epoch(3).item == first.item
+    assert orders(first) == orders(first)
+    assert len(set(map(tuple, orders(first)))) > 1
+    assert orders(first) != orders(first, seed=1)
+    assert orders(first) != orders(second)
 
 
-def test_an_epoch_reaches_the_samples(micro_store, frames, student_cfg) -> None:
-    asked = made(micro_store, "answer_only", seed=0)["answer"]
-    samples = Samples([s.planned(frames, student_cfg) for s in asked])
-    shown = []
+def test_samples_follow_the_epoch(micro_store, frames, student_cfg) -> None:
+    supervised = items_of(micro_store, "answer_only")["answer"]
+    count = student_cfg.frames
+    lazy = [
+        LazySample(s.text, 1, partial(load_supervised, s, frames, count, 0)) for s in supervised
+    ]
+    dataset = StudentDataset(lazy)
+    responses = []
     for epoch in range(4):
-        samples.set_epoch(epoch)
-        shown.append([samples[k].response for k in range(len(samples))])
-        assert shown[-1] == [told(s.in_epoch(epoch)) for s in asked]
-    assert shown[0] != shown[1]
+        dataset.set_epoch(epoch)
+        responses.append([dataset[k].response for k in range(len(dataset))])
+        assert responses[-1] == [s.permuted(0, epoch).response for s in supervised]
+    assert responses[0] != responses[1]
+    unpermuted = load_supervised(supervised[0], frames, count, None, 3)
+    assert unpermuted.response == supervised[0].response
 
 
 class Names:
-    """All of a store that says which scenes are held out."""
+    """A store of scene names only."""
 
     def __init__(self, names: list[str]) -> None:
         self.names = names
@@ -130,7 +131,7 @@ class Names:
         return self.names
 
 
-def test_a_scene_is_held_out_whatever_else_a_store_holds() -> None:
+def test_whether_a_scene_is_held_out_depends_on_its_name_only() -> None:
     names = [f"s0-{k:06d}" for k in range(2000)]
     held_out = held_out_scenes(Names(names))
     assert len(held_out) == pytest.approx(HELD_OUT * len(names), rel=0.15)

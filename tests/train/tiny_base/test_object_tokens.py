@@ -23,7 +23,7 @@ def test_words_are_labels_of_the_tokens_at_their_objects(
     micro_store, frames, student_cfg, processor
 ) -> None:
     items = micro_store.selection("train")
-    kinds = questions.build_questions(micro_store, items, student_cfg, frames, 0)
+    kinds = questions.build_questions(micro_store, items, student_cfg.frames, frames, 0)
     samples = [made[0].make(0) for made in kinds.values()]
     batch = ObjectTokenCollator(processor, 1500)(samples)
     plain = Collator(processor, 1500)(samples)

@@ -18,7 +18,7 @@ from train.tiny_base import questions
 @pytest.fixture
 def kinds(micro_store, frames, student_cfg) -> dict[str, list[LazySample]]:
     return questions.build_questions(
-        micro_store, micro_store.selection("train"), student_cfg, frames, 0
+        micro_store, micro_store.selection("train"), student_cfg.frames, frames, 0
     )
 
 
@@ -43,7 +43,7 @@ def all_visible(store: Store, frames: FrameReader) -> dict[bytes, list[dict[str,
 
 
 def question_and_answer(lazy: LazySample, epoch: int = 0) -> tuple[str, str]:
-    sample = lazy.make(epoch)
+    sample = lazy.load(epoch)
     return sample.content[-1]["text"], sample.response
 
 
@@ -62,7 +62,7 @@ def test_each_candidate_is_described_under_its_letter(micro_store, frames, kinds
     distinguished = 0
     for lazy in kinds["candidates"][:16]:
         for epoch in range(4):
-            sample = lazy.make(epoch)
+            sample = lazy.load(epoch)
             lines = sample.response.split("\n")
             stated = [
                 dict(re.findall(r"The (\w+ \w+ \w+) is (near the [\w-]+)\.", x)) for x in lines
@@ -79,7 +79,7 @@ def test_places_of_an_object_in_each_candidate(micro_store, frames, kinds) -> No
     answers = set()
     for lazy in kinds["where"][:16]:
         for epoch in range(4):
-            sample = lazy.make(epoch)
+            sample = lazy.load(epoch)
             question = sample.content[-1]["text"]
             assert sample.clip is None
             phrase = re.search(r"Where does each candidate show the (.+)\?$", question)[1]
@@ -95,7 +95,7 @@ def test_candidates_are_compared_with_the_predicted_place(micro_store, frames, k
     answers = set()
     for lazy in kinds["compared"][:16]:
         for epoch in range(4):
-            sample = lazy.make(epoch)
+            sample = lazy.load(epoch)
             question = sample.content[-1]["text"]
             assert sample.clip is not None
             phrase = re.search(r"Compare each .+ with the prediction by the (.+)\.$", question)[1]
@@ -203,7 +203,7 @@ def test_answer_is_the_later_frame(frames, kinds) -> None:
     letters = set()
     for lazy in kinds["later"]:
         for epoch in range(3):
-            sample = lazy.make(epoch)
+            sample = lazy.load(epoch)
             assert len(sample.images) == 2
             letters.add(sample.response)
             wrong = sample.images[sample.response == "Answer: A"]
@@ -215,7 +215,7 @@ def test_answer_is_the_later_frame(frames, kinds) -> None:
 
 def test_clip_is_described_with_and_without_the_target(kinds) -> None:
     for lazy in kinds["clip"]:
-        stated = [lazy.make(epoch) for epoch in range(12)]
+        stated = [lazy.load(epoch) for epoch in range(12)]
         assert {len(sample.images) for sample in stated} == {0, 1}
         assert len({sample.response for sample in stated}) == 1
         assert stated[0].response.startswith("Scene parse: ")

@@ -1,0 +1,75 @@
+"""Arguments of transformers' trainers from the project's settings."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from conf.runs import Run
+from conf.schema import TrainConfig
+from models.compat import checkpointing_arguments
+from train.common.checkpoints import STATE
+
+PROJECT = "dynapix"
+"""Name under which trackers file a run."""
+SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
+
+
+def common_arguments(
+    train: TrainConfig, run: Run, seed: int, checkpoint: Path | None
+) -> dict[str, Any]:
+    """Return the arguments that `TrainingArguments` and its subclasses share.
+
+    Args:
+        train: Settings with a resolved precision.
+        checkpoint: The checkpoint that the run resumes from, or None.
+    """
+    if checkpoint is None:
+        # A share of the steps; 1 would mean every step.
+        every = min(1 / train.evaluations, 0.9999)
+    else:
+        every = json.loads((checkpoint / STATE).read_text())["eval_steps"]
+    return {
+        "output_dir": str(run.folder),
+        "seed": seed,
+        "data_seed": seed,
+        "learning_rate": train.lr,
+        "lr_scheduler_type": SCHEDULES[train.schedule],
+        "warmup_steps": train.warmup,
+        "weight_decay": train.weight_decay,
+        "adam_beta2": train.adam_beta2,
+        "max_grad_norm": train.max_grad_norm,
+        "num_train_epochs": train.epochs,
+        "max_steps": train.max_steps,
+        "bf16": train.precision == "bf16",
+        "use_cpu": not torch.cuda.is_available(),
+        **checkpointing_arguments(train.gradient_checkpointing),
+        "eval_strategy": "steps",
+        "eval_steps": every,
+        # The journal of a resumed run has the evaluation at the start already.
+        "eval_on_start": checkpoint is None,
+        "save_strategy": "steps",
+        "save_steps": every,
+        "save_total_limit": train.keep,
+        "logging_steps": 1,
+        "dataloader_num_workers": train.workers,
+        "dataloader_pin_memory": torch.cuda.is_available(),
+        "remove_unused_columns": False,
+        # This also keeps the best checkpoint from being deleted.
+        "load_best_model_at_end": train.best is not None,
+        "metric_for_best_model": train.best,
+        "report_to": list(train.report_to) or "none",
+        "run_name": run.name,
+        "project": PROJECT,
+        "disable_tqdm": False,
+    }
+
+
+def prefetch_factor(workers: int, accumulation: int) -> int | None:
+    """Return the batches that each worker prepares ahead: together at least those of a step, which
+    the trainer requests at once, so that they are ready when the step before ends."""
+    return max(2, math.ceil(accumulation / workers)) if workers else None

@@ -1,0 +1,125 @@
+"""Callbacks of both trainers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from transformers import ProgressCallback, TrainerCallback
+from transformers.trainer_callback import TrainerControl, TrainerState
+
+from conf.errors import UserError
+from conf.runs import write_text
+from train.common.curves import plot_curves
+from train.common.journal import ANSWERS, CURVES, JOURNAL, read_journal, read_lines
+
+NOT_REPRODUCIBLE = ("_runtime", "_per_second", "total_flos", "train_loss")
+"""Endings of logged names that are left out of the journal: timings, and the trainer's mean loss,
+which counts only the steps since the run resumed."""
+BAR_LABELS = {
+    "generated_parse_rate": "parsed",
+    "generated_accuracy": "right",
+    "letter_accuracy": "letter",
+    "token_accuracy": "token",
+    "loss": "loss",
+    "recall@10": "recall@10",
+}
+"""Measures on the progress bar, by the ending of their names, and their labels."""
+
+
+class JournalCallback(TrainerCallback):
+    """Appends what the trainer logs to metrics.jsonl, and plots the curves with each checkpoint.
+
+    A resumed run first drops the lines after its checkpoint from metrics.jsonl and samples.jsonl,
+    so that both end as those of an uninterrupted run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / JOURNAL
+
+    def on_train_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        resumed = state.global_step > 0
+        for path in (self._path, self._path.with_name(ANSWERS)):
+            kept = [r for r in read_lines(path) if resumed and r["step"] <= state.global_step]
+            if kept or path.exists():
+                write_text(path, "".join(json.dumps(r) + "\n" for r in kept))
+
+    def on_log(self, args, state: TrainerState, control: TrainerControl, logs=None, **_) -> None:
+        values = {k: v for k, v in (logs or {}).items() if not k.endswith(NOT_REPRODUCIBLE)}
+        if not values.keys() - {"epoch"}:
+            return
+        with open(self._path, "a") as file:
+            file.write(json.dumps({"step": state.global_step, **values}) + "\n")
+
+    def on_save(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        plot_curves(read_journal(self._path.parent), self._path.with_name(CURVES))
+
+
+class CheckBestMeasure(TrainerCallback):
+    """Refuses a train.best that the evaluation at the start did not measure."""
+
+    def on_step_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        best = args.metric_for_best_model
+        if best is None or state.best_global_step:
+            return
+        names = {k for r in state.log_history for k in r if k.startswith("eval_")}
+        names = sorted(k for k in names if not k.endswith((*NOT_REPRODUCIBLE, "_preparation_time")))
+        if f"eval_{best.removeprefix('eval_')}" not in names:
+            raise UserError(
+                f"train.best={best} is not measured by this run's evaluations; the options are "
+                f"{', '.join(names)}",
+                code="unknown-option",
+            )
+
+
+class BestCheckpoint(TrainerCallback):
+    """Sets the best checkpoint's folder from its step, on every rank.
+
+    The library looks for the folder while it is written. With FSDP, whose checkpoints are written
+    in parts, that is too early: an earlier checkpoint remains the best, or the ranks disagree and
+    wait for each other forever at the end.
+    """
+
+    def on_save(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        if state.best_global_step:
+            folder = Path(args.output_dir, f"checkpoint-{state.best_global_step}")
+            state.best_model_checkpoint = str(folder)
+
+
+class EpochCallback(TrainerCallback):
+    """Calls `set_epoch` of datasets and samplers. A run that resumes within an epoch wraps its
+    sampler, and the library then no longer calls it."""
+
+    def __init__(self, *followers: Any) -> None:
+        self._followers = followers
+
+    def on_epoch_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        # The epoch is fractional where a run resumes within one.
+        for follower in self._followers:
+            follower.set_epoch(int(state.epoch or 0))
+
+
+class MetricsBar(ProgressCallback):
+    """The trainer's progress bar with the latest measures."""
+
+    def __init__(self, max_str_len: int = 100) -> None:
+        super().__init__(max_str_len)
+        self._values: dict[str, dict[str, str]] = {"": {}}
+
+    def on_prediction_step(self, args, state, control, **_) -> None:
+        """A bar for each evaluation would break the line of the run's bar."""
+
+    def on_log(self, args, state, control, logs=None, **_) -> None:
+        for name, value in (logs or {}).items():
+            ending = next((end for end in BAR_LABELS if name.endswith(end)), None)
+            if ending and not name.endswith(NOT_REPRODUCIBLE):
+                mode = name.removesuffix(ending).removeprefix("eval_").strip("_")
+                self._values.setdefault(mode, {})[BAR_LABELS[ending]] = f"{value:.3g}"
+        if self.training_bar is not None:
+            texts = [
+                " ".join([mode, *(f"{label}={value}" for label, value in values.items())]).strip()
+                for mode, values in self._values.items()
+                if values
+            ]
+            self.training_bar.set_postfix_str(", ".join(texts))
