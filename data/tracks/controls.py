@@ -16,7 +16,7 @@ import numpy as np
 from data.records import SELECTION_SECOND, Scene, SelectionItem, sample_prefix_frames
 from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.selection import event, time
-from data.tracks.selection.distractors import DistractorPicker, new_item
+from data.tracks.selection.distractors import DistractorPicker
 from data.tracks.selection.event import EventTiming
 from data.world.events import collisions_in
 
@@ -43,27 +43,14 @@ def anchor_timings(scene: Scene) -> Iterator[EventTiming]:
 def make_item(
     scene: Scene, rng: np.random.Generator, picker: DistractorPicker
 ) -> SelectionItem | None:
-    """Make the item of a pair that names the time; its distractors are other later frames."""
+    """Make the item of a pair that names the time, at a random timing of the scene."""
     timings = list(anchor_timings(scene))
-    for k in rng.permutation(len(timings)):
-        timing = timings[k]
-        prefix = (timing.start, timing.stop)
-        horizon = timing.target - timing.stop
-        picked = time.pick_later_frames(scene, prefix, timing.target, rng, picker)
-        if picked is not None:
-            return new_item(
-                scene,
-                "time",
-                f"in_{horizon // SELECTION_SECOND}s",
-                time.question(horizon // SELECTION_SECOND),
-                prefix,
-                timing.target,
-                picked,
-                event_frame=timing.target,
-                distractors="same_time",
-                horizon=horizon,
-            )
-    return None
+    attempts = (timings[k] for k in rng.permutation(len(timings)))
+    items = (
+        time.make_item_at(scene, (t.start, t.stop), t.target, rng, picker, event_frame=t.target)
+        for t in attempts
+    )
+    return next(filter(None, items), None)
 
 
 def fill_pairs(cell: CellInputs) -> tuple[list[SelectionItem], int]:

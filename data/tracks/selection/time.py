@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from data.records import SELECTION_SECOND, FrameRef, Scene, SelectionItem
 from data.tracks.selection.distractors import (
     DistractorPicker,
-    Picked,
     new_item,
     scene_candidates,
     visible_objects,
@@ -28,35 +29,32 @@ def question(seconds: int) -> str:
 def make_item(
     subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
 ) -> SelectionItem | None:
-    """Make an item whose prefix is the scene's first second; distractors are later frames."""
-    seconds = CELLS[subtype]
-    prefix = start, stop = 0, SELECTION_SECOND - 1
-    target = start + SELECTION_SECOND + SELECTION_SECOND * seconds
-    picked = pick_later_frames(scene, prefix, target, rng, picker)
-    if picked is None:
-        return None
-    return new_item(
-        scene,
-        "time",
-        subtype,
-        question(seconds),
-        prefix,
-        target,
-        picked,
-        distractors="same_time",
-        horizon=target - stop,
-    )
+    """Make an item whose prefix is the scene's first second."""
+    stop = SELECTION_SECOND - 1
+    target = SELECTION_SECOND + SELECTION_SECOND * CELLS[subtype]
+    return make_item_at(scene, (0, stop), target, rng, picker)
 
 
-def pick_later_frames(
+def make_item_at(
     scene: Scene,
     prefix: tuple[int, int],
     target: int,
     rng: np.random.Generator,
     picker: DistractorPicker,
-) -> Picked | None:
-    """Pick distractors among the scene's frames after the prefix, in a random order."""
+    **axes: Any,
+) -> SelectionItem | None:
+    """Make an item that names the time to `target`; its distractors are other later frames."""
+    horizon = target - prefix[1]
+    seconds = horizon // SELECTION_SECOND
     later = rng.permutation(np.arange(prefix[1] + 1, scene.frames))
-    pool = scene_candidates(scene, later[later != target], "same_time")
-    about = visible_objects(scene, prefix)
-    return picker.pick(FrameRef(scene.scene_id, target), pool, about, int(rng.integers(4)))
+    picked = picker.pick(
+        FrameRef(scene.scene_id, target),
+        scene_candidates(scene, later[later != target], "same_time"),
+        visible_objects(scene, prefix),
+        int(rng.integers(4)),
+    )
+    if picked is None:
+        return None
+    axes |= {"distractors": "same_time", "horizon": horizon}
+    subtype = f"in_{seconds}s"
+    return new_item(scene, "time", subtype, question(seconds), prefix, target, picked, **axes)
