@@ -1,7 +1,7 @@
-"""Ask people: serve selection items in a browser to annotators who sign in by links of their own.
+"""Run a human study: annotators sign in by personal links and answer selection items in a browser.
 
-Everything is kept in the run's study.sqlite; stopped or killed, the same command goes on with it.
-`python -m evaluation.study.export run=NAME` writes the votes and says how right they are.
+The run's study.sqlite holds everything; after a stop or a kill the same command resumes the study.
+`python -m evaluation.study.export run=NAME` exports the votes with their accuracy and agreement.
 """
 
 from __future__ import annotations
@@ -18,33 +18,30 @@ log = logging.getLogger(__name__)
 @command("evaluation.study", StudyCommand)
 def main(cfg: StudyCommand, run: Run) -> None:
     try:
-        from evaluation.study import auth, routes, serving, storage
+        from evaluation.study import auth, routes, storage
     except ImportError as error:
         raise UserError(
-            f"the study's pages need {error.name}: pip install -e '.[study]'"
+            f"the study's pages need {error.name}: pip install -e '.[study]'",
+            code="missing-package",
         ) from error
     from evaluation.study import setup
 
-    path = run.folder / storage.DATABASE
-    with serving.listener(cfg.host, cfg.port) as at:
-        if storage.begun(path):
+    path, links = run.folder / storage.DATABASE, run.folder / auth.LINKS_FILE
+    with routes.listen(cfg.host, cfg.port) as listener:
+        if storage.exists(path):
             db = storage.open_study(path)
-            setup.check_names(cfg, db)
+            setup.check_items(cfg, db)
         else:
-            db = setup.begin(cfg, path)
-        setup.add_media(cfg, db, path)
+            db = setup.create_study(cfg, path)
+        setup.add_missing_media(cfg, db, path)
 
-        links = run.folder / auth.LINKS
-
-        def renew_links() -> dict[str, str]:
-            return auth.write_links(db, links, cfg.address)
-
-        # The links are secrets: they go to the screen and to their file, not into the run's log.
-        for name, link in renew_links().items():
+        # Links are secrets: they go to the screen and to their file, not into the run's log.
+        for name, link in auth.write_links(db, links, cfg.address).items():
             print(f"{name}  {link}")
-        log.info("a link signs in once; unspent ones are always in %s", links)
-        log.info("the study is up; stop it with Ctrl-C, the same command goes on with it")
-        serving.serve(routes.make_app(db, cfg.rest_every, cfg.public, renew_links), at)
+        log.info("a link signs in once; %s always holds the unused ones", links)
+        log.info("the study is running; stop it with Ctrl-C, resume it with the same command")
+        app = routes.build_app(db, cfg, lambda: auth.write_links(db, links, cfg.address))
+        routes.serve(app, listener)
 
 
 if __name__ == "__main__":

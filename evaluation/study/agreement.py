@@ -1,7 +1,7 @@
-"""What a study's votes say: accuracy of each annotator and of the majority, agreement, time.
+"""Accuracy of annotators and of their majority, agreement, and decision times.
 
-Majority is strictly more than half of an item's votes. An item on which no candidate has it (1-1,
-1-1-1) is counted wrong, and how many there are is told.
+A majority is strictly more than half of an item's votes. Items without one (1-1, 1-1-1) are
+undecided and count as wrong.
 """
 
 from __future__ import annotations
@@ -15,52 +15,51 @@ import numpy as np
 
 from data.records import FAMILIES, LETTERS
 from evaluation.metrics.accuracy import accuracy_by_family
-from evaluation.study.votes import Vote
+from evaluation.study.storage import Vote
 
 
 def summary(votes: Sequence[Vote], items: int, annotators: Sequence[str]) -> dict[str, Any]:
-    """Everything that a report shows of a study, ready for JSON; what is undefined is None.
+    """The report of a study, ready for JSON; undefined values are None.
 
     Args:
-        items: how many the study asks, answered or not.
-        annotators: everyone who has an account, whether it was used or not.
+        items: Number of items in the study, answered or not.
+        annotators: All annotators, with or without votes.
 
     Returns:
-        `items`, `judgments`; `annotators`, those who answered; `depth`, how many items have each
-        number of votes; `accuracy` by annotator, with `families`, `macro` and `micro` as in
-        `evaluation.metrics.accuracy.Accuracy`; `majority`, the same of the items that have a vote,
-        and how
-        many of them are `undecided`; `fleiss_kappa` with the `items` that all of them answered;
-        `krippendorff_alpha` with the `items` of two votes or more; and median `seconds` by family.
+        `items`, `judgments`; `annotators`, those with votes; `depth`, the number of items by their
+        number of votes; `accuracy` by annotator, as `evaluation.metrics.accuracy.Accuracy`;
+        `majority`, the same over the items with votes, and how many of them are `undecided`;
+        `fleiss_kappa` and its `items`, which all annotators answered; `krippendorff_alpha` and its
+        `items`, which have two votes or more; and median `seconds` by family.
     """
-    by_item = _grouped(votes, "item_id")
-    by_annotator = _grouped(votes, "annotator")
-    chosen = {item: [vote.choice for vote in of] for item, of in by_item.items()}
-    took_part = [a for a in annotators if a in by_annotator]
-    complete = [c for c in chosen.values() if 1 < len(c) == len(took_part)]
-    several = [c for c in chosen.values() if len(c) > 1]
-    depth = Counter(map(len, chosen.values())) + Counter({0: items - len(chosen)})
+    by_item = _group(votes, "item_id")
+    by_annotator = _group(votes, "annotator")
+    choices = [[vote.choice for vote in of_item] for of_item in by_item.values()]
+    active = [name for name in annotators if name in by_annotator]
+    complete = [c for c in choices if 1 < len(c) == len(active)]
+    several = [c for c in choices if len(c) > 1]
+    depth = Counter(map(len, choices)) + Counter({0: items - len(choices)})
     return {
         "items": items,
         "judgments": len(votes),
-        "annotators": took_part,
-        "depth": {str(votes): depth[votes] for votes in sorted(depth)},
-        "accuracy": {a: _accuracy(by_annotator[a]) for a in took_part},
+        "annotators": active,
+        "depth": {str(count): depth[count] for count in sorted(depth)},
+        "accuracy": {name: _accuracy(by_annotator[name]) for name in active},
         "majority": _majority_accuracy(by_item) if by_item else None,
         "fleiss_kappa": {"value": fleiss_kappa(complete), "items": len(complete)},
         "krippendorff_alpha": {"value": krippendorff_alpha(several), "items": len(several)},
-        "seconds": seconds(votes),
+        "seconds": median_seconds(votes),
     }
 
 
 def majority(choices: Sequence[int]) -> int | None:
-    """What more than half chose; None where nothing has so many."""
+    """The choice of more than half; None if there is no such choice."""
     choice, count = Counter(choices).most_common(1)[0]
     return choice if 2 * count > len(choices) else None
 
 
 def fleiss_kappa(items: Sequence[Sequence[int]]) -> float | None:
-    """Fleiss' kappa of items with the same number of votes each, two or more.
+    """Fleiss' kappa of items with equal numbers of votes, two or more.
 
     Returns:
         None where it is undefined: no items, single votes, or all votes for one candidate index.
@@ -72,34 +71,34 @@ def fleiss_kappa(items: Sequence[Sequence[int]]) -> float | None:
 
     if not items or len(items[0]) < 2:
         return None
-    table = _counts(items)
+    table = _count_choices(items)
     if len(set(table.sum(axis=1))) > 1:
-        raise ValueError("Fleiss' kappa needs as many votes of every item")
-    return None if _unanimous(table) else float(kappa(table))
+        raise ValueError("Fleiss' kappa needs the same number of votes for every item")
+    return None if _is_unanimous(table) else float(kappa(table))
 
 
 def krippendorff_alpha(items: Sequence[Sequence[int]]) -> float | None:
-    """Krippendorff's alpha for nominal votes, of items with any numbers of them: one minus the
-    disagreement within items over the disagreement between any two votes.
+    """Krippendorff's alpha for nominal votes: one minus the disagreement within items over the
+    disagreement between any two votes. Items may differ in their number of votes.
 
     Returns:
         None where it is undefined: no item has two votes, or all are for one candidate index.
     """
-    table = _counts([choices for choices in items if len(choices) > 1])
-    if not len(table) or _unanimous(table):
+    table = _count_choices([choices for choices in items if len(choices) > 1])
+    if not len(table) or _is_unanimous(table):
         return None
     depth, total = table.sum(axis=1), table.sum(axis=0)
     votes = total.sum()
-    # Ordered pairs of unlike votes, those of an item weighted by one over its other votes.
+    # Ordered pairs of unequal votes; a pair within an item weighs one over its other votes.
     within = ((depth**2 - (table**2).sum(axis=1)) / (depth - 1)).sum() / votes
     between = (votes**2 - (total**2).sum()) / (votes * (votes - 1))
     return float(1 - within / between)
 
 
-def seconds(votes: Sequence[Vote]) -> dict[str, dict[str, float | int]]:
-    """Median decision times by family, by both clocks, of votes whose page was loaded once: of the
-    others nobody knows how long they were looked at."""
-    by_family = _grouped([vote for vote in votes if vote.loads == 1], "family")
+def median_seconds(votes: Sequence[Vote]) -> dict[str, dict[str, float | int]]:
+    """Median decision times by family and clock, over votes whose page was loaded once: the total
+    viewing time of the others is unknown."""
+    by_family = _group([vote for vote in votes if vote.loads == 1], "family")
     return {
         family: {
             "server": float(np.median([vote.seconds for vote in by_family[family]])),
@@ -112,30 +111,29 @@ def seconds(votes: Sequence[Vote]) -> dict[str, dict[str, float | int]]:
 
 
 def _accuracy(votes: Sequence[Vote]) -> dict[str, Any]:
-    found = accuracy_by_family([vote.family for vote in votes], [vote.right for vote in votes])
-    return asdict(found)
+    return asdict(accuracy_by_family([vote.family for vote in votes], [v.right for v in votes]))
 
 
 def _majority_accuracy(by_item: Mapping[str, Sequence[Vote]]) -> dict[str, Any]:
-    decided = {item: majority([v.choice for v in of]) for item, of in by_item.items()}
-    families = [of[0].family for of in by_item.values()]
-    right = [decided[item] == of[0].answer for item, of in by_item.items()]
-    undecided = sum(choice is None for choice in decided.values())
-    return {**asdict(accuracy_by_family(families, right)), "undecided": undecided}
+    decisions = [majority([vote.choice for vote in votes]) for votes in by_item.values()]
+    first = [votes[0] for votes in by_item.values()]
+    correct = [choice == vote.answer for choice, vote in zip(decisions, first, strict=True)]
+    accuracy = accuracy_by_family([vote.family for vote in first], correct)
+    return {**asdict(accuracy), "undecided": decisions.count(None)}
 
 
-def _counts(items: Sequence[Sequence[int]]) -> np.ndarray:
+def _count_choices(items: Sequence[Sequence[int]]) -> np.ndarray:
     """(items, 4) votes for each candidate."""
     rows = [np.bincount(choices, minlength=len(LETTERS)) for choices in items]
     return np.array(rows, dtype=int).reshape(-1, len(LETTERS))
 
 
-def _unanimous(table: np.ndarray) -> bool:
+def _is_unanimous(table: np.ndarray) -> bool:
     return np.count_nonzero(table.sum(axis=0)) == 1
 
 
-def _grouped(votes: Sequence[Vote], key: str) -> dict[str, list[Vote]]:
-    found: dict[str, list[Vote]] = defaultdict(list)
+def _group(votes: Sequence[Vote], key: str) -> dict[str, list[Vote]]:
+    groups: dict[str, list[Vote]] = defaultdict(list)
     for vote in votes:
-        found[getattr(vote, key)].append(vote)
-    return found
+        groups[getattr(vote, key)].append(vote)
+    return groups

@@ -1,4 +1,4 @@
-"""Export a study's votes, its server running or not, and say how right and how agreed they are."""
+"""Export a study's votes with their accuracy and agreement; the study may be running."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from conf.schema import ExportStudyCommand
 
 log = logging.getLogger(__name__)
 
-VOTES = "votes.jsonl"
+VOTES_FILE = "votes.jsonl"
 
 
 @command("evaluation.study.export", ExportStudyCommand)
@@ -21,28 +21,31 @@ def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
     from evaluation.reporting.tables import human_table
     from evaluation.study import storage
     from evaluation.study.agreement import summary
-    from evaluation.study.votes import votes_of
 
-    runs = Path(cfg.checkpoints) / "study"
-    path = runs / resolve_run_name(cfg.run, str(runs)) / storage.DATABASE
-    if not storage.begun(path):
-        raise UserError(f"{path} is not there: begin a study with python -m evaluation.study")
+    studies = Path(cfg.checkpoints) / "study"
+    path = studies / resolve_run_name(cfg.run, str(studies)) / storage.DATABASE
+    if not storage.exists(path):
+        raise UserError(
+            f"{path} does not exist: start a study with python -m evaluation.study",
+            code="missing-run",
+        )
     db = storage.open_study(path)
-    with storage.transaction(db, reads=True):
-        votes = list(votes_of(db))
-        about, items = storage.about(db), len(storage.item_ids(db, practice=False))
-        annotators = storage.annotators(db)
+    with storage.transaction(db, read_only=True):
+        votes = list(storage.read_votes(db))
+        about, items = storage.read_about(db), len(storage.item_ids(db, practice=False))
+        annotators = storage.annotator_names(db)
     if not votes:
-        raise UserError(f"{path} holds no votes yet")
-    of = {"benchmark": about["benchmark"], "build": about["identity"]}
-    found = of | summary(votes, items, annotators)
-    write_text(run.folder / VOTES, "".join(json.dumps(v.to_row()) + "\n" for v in votes))
-    write_text(run.folder / "report.json", json.dumps(found, indent=1))
-    table = human_table(found)
+        raise UserError(f"{path} has no votes yet", code="no-votes")
+    benchmark = {"benchmark": about["benchmark"], "build": about["identity"]}
+    report = benchmark | summary(votes, items, annotators)
+    write_text(run.folder / VOTES_FILE, "".join(json.dumps(v.to_row()) + "\n" for v in votes))
+    write_text(run.folder / "report.json", json.dumps(report, indent=1))
+    table = human_table(report)
     write_text(run.folder / "report.txt", f"{table}\n")
-    log.info("%s\n\nvotes: %s", table, run.folder / VOTES)
-    families = {f"majority_{f}": i["value"] for f, i in found["majority"]["families"].items()}
-    return {**families, "majority_macro": found["majority"]["macro"]}
+    log.info("%s\n\nvotes: %s", table, run.folder / VOTES_FILE)
+    majority = report["majority"]
+    families = {f"majority_{f}": share["value"] for f, share in majority["families"].items()}
+    return {**families, "majority_macro": majority["macro"]}
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What an annotator sees of an item, encoded anew from its pixels and with nothing beside them."""
+"""The images and videos of an item, encoded from its pixels and without metadata."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from data.render.frame_cache import FrameReader
 
 VIDEO, IMAGE = "video/mp4", "image/png"
 PREFIX = -1
-"""Slot of an item's prefix; 0 to 3 are its candidates, in the item's own order."""
+"""Slot of an item's prefix; its candidates have 0 to 3, in the item's order."""
 CRF = "12"
-"""x264's constant rate factor: no loss that is seen."""
+"""Constant rate factor of x264 without visible loss."""
 SEI = "6"
-"""H.264 units in which x264 writes its version and settings."""
+"""Type of the H.264 units in which x264 writes its version and settings."""
 
 
 @dataclass(frozen=True)
@@ -30,19 +30,24 @@ class Medium:
     content: bytes
 
 
-def media_of(item: SelectionItem, frames: FrameReader) -> list[Medium]:
-    """An item's prefix as a video at the scene's own rate, every frame of it, and its candidates as
-    images that are all of one size in bytes."""
+def encode_media(item: SelectionItem, frames: FrameReader) -> list[Medium]:
+    """An item's prefix as a video of all its frames at the scene's rate, and its candidates as
+    images of equal file size.
+
+    Raises:
+        UserError: the frames differ in size, or cannot be read.
+    """
     shown = list(range(item.prefix_start, item.prefix_stop + 1))
     prefix = frames.stack(item.scene_id, shown)
     video = encode_video(prefix, frames.scene(item.scene_id).fps)
     images = [frames.array(c.scene_id, c.frame) for c in item.candidates]
     if len({prefix[0].shape, *(image.shape for image in images)}) > 1:
         raise UserError(
-            f"item {item.item_id} has candidates of another frame size than its prefix, which "
-            "would tell some of them apart: choose the items of the study by items=FILE, without it"
+            f"item {item.item_id} has frames of different sizes, which would distinguish its "
+            "candidates: choose the study's items without it by items=FILE",
+            code="frame-size",
         )
-    files = padded([encode_image(pixels) for pixels in images])
+    files = pad_files([encode_image(pixels) for pixels in images])
     return [
         _medium(PREFIX, VIDEO, prefix[0], video),
         *(_medium(k, IMAGE, images[k], file) for k, file in enumerate(files)),
@@ -58,16 +63,16 @@ def encode_image(pixels: np.ndarray) -> bytes:
     return target.getvalue()
 
 
-def padded(files: list[bytes]) -> list[bytes]:
-    """The files at the size of the largest: how well an image compresses would tell it from the
-    others. What follows the end of a PNG is not read."""
+def pad_files(files: list[bytes]) -> list[bytes]:
+    """The files padded to the size of the largest, so that sizes do not distinguish candidates.
+    Decoders ignore what follows the end of a PNG."""
     size = max(map(len, files))
     return [file.ljust(size, b"\0") for file in files]
 
 
 def encode_video(pixels: np.ndarray, fps: float) -> bytes:
-    """An mp4 (H.264) of (frames, height, width, 3) uint8 without dates or an encoder's name. An odd
-    side gets its last line twice, which the codec needs."""
+    """An mp4 (H.264) of (frames, height, width, 3) uint8 without dates or an encoder's name. The
+    codec needs even sides: an odd side repeats its last line."""
     import av
     from av.bitstream import BitStreamFilterContext
 

@@ -1,16 +1,19 @@
-"""The study's pages. What somebody sees is always at `/`, and follows from where they stand."""
+"""The study's pages and its server. `/` always shows the page of the annotator's current stage."""
 
 from __future__ import annotations
 
+import errno
 import logging
 import math
 import secrets
+import socket
 import sqlite3
 from collections.abc import Callable
 from importlib.resources import files
 from urllib.parse import parse_qsl
 
 import jinja2
+import uvicorn
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -18,49 +21,50 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
+from conf.errors import UserError
+from conf.schema import StudyCommand
 from data.records import LETTERS
 from evaluation.study import auth, workflow
-from evaluation.study.guards import Guard
 
 log = logging.getLogger(__name__)
 
 COOKIE = "study"
 COOKIE_SECONDS = 90 * 24 * 3600
-FORM_BYTES = 4096
-LONGEST = 1e7
-"""Seconds past which a browser's clock is not believed."""
+MAX_FORM_BYTES = 4096
+MAX_SECONDS = 1e7
+"""Longest plausible time of a browser's clock."""
+BACKLOG = 2048
+"""Connections that may wait to be accepted."""
 STATIC = {"study.css": "text/css", "study.js": "text/javascript", "icon.svg": "image/svg+xml"}
 REFUSALS = {
-    400: "That request could not be understood.",
-    401: "You are not signed in here. Open the link that you were given; if it has been used, ask "
-    "for a new one.",
-    403: "That form has expired.",
-    404: "There is nothing here.",
-    405: "There is nothing here.",
-    410: "This link has been used already, or never was one. Ask for a new one.",
-    413: "That request was too long.",
+    400: "The server could not read this request.",
+    401: "You are not signed in on this device. Open your link; if it has been used, ask for a new "
+    "one.",
+    403: "This form has expired.",
+    404: "This page does not exist.",
+    405: "This page does not exist.",
+    410: "This link has been used or is not valid. Ask for a new one.",
+    413: "This request was too long.",
 }
 
 
 class Pages:
-    """The endpoints over one study's database."""
+    """The endpoints over one study's database.
+
+    Args:
+        on_sign_in: Called after a link is used.
+    """
 
     def __init__(
-        self,
-        db: sqlite3.Connection,
-        rest_every: int,
-        secure: bool,
-        links_changed: Callable[[], None],
+        self, db: sqlite3.Connection, cfg: StudyCommand, on_sign_in: Callable[[], object]
     ) -> None:
-        """`secure` keeps the session to https; `links_changed` is called when one was spent."""
         self._db = db
-        self._rest_every = rest_every
-        self._secure = secure
-        self._links_changed = links_changed
-        loader = jinja2.PackageLoader("evaluation.study")
+        self._rest_every = cfg.rest_every
+        self._secure = (cfg.public or "").startswith("https:")
+        self._on_sign_in = on_sign_in
         self._templates = jinja2.Environment(
-            loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
-            lstrip_blocks=True,
+            loader=jinja2.PackageLoader("evaluation.study"), autoescape=True,
+            undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         )  # fmt: skip
         folder = files("evaluation.study") / "static"
         self._static = {name: (folder / name).read_bytes() for name in STATIC}
@@ -71,7 +75,7 @@ class Pages:
             Route("/link/{link}", self.link),
             Route("/link", self.sign_in, methods=["POST"]),
             Route("/consent", self.consent, methods=["POST"]),
-            Route("/go-on", self.go_on, methods=["POST"]),
+            Route("/continue", self.leave_page, methods=["POST"]),
             Route("/loaded", self.loaded, methods=["POST"]),
             Route("/answer", self.answer, methods=["POST"]),
             Route("/media/{name}", self.media),
@@ -79,32 +83,32 @@ class Pages:
         ]
 
     async def home(self, request: Request) -> Response:
-        me = self._signed_in(request)
-        stage = workflow.stage_of(self._db, me, self._rest_every)
-        asks = stage.page in ("practice", "feedback", "item")
-        question = workflow.question(self._db, stage.key) if asks else None
-        page = "question" if asks else stage.page
-        return self._page(page, stage=stage, question=question, form_key=me["form_key"])
+        annotator = self._annotator(request)
+        stage = workflow.current_stage(self._db, annotator, self._rest_every)
+        has_question = stage.page in ("practice", "feedback", "item")
+        question = workflow.load_question(self._db, stage.key) if has_question else None
+        page = "question" if has_question else stage.page
+        return self._render(page, stage=stage, question=question, form_key=annotator["form_key"])
 
     async def link(self, request: Request) -> Response:
-        # Looking at a link does not spend it: mail programs look too.
+        # Only the form below uses the link: mail programs open links, too.
         link = request.path_params["link"]
-        if auth.owner(self._db, link) is None:
+        if auth.find_link_owner(self._db, link) is None:
             raise HTTPException(410)
-        return self._page("link", link=link)
+        return self._render("link", link=link)
 
     async def sign_in(self, request: Request) -> Response:
-        link = (await form_of(request)).get("link", "")
-        name = auth.owner(self._db, link)
+        link = (await read_form(request)).get("link", "")
+        name = auth.find_link_owner(self._db, link)
         session = auth.sign_in(self._db, link)
         if session is None:
             raise HTTPException(410)
         log.info("%s signed in", name)
         try:
-            self._links_changed()
+            self._on_sign_in()
         except OSError as error:
-            # The link is spent: without the session its owner would be locked out.
-            log.warning("the file of links still holds that of %s: %s", name, error)
+            # The link is used: without the session its owner would be locked out.
+            log.warning("the file of links still holds the used link of %s: %s", name, error)
         response = RedirectResponse("/", 303)
         response.set_cookie(
             COOKIE, session, max_age=COOKIE_SECONDS, httponly=True, samesite="lax",
@@ -113,35 +117,38 @@ class Pages:
         return response
 
     async def consent(self, request: Request) -> Response:
-        me, _ = await self._posted(request)
-        workflow.consent(self._db, me)
+        annotator, _ = await self._read_own_form(request)
+        workflow.record_consent(self._db, annotator)
         return RedirectResponse("/", 303)
 
-    async def go_on(self, request: Request) -> Response:
-        me, form = await self._posted(request)
-        workflow.go_on(self._db, me, form.get("key", ""), self._rest_every)
+    async def leave_page(self, request: Request) -> Response:
+        annotator, form = await self._read_own_form(request)
+        workflow.leave_page(self._db, annotator, form.get("key", ""), self._rest_every)
         return RedirectResponse("/", 303)
 
     async def loaded(self, request: Request) -> Response:
-        me, form = await self._posted(request)
-        there = workflow.note_loaded(self._db, me["name"], form.get("key", ""))
-        return Response(status_code=204 if there else 409)
+        annotator, form = await self._read_own_form(request)
+        is_open = workflow.record_loaded(self._db, annotator["name"], form.get("key", ""))
+        return Response(status_code=204 if is_open else 409)
 
     async def answer(self, request: Request) -> Response:
-        me, form = await self._posted(request)
-        letter, seconds = form.get("choice", ""), _seconds(form.get("seconds", ""))
+        annotator, form = await self._read_own_form(request)
+        letter, seconds = form.get("choice", ""), _parse_seconds(form.get("seconds", ""))
         if letter not in tuple(LETTERS) or seconds is None:
             raise HTTPException(400)
-        if workflow.answer(self._db, me["name"], form.get("key", ""), letter, seconds):
-            self._tell_end(me)
+        name, key = annotator["name"], form.get("key", "")
+        if workflow.record_answer(self._db, name, key, letter, seconds):
+            stage = workflow.current_stage(self._db, annotator, self._rest_every)
+            if stage.page == "done":
+                log.info("%s has answered all %d items", name, stage.total)
         return RedirectResponse("/", 303)
 
     async def media(self, request: Request) -> Response:
-        me = self._signed_in(request)
-        found = workflow.medium(self._db, me["name"], request.path_params["name"])
-        if found is None:
+        annotator = self._annotator(request)
+        medium = workflow.load_medium(self._db, annotator["name"], request.path_params["name"])
+        if medium is None:
             raise HTTPException(404)
-        return Response(found["content"], media_type=found["kind"])
+        return Response(medium["content"], media_type=medium["kind"])
 
     async def static(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -149,61 +156,53 @@ class Pages:
             raise HTTPException(404)
         return Response(self._static[name], media_type=STATIC[name])
 
-    async def refusal(self, request: Request, error: Exception) -> Response:
-        """A page for every refused request. It tells nothing of what was asked for."""
+    async def refuse(self, request: Request, error: Exception) -> Response:
+        """The page of a refused request; it repeats nothing of the request."""
         status = error.status_code if isinstance(error, HTTPException) else 500
-        told = REFUSALS.get(status, "Something went wrong here. Try again in a moment.")
-        return self._page("refusal", status, refused=status, told=told)
+        reason = REFUSALS.get(status, "The server failed. Try again in a moment.")
+        return self._render("refusal", status, status=status, reason=reason)
 
-    def _tell_end(self, me: sqlite3.Row) -> None:
-        stage = workflow.stage_of(self._db, me, self._rest_every)
-        if stage.page == "done":
-            log.info("%s has answered all %d items", me["name"], stage.total)
-
-    def _signed_in(self, request: Request) -> sqlite3.Row:
-        """Raises HTTPException 401 for somebody without a session."""
-        me = auth.signed_in(self._db, request.cookies.get(COOKIE, ""))
-        if me is None:
+    def _annotator(self, request: Request) -> sqlite3.Row:
+        """The annotator of the request's session. Raises HTTPException 401 without one."""
+        annotator = auth.find_annotator(self._db, request.cookies.get(COOKIE, ""))
+        if annotator is None:
             raise HTTPException(401)
-        return me
+        return annotator
 
-    async def _posted(self, request: Request) -> tuple[sqlite3.Row, dict[str, str]]:
-        """Who sends a form that a page of theirs held, and its fields.
+    async def _read_own_form(self, request: Request) -> tuple[sqlite3.Row, dict[str, str]]:
+        """The annotator and the fields of a form from one of their own pages.
 
         Raises:
-            HTTPException: 401 without a session, 403 for a form of another session's page.
+            HTTPException: 401 without a session, 403 for a form of another session.
         """
-        me = self._signed_in(request)
-        form = await form_of(request)
-        given = form.get("form_key", "").encode()
-        if not secrets.compare_digest(given, me["form_key"].encode()):
+        annotator = self._annotator(request)
+        form = await read_form(request)
+        key = form.get("form_key", "").encode()
+        if not secrets.compare_digest(key, annotator["form_key"].encode()):
             raise HTTPException(403)
-        return me, form
+        return annotator, form
 
-    def _page(self, template: str, status: int = 200, **told: object) -> HTMLResponse:
-        return HTMLResponse(self._templates.get_template(f"{template}.html").render(told), status)
+    def _render(self, template: str, status_code: int = 200, **values: object) -> HTMLResponse:
+        page = self._templates.get_template(f"{template}.html").render(values)
+        return HTMLResponse(page, status_code)
 
 
-def make_app(
-    db: sqlite3.Connection,
-    rest_every: int,
-    public: str | None,
-    links_changed: Callable[[], None],
+def build_app(
+    db: sqlite3.Connection, cfg: StudyCommand, on_sign_in: Callable[[], object]
 ) -> ASGIApp:
-    """The study as an ASGI application; `public` is its address behind a proxy, if it has one."""
-    secure = (public or "").startswith("https:")
-    pages = Pages(db, rest_every, secure, links_changed)
+    """The study as an ASGI application."""
+    pages = Pages(db, cfg, on_sign_in)
     app = Starlette(
         routes=pages.routes(),
-        exception_handlers={HTTPException: pages.refusal, 500: pages.refusal},
-        max_body_size=FORM_BYTES,
+        exception_handlers={HTTPException: pages.refuse, 500: pages.refuse},
+        max_body_size=MAX_FORM_BYTES,
     )
-    # Around all of it: what Starlette itself replies to a long body or an error goes through too.
-    return Guard(app, public)
+    # The outermost layer, so that Starlette's own error responses pass through it.
+    return auth.SiteGuard(app, cfg.public)
 
 
-async def form_of(request: Request) -> dict[str, str]:
-    """The fields of a form. Raises HTTPException 400 for a body that is none."""
+async def read_form(request: Request) -> dict[str, str]:
+    """The fields of a form. Raises HTTPException 400 for another body."""
     try:
         body = (await request.body()).decode("ascii")
         return dict(parse_qsl(body, keep_blank_values=True, max_num_fields=16))
@@ -211,10 +210,47 @@ async def form_of(request: Request) -> dict[str, str]:
         raise HTTPException(400) from error
 
 
-def _seconds(text: str) -> float | None:
-    """A plausible time; None for what is no number, or no such time."""
+def _parse_seconds(text: str) -> float | None:
+    """A plausible number of seconds, else None."""
     try:
         seconds = float(text)
     except ValueError:
         return None
-    return seconds if math.isfinite(seconds) and 0 <= seconds < LONGEST else None
+    return seconds if math.isfinite(seconds) and 0 <= seconds < MAX_SECONDS else None
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket. Raises UserError if the address is taken or not this machine's."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM
+        )[0]
+        listener = socket.socket(family, kind, protocol)
+        try:
+            # Lingering connections of the previous server do not block the port.
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(address)
+            listener.listen(BACKLOG)
+        except OSError:
+            listener.close()
+            raise
+        return listener
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            reason = f"port={port} is in use: stop the server there, or choose another port="
+        elif error.errno == errno.EACCES:
+            reason = f"port={port} needs more rights: choose a port above 1023"
+        else:
+            reason = f"host={host} is not an address of this machine"
+        raise UserError(f"cannot serve the study: {reason}", code="invalid-address") from error
+
+
+def serve(app: ASGIApp, listener: socket.socket) -> None:
+    """Serve until Ctrl-C or SIGTERM."""
+    # Uvicorn's own log would record who requested what.
+    settings = uvicorn.Config(
+        app, log_config=None, log_level="warning", access_log=False, server_header=False,
+        proxy_headers=False, lifespan="off", ws="none", backlog=BACKLOG,
+        timeout_graceful_shutdown=5,
+    )  # fmt: skip
+    uvicorn.Server(settings).run(sockets=[listener])

@@ -1,7 +1,7 @@
-"""A study's database: one SQLite file with its items, media, accounts and answers.
+"""A study's database: one SQLite file with its items, media, annotators and answers.
 
-It is whole at every moment: each change is one transaction, on the disk before anybody is told. One
-server writes; an export may read beside it.
+Every change is one transaction that is on disk before the client is answered, so that the file is
+consistent at any time. One server writes; an export may read at the same time.
 """
 
 from __future__ import annotations
@@ -10,19 +10,21 @@ import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from conf.errors import UserError
 from data.records import SelectionItem
-from evaluation.study.assignment import Planned
+from evaluation.study.assignment import Assignment
 from evaluation.study.media import Medium
 
 DATABASE = "study.sqlite"
-APPLICATION = 0x44795078
-"""SQLite's mark of whose database a file is."""
+APPLICATION_ID = 0x44795078
+"""Marks the file as a study's in SQLite's header."""
 VERSION = 1
-SLOTS = 5
-"""Media of an item."""
+MEDIA_PER_ITEM = 5
 
 SCHEMA = """
 CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
@@ -58,70 +60,126 @@ CREATE TABLE name (
 """
 
 
+@dataclass(frozen=True)
+class Vote:
+    """One annotator's answer to one item.
+
+    Seconds run from the moment when the page was completely visible; if it was loaded more than
+    once (`loads`), from the last time.
+
+    Attributes:
+        answer, choice: Indices of the correct and the chosen candidate in the benchmark's order.
+        letter: The letter at which the chosen candidate stood.
+        seconds, client_seconds: By the server's and by the browser's clock.
+        answered: Time of the answer, UTC.
+    """
+
+    annotator: str
+    item_id: str
+    suite: str
+    family: str
+    subtype: str
+    answer: int
+    choice: int
+    letter: str
+    seconds: float
+    client_seconds: float
+    loads: int
+    answered: str
+
+    @property
+    def right(self) -> bool:
+        return self.choice == self.answer
+
+    def to_row(self) -> dict[str, Any]:
+        return {**asdict(self), "right": self.right}
+
+    @classmethod
+    def from_row(cls, row: dict[str, Any]) -> Vote:
+        return cls(**{key: value for key, value in row.items() if key != "right"})
+
+
 def create(
     path: Path,
     about: dict[str, str],
     items: Sequence[SelectionItem],
     practice: Sequence[SelectionItem],
     links: dict[str, str],
-    plan: Sequence[Planned],
+    assignments: Sequence[Assignment],
 ) -> sqlite3.Connection:
-    """A new study, still without media. `links` holds each annotator's first link; `plan` covers
-    the items of practice too."""
-    # SQLite gives the files that it keeps beside a database the mode of that.
+    """A new study without media.
+
+    Args:
+        links: Each annotator's first link.
+        assignments: Those of the items and of the practice items.
+    """
+    # SQLite gives its side files the mode of the database.
     os.close(os.open(path, os.O_CREAT | os.O_WRONLY, 0o600))
     path.chmod(0o600)
     db = _connect(path)
     db.execute("PRAGMA journal_mode = WAL")
+    all_items = [*((False, item) for item in items), *((True, item) for item in practice)]
+    item_rows = [
+        (
+            i.item_id, is_practice, place, i.suite, i.family, i.subtype, i.question, i.scene_id,
+            i.prefix_stop, i.answer,
+        )
+        for place, (is_practice, i) in enumerate(all_items)
+    ]  # fmt: skip
+    plan_rows = [(a.annotator, a.item_id, a.rank, "".join(map(str, a.order))) for a in assignments]
     with transaction(db):
         for statement in SCHEMA.split(";"):
             db.execute(statement)
         db.executemany("INSERT INTO about VALUES (?, ?)", about.items())
-        asked = [(False, i) for i in items] + [(True, i) for i in practice]
-        rows = [_item_row(practised, k, item) for k, (practised, item) in enumerate(asked)]
-        db.executemany(f"INSERT INTO item VALUES ({', '.join('?' * 10)})", rows)
+        db.executemany(f"INSERT INTO item VALUES ({', '.join('?' * 10)})", item_rows)
         db.executemany("INSERT INTO annotator (name, link) VALUES (?, ?)", links.items())
-        planned = [(p.annotator, p.item_id, p.rank, "".join(map(str, p.order))) for p in plan]
-        db.executemany("INSERT INTO plan VALUES (?, ?, ?, ?)", planned)
-        db.execute(f"PRAGMA application_id = {APPLICATION}")
+        db.executemany("INSERT INTO plan VALUES (?, ?, ?, ?)", plan_rows)
+        db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         db.execute(f"PRAGMA user_version = {VERSION}")
     return db
 
 
-def begun(path: Path) -> bool:
-    """Whether a file holds a study; one whose creation was killed holds nothing yet."""
-    return path.exists() and path.stat().st_size > 0 and _tables(path) != 0
+def exists(path: Path) -> bool:
+    """Whether a file holds a study. If the creation was killed, the file has no tables yet."""
+    if not path.exists() or path.stat().st_size == 0:
+        return False
+    try:
+        with closing(_connect(path)) as db:
+            return db.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0] > 0
+    except sqlite3.DatabaseError:
+        return True
 
 
 def open_study(path: Path) -> sqlite3.Connection:
-    """The database of a study that was begun.
+    """The database of an existing study.
 
     Raises:
-        UserError: it is damaged, of another version, or no study.
+        UserError: it is damaged, of another version, or not a study.
     """
-    anew = "delete its folder, or begin a study of another name with run=NAME"
+    remedy = "delete its folder, or start another study with run=NAME"
     try:
         db = _connect(path)
-        whose = db.execute("PRAGMA application_id").fetchone()[0]
+        application = db.execute("PRAGMA application_id").fetchone()[0]
         version = db.execute("PRAGMA user_version").fetchone()[0]
-        if whose != APPLICATION:
-            raise UserError(f"{path} is no database of a study: {anew}")
+        if application != APPLICATION_ID:
+            raise UserError(f"{path} is not a study's database: {remedy}", code="not-a-study")
         if version != VERSION:
             raise UserError(
-                f"{path} is a study of version {version}, this is version {VERSION}: go on with "
-                "it in the release that began it, or begin another with run=NAME"
+                f"{path} has the format {version} of another release, this one reads {VERSION}: "
+                "resume it in that release, or start another study with run=NAME",
+                code="unknown-version",
             )
-        if (found := db.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
-            raise UserError(f"{path} is damaged ({found}): {anew}")
+        if (damage := db.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
+            raise UserError(f"{path} is damaged ({damage}): {remedy}", code="damaged-file")
     except sqlite3.DatabaseError as error:
-        raise UserError(f"{path} is damaged or no database of a study ({error}): {anew}") from error
+        raise UserError(f"{path} is damaged ({error}): {remedy}", code="damaged-file") from error
     return db
 
 
 @contextmanager
-def transaction(db: sqlite3.Connection, reads: bool = False) -> Iterator[None]:
-    """All that happens within, or nothing of it; what only `reads` holds up nobody who writes."""
-    db.execute("BEGIN" if reads else "BEGIN IMMEDIATE")
+def transaction(db: sqlite3.Connection, read_only: bool = False) -> Iterator[None]:
+    """Run the block completely or not at all. Read-only transactions do not block writers."""
+    db.execute("BEGIN" if read_only else "BEGIN IMMEDIATE")
     try:
         yield
     except BaseException:
@@ -130,28 +188,28 @@ def transaction(db: sqlite3.Connection, reads: bool = False) -> Iterator[None]:
     db.execute("COMMIT")
 
 
-def about(db: sqlite3.Connection) -> dict[str, str]:
-    """What was noted of the study when it began."""
+def read_about(db: sqlite3.Connection) -> dict[str, str]:
+    """The name and the identity of the study's benchmark."""
     return dict(tuple(row) for row in db.execute("SELECT key, value FROM about"))
 
 
-def annotators(db: sqlite3.Connection) -> list[str]:
+def annotator_names(db: sqlite3.Connection) -> list[str]:
     return [row["name"] for row in db.execute("SELECT name FROM annotator ORDER BY rowid")]
 
 
 def item_ids(db: sqlite3.Connection, practice: bool) -> list[str]:
-    """The study's items, in the order that they were chosen in."""
-    asked = "SELECT item_id FROM item WHERE practice = ? ORDER BY place"
-    return [row["item_id"] for row in db.execute(asked, (practice,))]
+    """The ids of the items or of the practice items, in the order of their choice."""
+    query = "SELECT item_id FROM item WHERE practice = ? ORDER BY place"
+    return [row["item_id"] for row in db.execute(query, (practice,))]
 
 
-def without_media(db: sqlite3.Connection) -> list[str]:
-    """Items of which something to show is missing."""
-    counted = """
+def items_without_media(db: sqlite3.Connection) -> list[str]:
+    """The ids of items that lack a medium."""
+    query = """
         SELECT item_id FROM item LEFT JOIN medium USING (item_id)
         GROUP BY item_id HAVING count(slot) <> ? ORDER BY place
     """
-    return [row["item_id"] for row in db.execute(counted, (SLOTS,))]
+    return [row["item_id"] for row in db.execute(query, (MEDIA_PER_ITEM,))]
 
 
 def add_media(db: sqlite3.Connection, item_id: str, media: Sequence[Medium]) -> None:
@@ -160,23 +218,22 @@ def add_media(db: sqlite3.Connection, item_id: str, media: Sequence[Medium]) -> 
         db.executemany("INSERT OR REPLACE INTO medium VALUES (?, ?, ?, ?, ?, ?)", rows)
 
 
+def read_votes(db: sqlite3.Connection) -> Iterator[Vote]:
+    """The votes in temporal order, without practice."""
+    rows = db.execute(
+        "SELECT annotator, item_id, suite, family, subtype, answer, choice, letter, "
+        "answered - loaded AS seconds, client_seconds, loads, answered "
+        "FROM turn JOIN item USING (item_id) "
+        "WHERE NOT practice AND answered IS NOT NULL ORDER BY answered, token"
+    )
+    for row in rows:
+        time = datetime.fromtimestamp(row["answered"], UTC).isoformat(timespec="seconds")
+        yield Vote(**{**dict(row), "answered": time, "seconds": max(0.0, row["seconds"])})
+
+
 def _connect(path: Path) -> sqlite3.Connection:
     db = sqlite3.connect(path, isolation_level=None, timeout=30)
     db.row_factory = sqlite3.Row
     db.execute("PRAGMA foreign_keys = ON")
     db.execute("PRAGMA synchronous = FULL")
     return db
-
-
-def _tables(path: Path) -> int:
-    try:
-        with closing(_connect(path)) as db:
-            return db.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]
-    except sqlite3.DatabaseError:
-        return -1
-
-
-def _item_row(practice: bool, place: int, item: SelectionItem) -> tuple:
-    cell = (item.suite, item.family, item.subtype, item.question)
-    moment = (item.scene_id, item.prefix_stop, item.answer)
-    return (item.item_id, practice, place, *cell, *moment)

@@ -1,7 +1,7 @@
-"""An annotator's way through a study: consent, practice, items with breaks between them, the end.
+"""The stages of an annotator: consent, practice, items with breaks between them, and the end.
 
-Where somebody stands follows from the database alone, so that closing the page or ending the server
-loses nothing; a step that is not the one to take now changes nothing.
+The stage follows from the database alone, so that nothing is lost when a page closes or the server
+stops. A step that does not belong to the current stage changes nothing.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ import time
 from dataclasses import dataclass
 
 from data.records import LETTERS
-from evaluation.study.assignment import Waiting, next_item
+from evaluation.study.assignment import WaitingItem, next_item
 from evaluation.study.auth import new_token
 from evaluation.study.media import PREFIX
 from evaluation.study.storage import transaction
 
-ABANDONED = 3600.0
-"""Seconds after which an item that was opened and not answered counts as one that was not."""
+ABANDONED_SECONDS = 3600.0
+"""Age of an open, unanswered item after which it does not count as a vote to come."""
 ANSWERED = """
     SELECT turn.* FROM turn JOIN item USING (item_id)
     WHERE annotator = ? AND practice = ? AND answered IS NOT NULL
@@ -26,8 +26,13 @@ ANSWERED = """
 
 @dataclass(frozen=True)
 class Stage:
-    """Where an annotator stands. `page` is consent, practice, feedback, ready, item, rest or done;
-    `key` names this very step, and `number` of `total` items are behind or on the page."""
+    """An annotator's current stage.
+
+    Attributes:
+        page: consent, practice, feedback, ready, item, rest or done.
+        key: Identifies this step in its form.
+        number, total: Items answered or on the page, and all of them.
+    """
 
     page: str
     key: str = ""
@@ -36,8 +41,8 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Shown:
-    """One thing on a page: the name it is fetched by and its size in px."""
+class PageMedium:
+    """An image or a video on a page: the name of its URL, and its size in pixels."""
 
     name: str
     width: int
@@ -46,71 +51,71 @@ class Shown:
 
 @dataclass(frozen=True)
 class Question:
-    """What a page asks. `right` and `chosen` are letters, told after practice alone."""
+    """An item's page. `correct` and `chosen` are letters, set after practice only."""
 
     text: str
-    prefix: Shown
-    candidates: dict[str, Shown]
-    right: str | None
+    prefix: PageMedium
+    candidates: dict[str, PageMedium]
+    correct: str | None
     chosen: str | None
 
 
-def stage_of(db: sqlite3.Connection, me: sqlite3.Row, rest_every: int) -> Stage:
-    """Where an annotator stands; an item that comes next is opened."""
-    if me["consented"] is None:
+def current_stage(db: sqlite3.Connection, annotator: sqlite3.Row, rest_every: int) -> Stage:
+    """An annotator's stage; the next item is opened if none is open."""
+    if annotator["consented"] is None:
         return Stage("consent")
+    name = annotator["name"]
     with transaction(db):
-        if stage := _practice(db, me):
+        if stage := _practice_stage(db, name):
             return stage
-        total = _count(db, practice=False)
-        done = len(db.execute(ANSWERED, (me["name"], False)).fetchall())
-        if me["begun"] is None:
+        total = _count_items(db, practice=False)
+        done = len(db.execute(ANSWERED, (name, False)).fetchall())
+        if annotator["begun"] is None:
             return Stage("ready", "ready", total=total)
         if done == total:
             return Stage("done", number=done, total=total)
-        due, left = divmod(done, rest_every)
-        if due > me["rests"] and not left:
-            return Stage("rest", f"rest-{due}", done, total)
-        return Stage("item", _open(db, me["name"], practice=False), done + 1, total)
+        rests, items_since = divmod(done, rest_every)
+        if rests > annotator["rests"] and not items_since:
+            return Stage("rest", f"rest-{rests}", done, total)
+        return Stage("item", _open_item(db, name, practice=False), done + 1, total)
 
 
-def _practice(db: sqlite3.Connection, me: sqlite3.Row) -> Stage | None:
-    total = _count(db, practice=True)
-    turns = db.execute(ANSWERED, (me["name"], True)).fetchall()
+def _practice_stage(db: sqlite3.Connection, name: str) -> Stage | None:
+    total = _count_items(db, practice=True)
+    turns = db.execute(ANSWERED, (name, True)).fetchall()
     if unread := [turn for turn in turns if not turn["closed"]]:
         return Stage("feedback", unread[0]["token"], len(turns), total)
     if len(turns) < total:
-        return Stage("practice", _open(db, me["name"], practice=True), len(turns) + 1, total)
+        return Stage("practice", _open_item(db, name, practice=True), len(turns) + 1, total)
     return None
 
 
-def consent(db: sqlite3.Connection, me: sqlite3.Row) -> None:
+def record_consent(db: sqlite3.Connection, annotator: sqlite3.Row) -> None:
     with transaction(db):
         db.execute(
             "UPDATE annotator SET consented = ? WHERE name = ? AND consented IS NULL",
-            (time.time(), me["name"]),
+            (time.time(), annotator["name"]),
         )
 
 
-def go_on(db: sqlite3.Connection, me: sqlite3.Row, key: str, rest_every: int) -> None:
-    """Leave the page that `key` names, where the annotator stands on it."""
-    stage = stage_of(db, me, rest_every)
+def leave_page(db: sqlite3.Connection, annotator: sqlite3.Row, key: str, rest_every: int) -> None:
+    """Leave the feedback, the start or the break with this key, if it is the current page."""
+    stage = current_stage(db, annotator, rest_every)
     if stage.key != key:
         return
+    name = annotator["name"]
     with transaction(db):
         if stage.page == "feedback":
             db.execute("UPDATE turn SET closed = 1 WHERE token = ?", (key,))
         elif stage.page == "ready":
-            db.execute("UPDATE annotator SET begun = ? WHERE name = ?", (time.time(), me["name"]))
+            db.execute("UPDATE annotator SET begun = ? WHERE name = ?", (time.time(), name))
         elif stage.page == "rest":
-            db.execute(
-                "UPDATE annotator SET rests = ? WHERE name = ?",
-                (stage.number // rest_every, me["name"]),
-            )
+            rests = stage.number // rest_every
+            db.execute("UPDATE annotator SET rests = ? WHERE name = ?", (rests, name))
 
 
-def note_loaded(db: sqlite3.Connection, name: str, token: str) -> bool:
-    """An open item is all on the annotator's screen: its time begins. Returns whether it is one."""
+def record_loaded(db: sqlite3.Connection, name: str, token: str) -> bool:
+    """Start the time of an open item, whose page is completely visible. False if none is open."""
     with transaction(db):
         changed = db.execute(
             "UPDATE turn SET loaded = ?, loads = loads + 1 "
@@ -120,31 +125,30 @@ def note_loaded(db: sqlite3.Connection, name: str, token: str) -> bool:
     return changed.rowcount == 1
 
 
-def answer(
+def record_answer(
     db: sqlite3.Connection, name: str, token: str, letter: str, client_seconds: float
 ) -> bool:
-    """Keep the answer to an open item that is all on the screen. Returns whether it was one; a
-    second answer is none."""
+    """Store the answer to an open, loaded item. False if there is none, as for a second answer."""
     with transaction(db):
-        found = db.execute(
+        turn = db.execute(
             "SELECT shown, practice FROM turn JOIN plan USING (annotator, item_id) "
             "JOIN item USING (item_id) "
             "WHERE token = ? AND annotator = ? AND answered IS NULL AND loaded IS NOT NULL",
             (token, name),
         ).fetchone()
-        if found is None:
+        if turn is None:
             return False
-        choice = int(found["shown"][LETTERS.index(letter)])
+        choice = int(turn["shown"][LETTERS.index(letter)])
         db.execute(
             "UPDATE turn SET letter = ?, choice = ?, client_seconds = ?, answered = ?, closed = ? "
             "WHERE token = ?",
-            (letter, choice, client_seconds, time.time(), not found["practice"], token),
+            (letter, choice, client_seconds, time.time(), not turn["practice"], token),
         )
     return True
 
 
-def question(db: sqlite3.Connection, token: str) -> Question:
-    """What the page of an item shows, of practice with its answer once it is given."""
+def load_question(db: sqlite3.Connection, token: str) -> Question:
+    """The content of an item's page; an answered practice item includes the correct letter."""
     turn = db.execute(
         "SELECT * FROM turn JOIN plan USING (annotator, item_id) JOIN item USING (item_id) "
         "WHERE token = ?",
@@ -155,20 +159,20 @@ def question(db: sqlite3.Connection, token: str) -> Question:
         "JOIN medium USING (slot) WHERE turn = ? AND item_id = ?",
         (token, turn["item_id"]),
     )
-    shown = {row["slot"]: Shown(row["token"], row["width"], row["height"]) for row in rows}
+    media = {row["slot"]: PageMedium(row["token"], row["width"], row["height"]) for row in rows}
     order = [int(slot) for slot in turn["shown"]]
-    told = turn["practice"] and turn["answered"] is not None
+    has_feedback = turn["practice"] and turn["answered"] is not None
     return Question(
         turn["question"],
-        shown[PREFIX],
-        {letter: shown[slot] for letter, slot in zip(LETTERS, order, strict=True)},
-        LETTERS[order.index(turn["answer"])] if told else None,
-        turn["letter"] if told else None,
+        media[PREFIX],
+        {letter: media[slot] for letter, slot in zip(LETTERS, order, strict=True)},
+        LETTERS[order.index(turn["answer"])] if has_feedback else None,
+        turn["letter"] if has_feedback else None,
     )
 
 
-def medium(db: sqlite3.Connection, name: str, token: str) -> sqlite3.Row | None:
-    """The kind and content of something on the page that an annotator has before them now."""
+def load_medium(db: sqlite3.Connection, name: str, token: str) -> sqlite3.Row | None:
+    """The kind and content of a medium on the annotator's current page."""
     return db.execute(
         "SELECT kind, content FROM name JOIN turn ON turn.token = name.turn "
         "JOIN medium USING (item_id, slot) "
@@ -177,25 +181,24 @@ def medium(db: sqlite3.Connection, name: str, token: str) -> sqlite3.Row | None:
     ).fetchone()
 
 
-def _open(db: sqlite3.Connection, name: str, practice: bool) -> str:
-    """The token of the item that is open, or of the next one, opened now."""
-    is_open = (
+def _open_item(db: sqlite3.Connection, name: str, practice: bool) -> str:
+    """The token of the open item; if there is none, the next one is opened."""
+    open_turn = db.execute(
         "SELECT token FROM turn JOIN item USING (item_id) "
-        "WHERE annotator = ? AND practice = ? AND answered IS NULL"
-    )
-    if found := db.execute(is_open, (name, practice)).fetchone():
-        return found["token"]
-    waiting = _waiting(db, name, practice)
-    families = [
-        tuple(row)
-        for row in db.execute(
-            "SELECT family, count(*), count(turn.token) FROM item LEFT JOIN turn "
-            "ON turn.item_id = item.item_id AND annotator = ? WHERE practice = ? GROUP BY family",
-            (name, practice),
-        )
-    ]
+        "WHERE annotator = ? AND practice = ? AND answered IS NULL",
+        (name, practice),
+    ).fetchone()
+    if open_turn:
+        return open_turn["token"]
+    families = db.execute(
+        "SELECT family, count(*) AS total, count(turn.token) AS opened FROM item LEFT JOIN turn "
+        "ON turn.item_id = item.item_id AND annotator = ? WHERE practice = ? GROUP BY family",
+        (name, practice),
+    ).fetchall()
     item_id = next_item(
-        waiting, {f: asked for f, _, asked in families}, {f: total for f, total, _ in families}
+        _waiting_items(db, name, practice),
+        {row["family"]: row["opened"] for row in families},
+        {row["family"]: row["total"] for row in families},
     )
     token = new_token()
     db.execute(
@@ -208,18 +211,18 @@ def _open(db: sqlite3.Connection, name: str, practice: bool) -> str:
     return token
 
 
-def _waiting(db: sqlite3.Connection, name: str, practice: bool) -> list[Waiting]:
+def _waiting_items(db: sqlite3.Connection, name: str, practice: bool) -> list[WaitingItem]:
     rows = db.execute(
         "SELECT item_id, family, scene_id, prefix_stop, rank, "
         "(SELECT count(*) FROM turn WHERE turn.item_id = item.item_id "
         "AND (answered IS NOT NULL OR opened > ?)) AS votes "
         "FROM plan JOIN item USING (item_id) WHERE annotator = ? AND practice = ? "
         "AND item_id NOT IN (SELECT item_id FROM turn WHERE annotator = ?)",
-        (time.time() - ABANDONED, name, practice, name),
+        (time.time() - ABANDONED_SECONDS, name, practice, name),
     )
-    return [Waiting(**dict(row)) for row in rows]
+    return [WaitingItem(**dict(row)) for row in rows]
 
 
-def _count(db: sqlite3.Connection, practice: bool) -> int:
-    counted = db.execute("SELECT count(*) FROM item WHERE practice = ?", (practice,))
-    return counted.fetchone()[0]
+def _count_items(db: sqlite3.Connection, practice: bool) -> int:
+    rows = db.execute("SELECT count(*) FROM item WHERE practice = ?", (practice,))
+    return rows.fetchone()[0]

@@ -1,6 +1,6 @@
 "use strict";
 
-// A question is shown at once, when all of it is there and the server knows: both clocks begin then.
+// A question appears when all of its media are loaded and the server knows it; then both clocks start.
 
 const page = document.querySelector("main.question");
 const form = document.querySelector("main form");
@@ -9,14 +9,14 @@ const video = document.querySelector("video");
 
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
 
-// Ask until there is an answer: the server may be away for a while.
-async function persist(address, options) {
+// Repeat a request until the server answers: it may be down for a while.
+async function fetchUntilAnswered(address, options) {
   for (;;) {
     try {
       const response = await fetch(address, options);
       if (response.status < 500) return response;
     } catch (error) {
-      // Unreachable, like a server that is in trouble.
+      // Unreachable: repeat as after a server error.
     }
     status.textContent = "The study cannot be reached. Trying again…";
     await pause(1500);
@@ -24,7 +24,7 @@ async function persist(address, options) {
 }
 
 function post(address, fields) {
-  return persist(address, {
+  return fetchUntilAnswered(address, {
     method: "POST",
     body: new URLSearchParams(fields),
     redirect: "manual",
@@ -32,52 +32,52 @@ function post(address, fields) {
 }
 
 async function load(element) {
-  const response = await persist(element.dataset.src);
-  if (!response.ok) throw new Error("gone");
-  const there = element === video
+  const response = await fetchUntilAnswered(element.dataset.src);
+  if (!response.ok) throw new Error("not found");
+  const ready = element === video
     ? new Promise((done, failed) => {
         video.addEventListener("loadedmetadata", done, { once: true });
         video.addEventListener("error", failed, { once: true });
       })
     : null;
   element.src = URL.createObjectURL(await response.blob());
-  await (there ?? element.decode());
+  await (ready ?? element.decode());
 }
 
 function play() {
   video.currentTime = 0;
-  // Refused by a browser that saves power: the button is there.
+  // Browsers that save power refuse; the button remains.
   video.play().catch(() => {});
 }
 
 async function show() {
-  const asked = "asked" in page.dataset;
+  const isOpen = "open" in page.dataset;
   try {
     await Promise.all([...page.querySelectorAll("[data-src]")].map(load));
-    if (asked) {
+    if (isOpen) {
       const fields = { key: page.dataset.key, form_key: page.dataset.formKey };
       const response = await post("/loaded", fields);
-      if (!response.ok) throw new Error("over");
+      if (!response.ok) throw new Error("closed");
     }
   } catch (error) {
-    status.textContent = "This page is not the one to answer any more. Load it again, please.";
+    status.textContent = "This page is outdated. Please reload it.";
     return;
   }
-  const since = performance.now();
+  const start = performance.now();
   status.textContent = "";
   page.classList.remove("loading");
   play();
-  if (asked) answer(since);
+  if (isOpen) answer(start);
 }
 
-function answer(since) {
+function answer(start) {
   form.querySelector("fieldset").disabled = false;
   form.addEventListener("change", () => {
     form.querySelector("button").disabled = false;
   });
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
-    form.elements.seconds.value = ((performance.now() - since) / 1000).toFixed(3);
+    form.elements.seconds.value = ((performance.now() - start) / 1000).toFixed(3);
     const fields = new FormData(form);
     form.querySelector("fieldset").disabled = true;
     form.querySelector("button").disabled = true;
@@ -86,12 +86,12 @@ function answer(since) {
   });
 }
 
-function pressed(event) {
+function onKey(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
   const key = event.key.toUpperCase();
   if (key === "R" && video) {
     play();
-  } else if (/^[A-D1-4]$/.test(key) && page && "asked" in page.dataset) {
+  } else if (/^[A-D1-4]$/.test(key) && page && "open" in page.dataset) {
     const choice = form.querySelectorAll("input[type=radio]")["ABCD1234".indexOf(key) % 4];
     choice.focus();
     choice.click();
@@ -101,6 +101,6 @@ function pressed(event) {
   }
 }
 
-document.addEventListener("keydown", pressed);
+document.addEventListener("keydown", onKey);
 document.getElementById("replay")?.addEventListener("click", play);
 if (page) show();

@@ -22,8 +22,8 @@ def prepare(micro, micro_store, root: Path, items: int) -> Path:
     )
     folder = root / "study" / str(items)
     folder.mkdir(parents=True)
-    db = setup.begin(cfg, folder / storage.DATABASE)
-    setup.add_media(cfg, db, folder)
+    db = setup.create_study(cfg, folder / storage.DATABASE)
+    setup.add_missing_media(cfg, db, folder)
     db.close()
     return folder
 

@@ -1,4 +1,4 @@
-"""A real `python -m evaluation.study` to be started and killed, and annotators who speak HTTP."""
+"""A real `python -m evaluation.study` to start and kill, and annotators who use HTTP."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def free_port() -> int:
 
 
 class Server:
-    """The command on a study in checkpoints/study/NAME; its port stays when it is started again."""
+    """The command on a study in checkpoints/study/NAME; it keeps its port when it restarts."""
 
     def __init__(self, folder: Path, *settings: str) -> None:
         self.folder, self.settings = folder, settings
@@ -37,12 +37,12 @@ class Server:
         return [sys.executable, "-m", "evaluation.study", *where, *self.settings]
 
     def start(self) -> Server:
-        said = open(self.folder / "said.txt", "a")  # noqa: SIM115
+        output = open(self.folder / "output.txt", "a")  # noqa: SIM115
         self.process = subprocess.Popen(
-            self.command(), cwd=ROOT, stdout=said, stderr=subprocess.STDOUT, text=True
+            self.command(), cwd=ROOT, stdout=output, stderr=subprocess.STDOUT, text=True
         )
-        said.close()
-        Visitor(self.port).ask("GET", "/static/icon.svg")
+        output.close()
+        Visitor(self.port).request("GET", "/static/icon.svg")
         return self
 
     def kill(self) -> None:
@@ -70,7 +70,7 @@ class Reply:
         return unescape(re.search(rf'name="{name}" value="([^"]*)"', self.text)[1])
 
     def media(self) -> list[str]:
-        """Paths of the prefix and of the candidates, in the order they are shown."""
+        """Paths of the prefix and of the candidates, in the order of the page."""
         return re.findall(r'data-src="([^"]+)"', self.text)
 
     @property
@@ -80,14 +80,14 @@ class Reply:
 
 
 class Visitor:
-    """Somebody with a cookie jar, who asks again until a server is there."""
+    """A client with a cookie, which repeats requests until the server is up."""
 
     def __init__(self, port: int, patience: float = 60) -> None:
         self.port, self.patience = port, patience
         self.cookie: str | None = None
         self._open: HTTPConnection | None = None
 
-    def ask(self, method: str, path: str, fields: dict | None = None, **headers: str) -> Reply:
+    def request(self, method: str, path: str, fields: dict | None = None, **headers: str) -> Reply:
         if self.cookie:
             headers.setdefault("Cookie", self.cookie)
         body = None
@@ -100,34 +100,34 @@ class Visitor:
                 if self._open is None:
                     self._open = HTTPConnection("127.0.0.1", self.port, timeout=60)
                 self._open.request(method, path, body, headers)
-                reply = self._open.getresponse()
-                found = Reply(reply.status, reply.msg, reply.read())
+                response = self._open.getresponse()
+                answered = Reply(response.status, response.msg, response.read())
                 break
             except (OSError, HTTPException):
                 self._open = None
                 if time.monotonic() > until:
                     raise
                 time.sleep(0.05)
-        if given := found.headers.get("Set-Cookie"):
-            self.cookie = given.partition(";")[0]
-        return found
+        if cookie := answered.headers.get("Set-Cookie"):
+            self.cookie = cookie.partition(";")[0]
+        return answered
 
     def home(self) -> Reply:
-        return self.ask("GET", "/")
+        return self.request("GET", "/")
 
     def sign_in(self, link: str) -> Visitor:
-        assert self.ask("POST", "/link", {"link": link}).status == 303
+        assert self.request("POST", "/link", {"link": link}).status == 303
         return self
 
     def load(self, page: Reply) -> Reply:
-        return self.ask("POST", "/loaded", both(page))
+        return self.request("POST", "/loaded", both(page))
 
     def answer(self, page: Reply, letter: str, seconds: float = 1.5) -> Reply:
-        return self.ask("POST", "/answer", both(page) | {"choice": letter, "seconds": seconds})
+        return self.request("POST", "/answer", both(page) | {"choice": letter, "seconds": seconds})
 
-    def pass_by(self, page: Reply) -> Reply:
-        """Leave a page that asks nothing."""
-        return self.ask("POST", page.action, both(page) if page.action == "/go-on" else
+    def leave(self, page: Reply) -> Reply:
+        """Leave a page without a question."""
+        return self.request("POST", page.action, both(page) if page.action == "/continue" else
                         {"form_key": page.hidden("form_key")})  # fmt: skip
 
     def to_question(self) -> Reply:
@@ -135,7 +135,7 @@ class Visitor:
         while True:
             page = self.home()
             if page.action != "/answer":
-                self.pass_by(page)
+                self.leave(page)
             elif "Practice" in page.text:
                 self.load(page)
                 self.answer(page, "A")
@@ -149,26 +149,26 @@ def both(page: Reply) -> dict[str, str]:
 
 @dataclass
 class Annotator:
-    """Goes through a whole study, and keeps what was answered (letter by the item's key)."""
+    """Takes part in a whole study and remembers the answers, letters by the item's key."""
 
     visitor: Visitor
     choose: Callable[[int], str]
-    given: dict[str, str] = field(default_factory=dict)
+    answers: dict[str, str] = field(default_factory=dict)
     rests: int = 0
 
     def take_part(self, most: int | None = None) -> None:
-        while most is None or len(self.given) < most:
+        while most is None or len(self.answers) < most:
             page = self.visitor.home()
             if page.action is None:
                 return
             if page.action != "/answer":
                 self.rests += "Time for a break" in page.text
-                self.visitor.pass_by(page)
+                self.visitor.leave(page)
                 continue
             for path in page.media():
-                assert self.visitor.ask("GET", path).status in (200, 404)
+                assert self.visitor.request("GET", path).status in (200, 404)
             self.visitor.load(page)
-            letter = self.choose(len(self.given))
+            letter = self.choose(len(self.answers))
             assert self.visitor.answer(page, letter).status == 303
             if "Practice" not in page.text:
-                self.given[page.hidden("key")] = letter
+                self.answers[page.hidden("key")] = letter

@@ -1,4 +1,4 @@
-"""Accuracy, majority and agreement, held against laws and an independent library."""
+"""Accuracy, majority and agreement, compared with closed forms and another library."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import numpy as np
 import pytest
 
 from conf.entry import Run
-from conf.errors import UserError
 from conf.schema import ReportCommand
 from data.records import FAMILIES
 from evaluation import report
 from evaluation.reporting.tables import human_table
 from evaluation.study.agreement import fleiss_kappa, krippendorff_alpha, majority, summary
-from evaluation.study.votes import Vote
+from evaluation.study.storage import Vote
+from tests.user_errors import raises_user_error
 
 
 def vote(annotator: str, item: int, choice: int, family: str = "event", **changes) -> Vote:
-    told = {
+    fields = {
         "suite": "dynapix", "subtype": "x", "answer": 0, "letter": "A", "seconds": 10.0 + item,
         "client_seconds": 9.0 + item, "loads": 1, "answered": "2026-01-31T00:00:00+00:00",
     }  # fmt: skip
-    return Vote(annotator, f"i{item}", family=family, choice=choice, **{**told, **changes})
+    return Vote(annotator, f"i{item}", family=family, choice=choice, **{**fields, **changes})
 
 
-def drawn(rng, items: int, depths: list[int]) -> list[list[int]]:
+def sample_votes(rng, items: int, depths: list[int]) -> list[list[int]]:
     """Votes that agree more than chance."""
     truth = rng.integers(4, size=items)
     return [
@@ -38,9 +38,9 @@ def drawn(rng, items: int, depths: list[int]) -> list[list[int]]:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_alpha_is_that_of_an_independent_library(seed) -> None:
+def test_alpha_equals_that_of_the_krippendorff_package(seed) -> None:
     rng = np.random.default_rng(seed)
-    items = drawn(rng, 40, [1, 2, 3, 5])
+    items = sample_votes(rng, 40, [1, 2, 3, 5])
     table = np.array([np.bincount(c, minlength=4) for c in items])
     expected = krippendorff.alpha(value_counts=table, level_of_measurement="nominal")
     assert krippendorff_alpha(items) == pytest.approx(expected, abs=1e-12)
@@ -48,7 +48,7 @@ def test_alpha_is_that_of_an_independent_library(seed) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_kappa_is_agreement_above_chance(seed) -> None:
-    items = drawn(np.random.default_rng(seed), 30, [3])
+    items = sample_votes(np.random.default_rng(seed), 30, [3])
     pairs = [a == b for c in items for a, b in itertools.combinations(c, 2)]
     votes = Counter(itertools.chain(*items))
     chance = sum((n / sum(votes.values())) ** 2 for n in votes.values())
@@ -56,9 +56,9 @@ def test_kappa_is_agreement_above_chance(seed) -> None:
     assert fleiss_kappa(items) == pytest.approx((observed - chance) / (1 - chance), abs=1e-12)
 
 
-def test_agreement_does_not_hang_on_names_of_candidates_or_on_order() -> None:
+def test_agreement_is_independent_of_candidate_names_and_order() -> None:
     rng = np.random.default_rng(0)
-    items = drawn(rng, 25, [3])
+    items = sample_votes(rng, 25, [3])
     names = rng.permutation(4)
     renamed = [[int(names[c]) for c in reversed(choices)] for choices in reversed(items)]
     assert fleiss_kappa(renamed) == pytest.approx(fleiss_kappa(items))
@@ -68,13 +68,13 @@ def test_agreement_does_not_hang_on_names_of_candidates_or_on_order() -> None:
 
 
 @pytest.mark.parametrize("items", [[], [[0], [1]], [[2, 2, 2], [2, 2, 2]]])
-def test_agreement_is_undefined_where_nothing_could_differ(items) -> None:
+def test_agreement_is_undefined_without_variation(items) -> None:
     assert fleiss_kappa(items) is None
     assert krippendorff_alpha(items) is None
 
 
 def test_kappa_refuses_uneven_depth() -> None:
-    with pytest.raises(ValueError, match="as many votes"):
+    with pytest.raises(ValueError, match="number of votes"):
         fleiss_kappa([[0, 1], [0, 1, 1]])
 
 
@@ -113,11 +113,11 @@ def test_a_study_of_the_papers_shape() -> None:
         assert of["micro"]["value"] == pytest.approx(sum(own) / len(own))
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     table = str(human_table(found))
-    assert "10 by 1, 30 by 2, 19 by 3" in table
+    assert "10 with 1, 30 with 2, 19 with 3" in " ".join(table.split())
     assert max(map(len, table.splitlines())) <= 100
 
 
-def test_an_annotator_who_gave_nothing_has_no_row_and_costs_no_complete_case() -> None:
+def test_annotators_without_votes_are_left_out() -> None:
     votes = [vote(name, k, (k + (name == "A3")) % 2) for k in range(4) for name in ("A1", "A3")]
     found = summary(votes, 4, ["A1", "A2", "A3"])
     assert found == summary(votes, 4, ["A1", "A3"])
@@ -125,21 +125,21 @@ def test_an_annotator_who_gave_nothing_has_no_row_and_costs_no_complete_case() -
     assert found["fleiss_kappa"] == {"value": pytest.approx(-1.0), "items": 4}
 
 
-def test_of_one_annotator_there_is_no_agreement() -> None:
+def test_one_annotator_has_no_agreement() -> None:
     found = summary([vote("A1", k, 0) for k in range(3)], 3, ["A1", "A2"])
     assert found["fleiss_kappa"] == {"value": None, "items": 0}
     assert found["krippendorff_alpha"] == {"value": None, "items": 0}
     assert "undefined" in str(human_table(found))
 
 
-def test_times_are_medians_of_pages_that_were_loaded_once() -> None:
+def test_times_are_medians_over_pages_loaded_once() -> None:
     votes = [vote("A1", k, 0, seconds=s, client_seconds=s / 2) for k, s in enumerate([4, 9, 5])]
     votes.append(vote("A1", 3, 0, seconds=1e5, loads=2))
     found = summary(votes, 4, ["A1"])["seconds"]
     assert found == {"event": {"server": 5.0, "client": 2.5, "votes": 3}}
 
 
-def test_the_report_shows_an_exported_study_alone_too(tmp_path) -> None:
+def test_the_report_covers_an_exported_study_without_models(tmp_path) -> None:
     exported = tmp_path / "export_study" / "pilot"
     exported.mkdir(parents=True)
     (exported / "metrics.json").write_text("{}")
@@ -156,11 +156,11 @@ def test_the_report_shows_an_exported_study_alone_too(tmp_path) -> None:
     assert (run.folder / "tables" / "human-pilot.tex").exists()
 
     (exported / "report.json").write_text('{"benchmark": "tiny"}')
-    with pytest.raises(UserError, match="damaged or of another version"):
+    with raises_user_error("damaged-file", contains="report.json"):
         report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path)), run)
 
 
-def test_a_vote_comes_back_from_its_row() -> None:
-    given = vote("A1", 1, 2)
-    assert Vote.from_row(json.loads(json.dumps(given.to_row()))) == given
-    assert given.to_row()["right"] is False
+def test_votes_survive_json() -> None:
+    one = vote("A1", 1, 2)
+    assert Vote.from_row(json.loads(json.dumps(one.to_row()))) == one
+    assert one.to_row()["right"] is False

@@ -1,4 +1,4 @@
-"""The pages in a real Chromium: on a phone, on a desk, and by keyboard alone."""
+"""The pages in Chromium: on a phone, on a desktop, and by keyboard."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.ui import WebDriverWait
 
 from evaluation.study import storage
-from evaluation.study.votes import Vote, votes_of
+from evaluation.study.storage import Vote, read_votes
 from tests.evaluation.chromium import OVERFLOW, chromium_in
 
 pytestmark = pytest.mark.slow
 
 PATIENCE = 60
-SMALLEST = 44
-"""Pixels of the least side of what a finger is to hit."""
+MIN_TARGET = 44
+"""Smallest side of a touch target, in pixels."""
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def find(browser: webdriver.Chrome, what: str) -> WebElement:
 
 
 def await_page(browser: webdriver.Chrome) -> str:
-    """Wait until a page is all there, and tell which: its button's word, or its heading."""
+    """Wait until a page is loaded, and return its button's text, or its heading."""
     WebDriverWait(browser, PATIENCE, 0.05).until(
         lambda b: (
             b.execute_script("return document.readyState") == "complete"
@@ -55,87 +55,89 @@ def await_page(browser: webdriver.Chrome) -> str:
 
 
 def await_next(browser: webdriver.Chrome, act: Callable[[], None]) -> str:
-    """Do what leads to another page, and tell which."""
-    browser.execute_script("window.here = true")
+    """Act, wait for the next page, and return its button's text, or its heading."""
+    browser.execute_script("window.unchanged = true")
     act()
     WebDriverWait(browser, PATIENCE, 0.05).until(
-        lambda b: not b.execute_script("return window.here === true")
+        lambda b: not b.execute_script("return window.unchanged === true")
     )
     return await_page(browser)
 
 
 def votes(served, name: str) -> list[Vote]:
     db = storage.open_study(served.folder / storage.DATABASE)
-    found = [v for v in votes_of(db) if v.annotator == name]
+    own = [v for v in read_votes(db) if v.annotator == name]
     db.close()
-    return found
+    return own
 
 
 def check_fits(browser: webdriver.Chrome) -> None:
     assert not browser.execute_script(OVERFLOW), "the page is wider than the screen"
-    for touched in browser.find_elements(By.CSS_SELECTOR, "button, label, .button"):
-        assert min(touched.size.values()) >= SMALLEST, touched.text
+    for target in browser.find_elements(By.CSS_SELECTOR, "button, label, .button"):
+        assert min(target.size.values()) >= MIN_TARGET, target.text
 
 
 @pytest.mark.parametrize(
     ("name", "width", "height", "phone"),
     [("A1", 390, 844, True), ("A2", 1280, 800, False)],
-    ids=["phone", "desk"],
+    ids=["phone", "desktop"],
 )
-def test_by_hand_all_of_it_fits_and_counts(chromium, served, name, width, height, phone) -> None:
+def test_pages_fit_the_screen_and_answers_are_stored(
+    chromium, served, name, width, height, phone
+) -> None:
     screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": phone}
     chromium.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
     sign_in(chromium, served, name)
-    seen, given = [await_page(chromium)], []
+    seen, answers = [await_page(chromium)], []
     while seen[-1] != "Thank you":
         assert chromium.execute_script("return innerWidth") == width
         check_fits(chromium)
         if seen[-1] == "Confirm":
-            label = chromium.find_elements(By.TAG_NAME, "label")[len(given) % 4]
+            label = chromium.find_elements(By.TAG_NAME, "label")[len(answers) % 4]
             assert not find(chromium, "button.primary").is_enabled()
             label.click()
-            given.append(label.text)
+            answers.append(label.text)
         seen.append(await_next(chromium, find(chromium, "button.primary").click))
     practice = ["Confirm", "Continue"] * 3
     study = ["Continue", "Confirm", "Confirm", "Continue", "Confirm", "Confirm", "Thank you"]
     assert seen == ["Sign in", "I agree to take part", *practice, *study]
     found = votes(served, name)
-    assert [v.letter for v in found] == given[3:] == ["D", "A", "B", "C"]
+    assert [v.letter for v in found] == answers[3:] == ["D", "A", "B", "C"]
     for vote in found:
         assert 0 < vote.client_seconds <= vote.seconds + 0.1
         assert vote.loads == 1
 
 
-def test_by_keyboard_alone(chromium, served) -> None:
-    """Nothing is clicked. A page that is left and loaded again asks the same."""
+def test_the_study_works_by_keyboard(chromium, served) -> None:
+    """Without a click. A reloaded page has the same question."""
     chromium.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
     def press(*keys: str) -> Callable[[], None]:
         return lambda: ActionChains(chromium).send_keys(*keys).perform()
 
     sign_in(chromium, served, "A3")
-    page, given = await_page(chromium), []
-    ways = [("b",), ("3",), ("a", "d"), ("c", Keys.ARROW_RIGHT), ("2",), ("D",), ("1",)]
+    page, answers = await_page(chromium), []
+    keys_by_page = [("b",), ("3",), ("a", "d"), ("c", Keys.ARROW_RIGHT), ("2",), ("D",), ("1",)]
     while page != "Thank you":
         if page == "Confirm":
             question = find(chromium, "main").get_attribute("data-key")
-            if len(given) == 4:
+            if len(answers) == 4:
                 chromium.get(chromium.current_url)
                 assert await_page(chromium) == "Confirm"
                 assert find(chromium, "main").get_attribute("data-key") == question
-            for key in ways[len(given)]:
+            for key in keys_by_page[len(answers)]:
                 press(key)()
             chosen = find(chromium, "input:checked")
-            given.append(chosen.get_attribute("value"))
+            answers.append(chosen.get_attribute("value"))
             assert chromium.switch_to.active_element == chosen
         page = await_next(chromium, press(Keys.ENTER))
-    assert given == ["B", "C", "D", "D", "B", "D", "A"]
+    assert answers == ["B", "C", "D", "D", "B", "D", "A"]
     found = votes(served, "A3")
-    assert [v.letter for v in found] == given[3:]
+    assert [v.letter for v in found] == answers[3:]
     assert [v.loads for v in found] == [1, 2, 1, 1]
 
 
-def test_the_video_plays_once_and_again_by_key_and_button(chromium, serve, prepared_small) -> None:
+def test_the_video_replays_by_key_and_button(chromium, serve, prepared_small) -> None:
     served = serve(prepared_small)
     sign_in(chromium, served, "A1")
     await_next(chromium, find(chromium, "button.primary").click)
@@ -156,7 +158,7 @@ def test_the_video_plays_once_and_again_by_key_and_button(chromium, serve, prepa
     assert not errors
 
 
-def test_a_server_that_goes_and_comes_back_costs_nothing(chromium, serve, prepared_small) -> None:
+def test_an_answer_survives_a_restart_of_the_server(chromium, serve, prepared_small) -> None:
     served = serve(prepared_small)
     sign_in(chromium, served, "A1")
     await_next(chromium, find(chromium, "button.primary").click)
@@ -164,14 +166,14 @@ def test_a_server_that_goes_and_comes_back_costs_nothing(chromium, serve, prepar
     key = find(chromium, "main").get_attribute("data-key")
     chromium.find_elements(By.TAG_NAME, "label")[1].click()
     served.kill()
-    chromium.execute_script("window.here = true")
+    chromium.execute_script("window.unchanged = true")
     find(chromium, "button.primary").click()
     WebDriverWait(chromium, PATIENCE, 0.05).until(
         lambda b: "cannot be reached" in find(b, "#status").text
     )
     served.start()
     until = time.monotonic() + PATIENCE
-    while chromium.execute_script("return window.here === true"):
+    while chromium.execute_script("return window.unchanged === true"):
         assert time.monotonic() < until
         time.sleep(0.05)
     assert await_page(chromium) == "Continue"

@@ -1,4 +1,4 @@
-"""What is shown holds the frames' pixels and nothing else."""
+"""Media hold the pixels of frames and no metadata."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from data.render.frame_cache import FrameReader
-from evaluation.study.media import IMAGE, PREFIX, VIDEO, encode_video, media_of
+from evaluation.study.media import IMAGE, PREFIX, VIDEO, encode_media, encode_video
 
 END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 
@@ -20,9 +20,9 @@ def item(micro_store):
     return next(i for i in micro_store.selection("test") if i.family == "time")
 
 
-def test_candidates_are_their_pixels_in_files_of_one_size(micro_store, item) -> None:
+def test_candidates_are_lossless_images_of_equal_file_size(micro_store, item) -> None:
     frames = FrameReader(micro_store)
-    prefix, *candidates = media_of(item, frames)
+    prefix, *candidates = encode_media(item, frames)
     assert (prefix.slot, prefix.kind) == (PREFIX, VIDEO)
     assert [m.slot for m in candidates] == [0, 1, 2, 3]
     assert {m.kind for m in candidates} == {IMAGE}
@@ -39,24 +39,24 @@ def test_candidates_are_their_pixels_in_files_of_one_size(micro_store, item) -> 
         assert all(chunk not in head for chunk in (b"tEXt", b"tIME", b"eXIf", b"iTXt", b"zTXt"))
 
 
-def test_a_prefix_is_every_frame_at_the_scenes_rate_and_nothing_else(micro_store, item) -> None:
+def test_a_prefix_is_a_video_of_every_frame_without_metadata(micro_store, item) -> None:
     frames = FrameReader(micro_store)
-    prefix = media_of(item, frames)[0]
+    prefix = encode_media(item, frames)[0]
     shown = list(range(item.prefix_start, item.prefix_stop + 1))
     with av.open(io.BytesIO(prefix.content)) as video:
         stream = video.streams.video[0]
         assert float(stream.average_rate) == frames.scene(item.scene_id).fps
         decoded = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
-        told = {**video.metadata, **stream.metadata}
+        metadata = {**video.metadata, **stream.metadata}
     assert len(decoded) == len(shown)
     expected = frames.stack(item.scene_id, shown).astype(int)
     assert np.abs(np.stack(decoded) - expected).mean() < 3
-    assert set(told) <= {"major_brand", "minor_version", "compatible_brands", "language",
+    assert set(metadata) <= {"major_brand", "minor_version", "compatible_brands", "language",
                          "handler_name"}  # fmt: skip
     assert not any(word in prefix.content for word in (b"x264", b"Lav", item.scene_id.encode()))
 
 
-def test_a_prefix_of_odd_sides_is_shown_whole() -> None:
+def test_frames_of_odd_size_are_padded() -> None:
     pixels = np.random.default_rng(0).integers(256, size=(4, 51, 75, 3)).astype(np.uint8)
     with av.open(io.BytesIO(encode_video(pixels, 30.0))) as video:
         assert (video.streams.video[0].width, video.streams.video[0].height) == (76, 52)

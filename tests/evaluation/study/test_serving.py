@@ -1,4 +1,4 @@
-"""A whole study over HTTP, and everything that somebody might try with its server."""
+"""A whole study over HTTP, and attacks on its server."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from PIL import Image
 from starlette.responses import PlainTextResponse
 
 from conf.entry import Run
-from conf.schema import ExportStudyCommand
+from conf.schema import ExportStudyCommand, StudyCommand
 from data.records import LETTERS
 from data.render.frame_cache import FrameReader
 from evaluation.study import auth, export, storage
-from evaluation.study.guards import HEADERS, Guard
-from evaluation.study.routes import make_app
-from evaluation.study.votes import Vote, votes_of
+from evaluation.study.auth import HEADERS, SiteGuard
+from evaluation.study.routes import build_app
+from evaluation.study.storage import Vote, read_votes
 from tests.evaluation.study.conftest import ITEMS, SMALL
 from tests.evaluation.study.running import Annotator, Visitor, both
 
@@ -39,10 +39,10 @@ def small(serve, prepared_small):
     return serve(prepared_small)
 
 
-def rows(server, asked: str, *values) -> list[sqlite3.Row]:
+def rows(server, query: str, *values) -> list[sqlite3.Row]:
     db = storage.open_study(server.folder / storage.DATABASE)
     try:
-        return db.execute(asked, values).fetchall()
+        return db.execute(query, values).fetchall()
     finally:
         db.close()
 
@@ -53,7 +53,7 @@ def visitor(small) -> Visitor:
     return Visitor(small.port).sign_in(small.links()["A1"])
 
 
-def test_a_study_of_59_items_by_three_annotators_killed_midway(serve, prepared, tmp_path) -> None:
+def test_a_study_survives_kills_with_three_concurrent_annotators(serve, prepared, tmp_path) -> None:
     server = serve(prepared)
     annotators = [
         Annotator(
@@ -66,24 +66,24 @@ def test_a_study_of_59_items_by_three_annotators_killed_midway(serve, prepared, 
     for thread in threads:
         thread.start()
     for killed_after in (40, 100):
-        while sum(len(a.given) for a in annotators) < killed_after:
+        while sum(len(a.answers) for a in annotators) < killed_after:
             assert all(thread.is_alive() for thread in threads)
             time.sleep(0.02)
         server.kill()
         server.start()
     for thread in threads:
         thread.join(timeout=300)
-    assert [len(a.given) for a in annotators] == [ITEMS] * 3
+    assert [len(a.answers) for a in annotators] == [ITEMS] * 3
     assert [a.rests for a in annotators] == [2] * 3
     kept = rows(
         server, "SELECT token, letter FROM turn JOIN item USING (item_id) WHERE NOT practice"
     )
-    assert dict(map(tuple, kept)) == {k: v for a in annotators for k, v in a.given.items()}
+    assert dict(map(tuple, kept)) == {k: v for a in annotators for k, v in a.answers.items()}
 
     run = Run("x", tmp_path)
-    asked = ExportStudyCommand(run=server.folder.name, checkpoints=str(server.folder.parents[1]))
-    export.main.__wrapped__(asked, run)
-    text = (tmp_path / export.VOTES).read_text()
+    cfg = ExportStudyCommand(run=server.folder.name, checkpoints=str(server.folder.parents[1]))
+    export.main.__wrapped__(cfg, run)
+    text = (tmp_path / export.VOTES_FILE).read_text()
     votes = [Vote.from_row(json.loads(line)) for line in text.splitlines()]
     assert Counter(v.annotator for v in votes) == {"A1": ITEMS, "A2": ITEMS, "A3": ITEMS}
     assert len({(v.annotator, v.item_id) for v in votes}) == 3 * ITEMS
@@ -92,42 +92,41 @@ def test_a_study_of_59_items_by_three_annotators_killed_midway(serve, prepared, 
     found = json.loads((tmp_path / "report.json").read_text())
     assert found["depth"] == {"3": ITEMS}
     assert found["fleiss_kappa"]["items"] == ITEMS
-    # Three annotators have an item's right answer at three letters.
+    # Three annotators have an item's correct candidate at three letters.
     places = Counter((v.item_id, _place_of_answer(server, v)) for v in votes)
     assert set(places.values()) == {1}
 
 
 def _place_of_answer(server, vote: Vote) -> int:
-    asked = "SELECT shown FROM plan WHERE annotator = ? AND item_id = ?"
-    [row] = rows(server, asked, vote.annotator, vote.item_id)
+    query = "SELECT shown FROM plan WHERE annotator = ? AND item_id = ?"
+    [row] = rows(server, query, vote.annotator, vote.item_id)
     assert int(row["shown"][LETTERS.index(vote.letter)]) == vote.choice
     return row["shown"].index(str(vote.answer))
 
 
-def test_a_letter_stands_for_the_candidate_that_was_shown_there(small, micro_store) -> None:
+def test_a_letter_chooses_the_candidate_that_stood_there(small, micro_store) -> None:
     visitor = Visitor(small.port).sign_in(small.links()["A2"])
     page = visitor.to_question()
-    shown = [visitor.ask("GET", path).body for path in page.media()[1:]]
+    images = [visitor.request("GET", path).body for path in page.media()[1:]]
     visitor.load(page)
     visitor.answer(page, "C", seconds=3.25)
     [turn] = rows(small, "SELECT * FROM turn WHERE token = ?", page.hidden("key"))
     item = next(i for i in micro_store.selection("test") if i.item_id == turn["item_id"])
     chosen = item.candidates[turn["choice"]]
     pixels = FrameReader(micro_store).array(chosen.scene_id, chosen.frame)
-    assert np.array_equal(np.asarray(Image.open(io.BytesIO(shown[2]))), pixels)
+    assert np.array_equal(np.asarray(Image.open(io.BytesIO(images[2]))), pixels)
     assert turn["client_seconds"] == 3.25
     assert turn["opened"] <= turn["loaded"] <= turn["answered"]
 
 
-def test_nothing_that_is_sent_tells_the_right_answer(small, micro_store) -> None:
-    """Pages of two annotators differ in the question, the order of what they show, and in words
-    drawn at random: nothing else is there that could depend on the answer."""
+def test_no_response_reveals_the_correct_answer(small, micro_store) -> None:
+    """Pages differ only in the question, in the order of the candidates and in random tokens."""
     items = {i.item_id: i for i in micro_store.selection()}
     visitor = Visitor(small.port).sign_in(small.links()["A3"])
     answers, places, names = [], [], []
     for k in range(SMALL + 3):
         while (page := visitor.home()).action != "/answer":
-            visitor.pass_by(page)
+            visitor.leave(page)
         [turn] = rows(
             small,
             "SELECT * FROM turn JOIN plan USING (annotator, item_id) WHERE token = ?",
@@ -136,50 +135,48 @@ def test_nothing_that_is_sent_tells_the_right_answer(small, micro_store) -> None
         item = items[turn["item_id"]]
         paths = page.media()
         names += paths
-        replies = [visitor.ask("GET", path) for path in paths]
+        replies = [visitor.request("GET", path) for path in paths]
         assert {r.status for r in replies} == {200}
-        for told in (page.text, *(str(r.headers) for r in replies), *paths):
+        for text in (page.text, *(str(r.headers) for r in replies), *paths):
             assert not any(
-                word in told
+                word in text
                 for word in (item.item_id, item.scene_id, item.family, item.subtype, "target")
             )
-        assert not re.search(
-            r"same_|cross_|oracle|correct answer|right", page.text.split("<main")[1]
-        )
+        assert not re.search(r"same_|cross_|oracle|correct|right", page.text.split("<main")[1])
         candidates = replies[1:]
         heads = [{k: v for k, v in r.headers.items() if k != "date"} for r in candidates]
         assert all(head == heads[0] for head in heads)
         assert set(heads[0]) == {"content-length", "content-type"} | {h.lower() for h in HEADERS}
-        # A condition on a header that is not sent gets the whole again, and so does a range.
-        again = visitor.ask("GET", paths[1], **{"If-None-Match": "*", "Range": "bytes=0-9"})
+        # Conditional and range requests get the whole content.
+        again = visitor.request("GET", paths[1], **{"If-None-Match": "*", "Range": "bytes=0-9"})
         assert (again.status, again.body) == (200, candidates[0].body)
         places.append(turn["shown"].index(str(item.answer)))
         answers.append(item.answer)
         visitor.load(page)
         visitor.answer(page, LETTERS[k % 4])
         if k >= 3:
-            # What was answered is not shown again.
-            assert {visitor.ask("GET", path).status for path in paths} == {404}
+            # Answered items are not served again.
+            assert {visitor.request("GET", path).status for path in paths} == {404}
     assert len(set(names)) == len(names)
     assert sorted(places[3:]) == [0, 1, 2, 3]
 
 
-def test_a_link_signs_in_once_and_looking_at_it_does_not(small) -> None:
+def test_a_link_signs_in_once_and_opening_it_does_not(small) -> None:
     link = small.links()["A1"]
     for _ in range(2):
-        assert Visitor(small.port).ask("GET", f"/link/{link}").status == 200
+        assert Visitor(small.port).request("GET", f"/link/{link}").status == 200
     first = Visitor(small.port).sign_in(link)
     assert first.home().status == 200
-    assert Visitor(small.port).ask("POST", "/link", {"link": link}).status == 410
-    assert Visitor(small.port).ask("GET", f"/link/{link}").status == 410
+    assert Visitor(small.port).request("POST", "/link", {"link": link}).status == 410
+    assert Visitor(small.port).request("GET", f"/link/{link}").status == 410
     assert small.links()["A1"] != link
-    # A new link is for another device: the one before is signed out.
+    # A new link signs in another device and signs out the previous one.
     second = Visitor(small.port).sign_in(small.links()["A1"])
     assert (first.home().status, second.home().status) == (401, 200)
     assert second.home().text.count(small.links()["A1"]) == 0
 
 
-def test_links_and_answers_are_for_their_owner_alone(small) -> None:
+def test_only_the_owner_can_read_links_and_answers(small) -> None:
     for name in ("links.txt", storage.DATABASE):
         assert stat.S_IMODE((small.folder / name).stat().st_mode) == 0o600
     assert not any(
@@ -187,65 +184,65 @@ def test_links_and_answers_are_for_their_owner_alone(small) -> None:
     )
 
 
-def test_a_cookie_is_kept_from_scripts_and_other_sites(small) -> None:
-    reply = Visitor(small.port).ask("POST", "/link", {"link": small.links()["A1"]})
+def test_the_cookie_is_hidden_from_scripts_and_other_sites(small) -> None:
+    reply = Visitor(small.port).request("POST", "/link", {"link": small.links()["A1"]})
     assert {"httponly", "samesite=lax", "path=/"} <= set(
         reply.headers["set-cookie"].lower().split("; ")
     )
 
 
-def test_every_reply_carries_the_headers_that_shut_other_sites_out(small, visitor) -> None:
+def test_every_response_has_the_security_headers(small, visitor) -> None:
     for path in ("/", "/nothing", "/static/study.css", "/static/nothing", "/link/x", "/media/x"):
-        told = visitor.ask("GET", path).headers
-        assert {name: told[name] for name in HEADERS} == HEADERS
-        assert not {"server", "etag", "last-modified"} & {name.lower() for name in told}
+        headers = visitor.request("GET", path).headers
+        assert {name: headers[name] for name in HEADERS} == HEADERS
+        assert not {"server", "etag", "last-modified"} & {name.lower() for name in headers}
     assert "unsafe" not in HEADERS["Content-Security-Policy"]
 
 
-def test_what_goes_wrong_inside_carries_them_and_locks_nobody_out(small) -> None:
+def test_server_errors_have_the_headers_and_lock_nobody_out(small) -> None:
     def full() -> None:
         raise OSError("No space left on device")
 
     db = storage.open_study(small.folder / storage.DATABASE)
-    told = asked(make_app(db, 10, None, full), "POST", "/link", small.links()["A1"])
-    auth.write_links(db, small.folder / auth.LINKS, "http://here")
-    assert told["status"] == 303
-    assert any(name == b"set-cookie" for name, _ in told["headers"])
-    # Without its tables no page can be made.
-    broken = make_app(sqlite3.connect(":memory:"), 10, None, full)
+    message = first_message(build_app(db, StudyCommand(), full), small.links()["A1"])
+    auth.write_links(db, small.folder / auth.LINKS_FILE, "http://here")
+    assert message["status"] == 303
+    assert any(name == b"set-cookie" for name, _ in message["headers"])
+    # Without its tables no page can be rendered.
+    broken = build_app(sqlite3.connect(":memory:"), StudyCommand(), full)
     for body, status in (("x" * 10, 500), ("x" * 5000, 413)):
-        told = asked(broken, "POST", "/link", body)
-        assert told["status"] == status
-        heads = {name.decode().lower(): value.decode() for name, value in told["headers"]}
+        message = first_message(broken, body)
+        assert message["status"] == status
+        heads = {name.decode().lower(): value.decode() for name, value in message["headers"]}
         assert {name: heads[name.lower()] for name in HEADERS} == HEADERS
 
 
-def asked(app, method: str, path: str, link: str) -> dict:
-    """How an application begins its reply to a form with a link."""
-    told = []
+def first_message(app, link: str) -> dict:
+    """The beginning of an application's response to the form of a link."""
+    messages = []
 
     async def receive() -> dict:
         return {"type": "http.request", "body": f"link={link}".encode(), "more_body": False}
 
     async def send(message: dict) -> None:
-        told.append(message)
+        messages.append(message)
 
     headers = [(b"host", b"here"), (b"content-length", str(len(link) + 5).encode())]
     scope = {
-        "type": "http", "method": method, "path": path, "raw_path": path.encode(),
+        "type": "http", "method": "POST", "path": "/link", "raw_path": b"/link",
         "query_string": b"", "headers": headers, "http_version": "1.1",
     }  # fmt: skip
-    # The server logs what it re-raises.
+    # The application re-raises errors for the server to log.
     with contextlib.suppress(sqlite3.Error):
         asyncio.run(app(scope, receive, send))
-    return told[0]
+    return messages[0]
 
 
-def test_a_replayed_or_early_or_forged_answer_does_nothing(small, visitor) -> None:
+def test_repeated_early_and_forged_answers_change_nothing(small, visitor) -> None:
     page = visitor.to_question()
     assert visitor.answer(page, "A").status == 303
     [turn] = rows(small, "SELECT * FROM turn WHERE token = ?", page.hidden("key"))
-    assert turn["answered"] is None, "answered before anything was on the screen"
+    assert turn["answered"] is None, "answered before the page was loaded"
     visitor.load(page)
     visitor.answer(page, "B")
     [kept] = map(tuple, rows(small, "SELECT * FROM turn WHERE token = ?", page.hidden("key")))
@@ -255,17 +252,17 @@ def test_a_replayed_or_early_or_forged_answer_does_nothing(small, visitor) -> No
     [after] = map(tuple, rows(small, "SELECT * FROM turn WHERE token = ?", page.hidden("key")))
     assert after == kept
 
-    # Another annotator's item, under one's own session.
+    # Another annotator's item in the own session.
     other = Visitor(small.port).sign_in(small.links()["A2"])
     theirs = other.to_question()
     other.load(theirs)
     mine = visitor.home()
     forged = {"form_key": mine.hidden("form_key"), "key": theirs.hidden("key")}
-    assert visitor.ask("POST", "/loaded", forged).status == 409
-    visitor.ask("POST", "/answer", forged | {"choice": "A", "seconds": "1"})
+    assert visitor.request("POST", "/loaded", forged).status == 409
+    visitor.request("POST", "/answer", forged | {"choice": "A", "seconds": "1"})
     [turn] = rows(small, "SELECT * FROM turn WHERE token = ?", theirs.hidden("key"))
     assert (turn["answered"], turn["loads"]) == (None, 1)
-    assert {visitor.ask("GET", path).status for path in theirs.media()} == {404}
+    assert {visitor.request("GET", path).status for path in theirs.media()} == {404}
 
 
 @pytest.mark.parametrize(
@@ -287,18 +284,20 @@ def test_a_replayed_or_early_or_forged_answer_does_nothing(small, visitor) -> No
         ({f"f{k}": "" for k in range(50)}, 400),
     ],
 )
-def test_hostile_fields_do_nothing(small, visitor, changes, status) -> None:
+def test_hostile_fields_change_nothing(small, visitor, changes, status) -> None:
     page = visitor.to_question()
     visitor.load(page)
     before = rows(small, "SELECT count(*), count(answered), max(rests) FROM turn, annotator")
-    reply = visitor.ask("POST", "/answer", {**both(page), "choice": "A", "seconds": "1", **changes})
+    reply = visitor.request(
+        "POST", "/answer", {**both(page), "choice": "A", "seconds": "1", **changes}
+    )
     assert reply.status == status
     assert "<script>alert" not in reply.text
     after = rows(small, "SELECT count(*), count(answered), max(rests) FROM turn, annotator")
     assert list(map(tuple, before)) == list(map(tuple, after))
 
 
-def test_another_sites_forms_are_refused(visitor) -> None:
+def test_forms_of_other_sites_are_refused(visitor) -> None:
     page = visitor.to_question()
     for headers in (
         {"Origin": "http://evil.example"},
@@ -308,10 +307,10 @@ def test_another_sites_forms_are_refused(visitor) -> None:
         {"Sec-Fetch-Site": "cross-site"},
         {"Sec-Fetch-Site": "same-site"},
     ):
-        for path in ("/consent", "/go-on", "/loaded", "/answer", "/link"):
-            assert visitor.ask("POST", path, both(page), **headers).status == 403
+        for path in ("/consent", "/continue", "/loaded", "/answer", "/link"):
+            assert visitor.request("POST", path, both(page), **headers).status == 403
     own = {"Origin": f"http://127.0.0.1:{visitor.port}"}
-    assert visitor.ask("POST", "/loaded", both(page), **own).status == 204
+    assert visitor.request("POST", "/loaded", both(page), **own).status == 204
 
 
 @pytest.mark.parametrize(
@@ -322,17 +321,17 @@ def test_another_sites_forms_are_refused(visitor) -> None:
      ("https://study.example.org:x", 403), ("http://INSIDE:8000", 200), ("http://[", 403),
      ("", 403), (":", 403)],
 )  # fmt: skip
-def test_forms_come_back_to_the_public_address_however_it_is_written(origin, status) -> None:
-    told = []
+def test_forms_of_the_public_address_are_accepted_in_every_spelling(origin, status) -> None:
+    messages = []
 
     async def send(message: dict) -> None:
-        told.append(message)
+        messages.append(message)
 
     headers = [(b"host", b"inside:8000"), (b"origin", origin.encode())]
-    asked = {"type": "http", "method": "POST", "path": "/", "headers": headers}
-    guard = Guard(PlainTextResponse("taken"), "https://Study.Example.org:443/")
-    asyncio.run(guard(asked, None, send))
-    assert told[0]["status"] == status
+    scope = {"type": "http", "method": "POST", "path": "/", "headers": headers}
+    guard = SiteGuard(PlainTextResponse("taken"), "https://Study.Example.org:443/")
+    asyncio.run(guard(scope, None, send))
+    assert messages[0]["status"] == status
 
 
 @pytest.mark.parametrize(
@@ -341,24 +340,24 @@ def test_forms_come_back_to_the_public_address_however_it_is_written(origin, sta
      "/media/%00", "/study.sqlite", "/links.txt", "//etc/passwd", "/media/" + "a" * 4000,
      "/link/%ff%fe", "/export", "/votes.jsonl"],
 )  # fmt: skip
-def test_tricks_with_paths_find_nothing(small, visitor, path) -> None:
-    reply = visitor.ask("GET", path)
+def test_hostile_paths_are_not_found(small, visitor, path) -> None:
+    reply = visitor.request("GET", path)
     assert reply.status in (404, 410)
     assert "Traceback" not in reply.text
-    assert visitor.ask("DELETE", path).status in (404, 405)
+    assert visitor.request("DELETE", path).status in (404, 405)
 
 
-def test_without_a_session_there_is_nothing_to_see_or_do(small, visitor) -> None:
+def test_without_a_session_every_request_is_refused(small, visitor) -> None:
     page = visitor.to_question()
     for cookie in ("", "study=", "study=x", "study=' OR 1=1 --", "study=" + "x" * 4000):
         stranger = Visitor(small.port)
         stranger.cookie = cookie
         assert stranger.home().status == 401
-        assert {stranger.ask("GET", path).status for path in page.media()} == {401}
+        assert {stranger.request("GET", path).status for path in page.media()} == {401}
         assert stranger.load(page).status == 401
 
 
-def test_a_thousand_requests_at_once_are_answered_and_count_once(small, visitor) -> None:
+def test_of_a_thousand_concurrent_answers_one_counts(small, visitor) -> None:
     page = visitor.to_question()
     visitor.load(page)
     votes = len(rows(small, "SELECT 1 FROM turn WHERE answered IS NOT NULL"))
@@ -385,10 +384,10 @@ def test_a_thousand_requests_at_once_are_answered_and_count_once(small, visitor)
     assert visitor.home().status == 200
 
 
-def test_votes_hold_answers_to_the_study_alone(small) -> None:
+def test_votes_exclude_practice(small) -> None:
     db = storage.open_study(small.folder / storage.DATABASE)
-    practised = set(storage.item_ids(db, practice=True))
-    votes = list(votes_of(db))
+    practice = set(storage.item_ids(db, practice=True))
+    votes = list(read_votes(db))
     db.close()
     assert votes
-    assert not {v.item_id for v in votes} & practised
+    assert not {v.item_id for v in votes} & practice
