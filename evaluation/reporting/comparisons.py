@@ -13,8 +13,6 @@ from evaluation.reporting.results import SelectionResult
 from evaluation.reporting.run_responses import Responses
 from evaluation.reporting.runs import FinishedRun, reading
 
-REMEDY = "compare runs of the same items, chosen with runs=[...]"
-
 
 def check_same_build(runs: Iterable[FinishedRun]) -> None:
     """Refuse two builds of one benchmark: their items can differ although their ids agree.
@@ -35,37 +33,20 @@ def check_same_build(runs: Iterable[FinishedRun]) -> None:
             )
 
 
-def check_selection_items(
-    rows: Sequence[Measurement], items: Sequence[Mapping[str, object] | None]
-) -> None:
+def check_selection_items(rows: Sequence[Measurement], responses: Sequence[Responses]) -> None:
     """Refuse rows of one table that are not of the same items.
 
     Args:
-        items: Each row's items by id; None if they are unknown, so that their number, and the
-            limit and seed that chose them, are compared instead.
+        responses: The responses of each row's model.
 
     Raises:
         UserError: two runs measured different items.
     """
     first: dict[str, int] = {}
-    # Known items come first, for the error can name those that differ.
-    for k in sorted(range(len(rows)), key=lambda k: items[k] is None):
-        row, j = rows[k], first.setdefault(rows[k].items, k)
-        other = rows[j]
-        names = (str(other.run.folder), str(row.run.folder))
-        if items[j] is not None and items[k] is not None:
-            check_same_items(items[j], items[k], names)
-        elif (sizes := (f"{other.row.n:,}", f"{row.row.n:,}"))[0] != sizes[1]:
-            _refuse(names, f"answered {sizes[0]} and {sizes[1]} items", "different-items")
-        elif (samples := (_sample(other.run), _sample(row.run)))[0] != samples[1]:
-            detail = f"answered items of limit and seed {samples[0]} and {samples[1]}"
-            _refuse(names, detail, "different-items")
-
-
-def _sample(run: FinishedRun) -> tuple[int, int] | None:
-    """The limit and the seed that chose a run's items; None for all items."""
-    limit = run.config.get("limit")
-    return None if limit is None else (limit, run.config.get("seed", 0))
+    for k, m in enumerate(rows):
+        j = first.setdefault(m.items, k)
+        names = (str(rows[j].run.folder), str(m.run.folder))
+        check_same_items(responses[j], responses[k], names)
 
 
 def check_retrieval_sizes(rows: Sequence[Measurement]) -> None:
@@ -79,17 +60,13 @@ def check_retrieval_sizes(rows: Sequence[Measurement]) -> None:
         other = first.setdefault((m.benchmark, m.row.builder), m)
         sizes = [(r.row.frames, r.row.queries) for r in (other, m)]
         if sizes[0] != sizes[1]:
-            (frames, queries), (more_frames, more_queries) = sizes
-            names = (str(other.run.folder), str(m.run.folder))
-            detail = (
-                f"ranked {frames:,} and {more_frames:,} frames of {m.benchmark} for {queries:,} "
-                f"and {more_queries:,} queries"
+            (frames, queries), (other_frames, other_queries) = sizes
+            raise UserError(
+                f"{other.run.folder} and {m.run.folder} ranked {frames:,} and {other_frames:,} "
+                f"frames of {m.benchmark} for {queries:,} and {other_queries:,} queries: choose "
+                "runs of one test with runs=[...]",
+                code="different-queries",
             )
-            _refuse(names, detail, "different-queries")
-
-
-def _refuse(names: tuple[str, str], detail: str, code: str) -> None:
-    raise UserError(f"{names[0]} and {names[1]} {detail}: {REMEDY}", code=code)
 
 
 def compare_models(

@@ -69,16 +69,10 @@ def browse_items(
     """
     runs = {m.run.folder: m.run for m in selections}
     responses = {folder: read_responses(run) for folder, run in runs.items()}
-    check_selection_items(selections, [_responses_of(m, responses) or None for m in selections])
+    check_selection_items(selections, [_responses_of(m, responses) for m in selections])
     browser = ItemBrowser()
     for name in dict.fromkeys(m.benchmark for m in selections):
-        answered = [
-            m
-            for m in deduplicate(selections)
-            if m.benchmark == name and _responses_of(m, responses)
-        ]
-        if not answered:
-            continue
+        answered = [m for m in deduplicate(selections) if m.benchmark == name]
         try:
             store = open_store(stores / name)
         except UserError as error:

@@ -68,7 +68,7 @@ def read_responses(run: FinishedRun) -> dict[Variant, Responses]:
     Responses under other settings, and lines torn by a kill, are left out.
 
     Raises:
-        UserError: the report or the responses are of another version.
+        UserError: the report or the responses are missing or of another version.
     """
     return _read_scores(run) if run.kind == "similarity" else _read_texts(run)
 
@@ -85,7 +85,8 @@ def _read_scores(run: FinishedRun) -> dict[Variant, Responses]:
 def _read_texts(run: FinishedRun) -> dict[Variant, Responses]:
     with reading(run.folder):
         variants = {key: (mode, control) for mode, control, key in run.report["asked"]}
-        responses: dict[Variant, dict[str, TextResponse]] = {v: {} for v in variants.values()}
+    responses: dict[Variant, dict[str, TextResponse]] = {v: {} for v in variants.values()}
+    with reading(run.folder, "answers.jsonl"):
         for row in json_lines(run.folder / "answers.jsonl"):
             if "text" in row and row["key"] in variants:
                 response = TextResponse(str(row["text"]), bool(row["cut"]))

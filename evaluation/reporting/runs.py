@@ -170,9 +170,7 @@ def reading(folder: Path, file: str = "report.json") -> Iterator[None]:
 
 
 def json_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """The objects in a file of JSON lines, none if it is missing; torn lines are skipped."""
-    if not path.exists():
-        return
+    """The objects in a file of JSON lines; torn lines are skipped."""
     with open(path, encoding="utf-8", errors="replace") as file:
         for line in file:
             try:

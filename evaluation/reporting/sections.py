@@ -318,7 +318,8 @@ def training(runs: Sequence[FinishedRun], draw: Callable) -> Section:
     if table.groups:
         section.tables.append(table)
     for run in runs:
-        if records := [*json_lines(run.folder / "metrics.jsonl")]:
+        journal = run.folder / "metrics.jsonl"
+        if journal.exists() and (records := [*json_lines(journal)]):
             name = f"training-{run.kind}-{run.name.replace('/', '-')}"
             caption = f"Training of {run.kind}/{run.name}."
             section.figures.append(draw(name, plot_curves, records, caption))

@@ -6,8 +6,6 @@ import json
 import shutil
 from pathlib import Path
 
-from omegaconf import OmegaConf
-
 from conf.schema import ExportStudyCommand
 from data.records import FAMILIES
 from evaluation.study.agreement import summary
@@ -16,10 +14,8 @@ from tests.evaluation.reporting.measured import (
     read_table,
     reported,
     retrieve_run,
-    similarity_run,
 )
 from tests.evaluation.study.test_agreement import vote
-from tests.user_errors import raises_user_error
 
 
 def change_first_row(report: Path, **row: object) -> None:
@@ -41,17 +37,6 @@ def test_a_model_that_is_measured_twice_keeps_its_line(runs):
         [row] = [row for row in table.splitlines() if row.startswith(f"| {line} |")]
         assert "100.0" in row.split("|")[2]
         assert "cot, cot" in table
-
-
-def test_runs_of_unknown_items_are_compared_by_limit_and_seed(runs, micro, micro_store) -> None:
-    for seed, name in enumerate(("one", "two")):
-        folder = similarity_run(runs, micro_store, micro, name, limit=9)
-        (folder / "scores.jsonl").unlink()
-        settings = OmegaConf.load(folder / "config.yaml")
-        settings.seed = seed
-        OmegaConf.save(settings, folder / "config.yaml")
-    with raises_user_error("different-items", contains=("(9, 0)", "(9, 1)")):
-        reported(runs, micro_store.folder.parent, runs=["similarity/one", "similarity/two"])
 
 
 def test_a_common_base_has_one_curve_and_two_runs_have_names(runs, micro, micro_store):
