@@ -19,7 +19,8 @@ from data.releases.clevrer import EULER, VECTORS
 from data.render.frame_cache import FrameCache, load_frames
 from data.store import Store, load_scene, scene_path, write_atomically
 
-FIRST_VALIDATION, FIRST_TEST = 10_000, 15_000
+NUMBERS = {"train": range(10_000), "test": range(10_000, 15_000)}
+"""Numbers of the annotated scenes by our splits: CLEVRER's train and validation parts."""
 BLOCK = 1_000
 """Scenes per folder."""
 QUALITY = "6"
@@ -38,11 +39,16 @@ def export_clevrer(store: Store, folder: Path, workers: Workers) -> int:
     Raises:
         UserError: CLEVRER's layout cannot hold this number of scenes, or one of the scenes.
     """
-    indices = {
-        name: first + k
-        for split, first in (("train", 0), ("test", FIRST_VALIDATION))
-        for k, name in enumerate(store.scene_ids(split))
-    }
+    indices = {}
+    for split, numbers in NUMBERS.items():
+        names = store.scene_ids(split)
+        if len(names) > len(numbers):
+            raise UserError(
+                f"{store.name} has {len(names)} {split} scenes: CLEVRER's layout holds at most "
+                f"{len(numbers)}, export a smaller benchmark",
+                code="too-many-scenes",
+            )
+        indices |= dict(zip(names, numbers, strict=False))
     cache = FrameCache.of(store)
     jobs = {
         name: partial(_export_one, cache, name, folder, index)
@@ -64,7 +70,7 @@ def _export_one(cache: FrameCache, scene_id: str, folder: Path, index: int) -> N
 
 def annotation_path(folder: Path, index: int) -> Path:
     """Return the path of scene `index`'s annotation."""
-    part = "train" if index < FIRST_VALIDATION else "validation"
+    part = "train" if index in NUMBERS["train"] else "validation"
     block = index // BLOCK * BLOCK
     span = f"{block:05d}-{block + BLOCK:05d}"
     return folder / f"annotation_{part}/annotation_{span}/annotation_{index:05d}.json"
@@ -75,21 +81,15 @@ def write_clevrer(
 ) -> tuple[Path, Path]:
     """Write a scene and its frames as scene `index` of a release.
 
-    The index determines the split: train below 10,000, validation below 15,000. The oracle does not
-    record where two objects touched, so a collision's location is the middle of their centres.
+    The oracle does not record where two objects touched, so a collision's location is the middle of
+    their centres.
 
     Returns:
         The paths of the annotation and of the video.
 
     Raises:
-        UserError: CLEVRER's layout has no such index, or cannot hold the scene.
+        UserError: CLEVRER's layout cannot hold the scene.
     """
-    if not 0 <= index < FIRST_TEST:
-        raise UserError(
-            f"scene {scene.scene_id} cannot be exported as number {index}: CLEVRER's annotations "
-            f"are numbered 0 to {FIRST_TEST - 1}, export fewer scenes",
-            code="too-many-scenes",
-        )
     if scene.frames != FRAMES or sorted(images) != list(range(FRAMES)):
         raise UserError(
             f"scene {scene.scene_id} has {scene.frames} frames and {len(images)} images: CLEVRER's "

@@ -74,7 +74,8 @@ def draw_sheet(rows: Sequence[Row]) -> bytes:
         grid = strip.subplots(1, columns + 1, **layout)
         for axes in grid:
             axes.set_axis_off()
-        for axes, cell in zip(grid, [*row.prefix, None, *row.candidates], strict=False):
+        padding = [None] * (prefix + 1 - len(row.prefix))
+        for axes, cell in zip(grid, [*row.prefix, *padding, *row.candidates], strict=False):
             if cell:
                 draw_cell(axes, cell)
     return encode_figure(figure)

@@ -33,7 +33,7 @@ PAGE = """<!doctype html>
 <h1>Rationales of {teacher}</h1>
 <pre>{figures}</pre>
 <p>{count} of {accepted:,} accepted rationales for the benchmark {benchmark}, a random sample. The
-frames of the prefix are left of the line and the candidates right of it; the answer has a green
+frames of the prefix are on the left and the candidates on the right; the answer has a green
 frame.</p>
 {articles}
 </html>

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from conf.schema import BenchmarkConfig
-from data.publish.clevrer_format import write_clevrer
+from data.parallel import Workers
+from data.publish.clevrer_format import export_clevrer, write_clevrer
 from data.records import Collision
 from data.releases import clevrer
 from data.releases.validation import RecordError
@@ -176,8 +178,17 @@ def test_scenes_that_clevrer_cannot_hold_are_not_exported(tmp_path: Path) -> Non
     path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
     scene = clevrer.read_scene(path, tmp_path, "test")
     images = clevrer.load_images(scene, tmp_path, range(128))
-    with raises_user_error("too-many-scenes", contains="15000"):
-        write_clevrer(scene, images, tmp_path / "new", 15_000)
     with raises_user_error("invalid-scene", contains="127"):
         write_clevrer(scene, {f: images[f] for f in range(127)}, tmp_path / "new", 0)
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(("train", "test"), [(10_001, 0), (1, 5_001)])
+def test_more_scenes_than_clevrer_numbers_are_refused(
+    tmp_path: Path, train: int, test: int
+) -> None:
+    """The 10,001st training scene would overwrite the first validation scene."""
+    names = {"train": [f"a{k}" for k in range(train)], "test": [f"b{k}" for k in range(test)]}
+    store = SimpleNamespace(name="large", scene_ids=names.__getitem__)
+    with raises_user_error("too-many-scenes", contains="large"):
+        export_clevrer(store, tmp_path, Workers(1))
