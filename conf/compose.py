@@ -164,7 +164,7 @@ def _compose(command: str, overrides: list[str], **options: Any) -> DictConfig:
         return hydra_compose(config_name(command), overrides, **options)
     except ValueError as error:
         typed = " ".join(o for o in overrides if o.endswith("=null"))
-        raise SettingsError(f"{typed}: {error}") from error
+        raise SettingsError(f"{typed}: give the name of a preset instead of null") from error
     except (AssertionError, AttributeError) as error:
         typed = " ".join(o for o in overrides if "." in o.partition("=")[0])
         raise SettingsError(

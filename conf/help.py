@@ -43,12 +43,12 @@ def _setting_lines(settings: Any, group: str = "") -> Iterator[str]:
             yield from _setting_lines(value, f"{group}{field.name}.")
             continue
         text = textwrap.shorten(json.dumps(value, default=asdict), 60, placeholder=" ...")
-        first, *rest = textwrap.wrap(_description(type(settings), field.name), width) or [""]
+        first, *rest = textwrap.wrap(description(type(settings), field.name), width) or [""]
         yield f"{f'  {group}{field.name} = {text}':<{COLUMN - 2}}  {first}".rstrip()
         yield from (f"{'':<{COLUMN}}{line}" for line in rest)
 
 
-def _description(schema: type, name: str) -> str:
+def description(schema: type, name: str) -> str:
     """The docstring below a field, from the class or the base class that has one."""
     schemas = [kind for kind in schema.__mro__ if is_dataclass(kind)]
     return next((text for kind in schemas if (text := _docstrings(kind).get(name))), "")

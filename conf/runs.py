@@ -53,8 +53,10 @@ class Run:
 
 
 def rank() -> int:
-    """Rank of this process under a launcher such as torchrun, otherwise 0. Rank 0 is the main rank:
-    it prepares, logs and writes for all ranks."""
+    """Rank of this process under a launcher such as torchrun; 0 without a launcher.
+
+    Rank 0 is the main rank, which prepares, logs and writes for all ranks.
+    """
     return int(os.environ["RANK"]) if "LOCAL_RANK" in os.environ else 0
 
 

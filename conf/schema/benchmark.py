@@ -27,7 +27,9 @@ class Quota:
     """Number of items or queries of a cell in each split."""
 
     train: int = 0
+    """Number in the training split."""
     test: int = 0
+    """Number in the test split."""
 
 
 @dataclass

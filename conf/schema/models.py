@@ -73,6 +73,7 @@ class ModelConfig:
     trust_remote_code: bool = False
     """Allow the model's own Python code to run."""
     architecture: ArchitectureConfig | None = None
+    """Sizes of a model to build with random weights; null loads `model`."""
     quantization: str = "nf4"
     """Quantisation of the base's weights: nf4 (4 bits) or none."""
     lora: LoraConfig = field(default_factory=LoraConfig)

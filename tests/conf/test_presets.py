@@ -1,6 +1,7 @@
 """Every yaml file composes with the command in its first comment."""
 
 import shlex
+from dataclasses import fields, is_dataclass
 from importlib.resources import files
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 from conf import schema
 from conf.compose import compose, config_name, options
 from conf.errors import SettingsError
+from conf.help import description
 from data.tracks.selection.window import CELLS
 
 CONF = Path(str(files("conf")))
@@ -67,6 +69,19 @@ def test_help_lists_the_overlays_that_compose(command):
 
     overlays = [path.stem for path in sorted((CONF / "exp").iterdir())]
     assert options(command, SCHEMAS[command])["exp"] == list(filter(composes, overlays))
+
+
+@pytest.mark.parametrize("command", SCHEMAS)
+def test_help_describes_every_setting(command):
+    def undescribed(settings, group=""):
+        for field in fields(settings):
+            value = getattr(settings, field.name)
+            if is_dataclass(value):
+                yield from undescribed(value, f"{group}{field.name}.")
+            elif not description(type(settings), field.name):
+                yield f"{group}{field.name}"
+
+    assert list(undescribed(compose(command, SCHEMAS[command], []))) == []
 
 
 def test_student_preset_sets_its_training_recipe():
