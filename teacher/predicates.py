@@ -226,10 +226,7 @@ def extract_predicates(
 ) -> Predicates | None:
     """Predicates of an item; None if the cut leaves too short a prefix.
 
-    Args:
-        item: The item.
-        scene: Its scene.
-        scene_of: Returns the scene of a candidate from another scene, by its id.
+    `scene_of` returns the scene of a candidate from another scene, by its id.
     """
     moment = {"future": "at the collision", "contact": "just after the collision"}.get(
         item.framing or "", "at the target moment"

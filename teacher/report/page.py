@@ -43,16 +43,7 @@ frame.</p>
 def write_page(
     store: Store, accepted: Sequence[Rationale], figures: str, count: int, seed: int, folder: Path
 ) -> Path:
-    """Write report.html and its images.
-
-    Args:
-        store: The benchmark.
-        accepted: The accepted rationales.
-        figures: The text of the report's figures.
-        count: Number of rationales on the page.
-        seed: Seed of their random choice.
-        folder: Folder of the report.
-    """
+    """Write report.html with `figures` and `count` random rationales, and its images."""
     chosen = np.random.default_rng(seed).permutation(len(accepted))[:count]
     items = {item.item_id: item for item in store.selection("train")}
     rows = ExampleRows(store)

@@ -158,13 +158,9 @@ def summarize(
     attempts: int,
     too_short: int,
 ) -> Summary:
-    """The figures of `responses`, by item and in the order of their attempts.
+    """The figures of `responses` by item, in the order of their attempts.
 
-    Args:
-        items: The training items.
-        responses: The responses to each item.
-        attempts: The most attempts that an item has.
-        too_short: Number of items whose prefix is too short.
+    `attempts` is the limit per item, `too_short` the number of items with too short a prefix.
     """
     every = [r for item in items for r in responses.get(item.item_id, ())]
     accepted = select_accepted(items, responses)

@@ -55,12 +55,7 @@ class RefusedError(RequestError):
 
 
 class RateLimitedError(RequestError):
-    """The server limits the request rate.
-
-    Args:
-        problem: The HTTP status.
-        seconds: How long the server asks clients to wait; None if it does not say.
-    """
+    """The server limits the request rate; `seconds` is the wait that it asks for, if any."""
 
     def __init__(self, problem: str, seconds: float | None) -> None:
         super().__init__(problem)
