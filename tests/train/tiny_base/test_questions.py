@@ -49,7 +49,7 @@ def question_and_answer(lazy: LazySample, epoch: int = 0) -> tuple[str, str]:
 
 def test_frame_is_described_completely(micro_store, kinds) -> None:
     for lazy in kinds["frame"]:
-        sample = lazy.make(0)
+        sample = lazy.load(0)
         scene_id, frame = sample.sample_id.rsplit(" ", 1)
         expected = visible(micro_store, scene_id, int(frame))
         stated = re.findall(r"The (\w+ \w+ \w+) is (near the [\w-]+)\.", sample.response)
@@ -116,7 +116,7 @@ def test_motion_of_an_object_in_a_clip(micro_store, kinds) -> None:
     items = {item.item_id: item for item in micro_store.selection("train")}
     rests = []
     for lazy in kinds["moves"][:24]:
-        sample = lazy.make(0)
+        sample = lazy.load(0)
         item = items[sample.sample_id.partition(" (")[0]]
         scene = micro_store.scene(item.scene_id)
         end = find_cut(scene, item.prefix_start, item.prefix_stop)
@@ -146,7 +146,7 @@ def test_headings_of_objects_at_visual_tokens(micro_store, kinds) -> None:
     items = {item.item_id: item for item in micro_store.selection("train")}
     headings = set()
     for lazy in kinds["moves"][::6]:
-        sample = lazy.make(0)
+        sample = lazy.load(0)
         item = items[sample.sample_id.partition(" (")[0]]
         scene, frames = micro_store.scene(item.scene_id), sample.clip.indices
         assert {sight.picture for sight in sample.sights} <= set(range(sample.pictures))
@@ -183,7 +183,7 @@ def test_only_one_candidate_fits_a_description(micro_store, kinds) -> None:
     items = {item.item_id: item for item in micro_store.selection("train")}
     assert kinds["match"]
     for lazy in kinds["match"]:
-        sample = lazy.make(0)
+        sample = lazy.load(0)
         item = items[sample.sample_id.removesuffix(" (match)")]
         wanted = re.findall(r"the (\w+ \w+ \w+) (near the [\w-]+)", sample.content[-1]["text"])
         assert wanted
