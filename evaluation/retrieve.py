@@ -25,8 +25,9 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
 
         if preset.late is not None:
             raise UserError(
-                "index=faiss holds one vector a frame, and retriever.late has many: "
-                "leave index=exact"
+                "index=faiss holds one vector per frame, but retriever.late has several: set "
+                "index=exact",
+                code="unsupported-index",
             )
         import_faiss()
 
@@ -35,7 +36,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.render.frame_cache import FrameReader
-    from evaluation.embedders import embed
+    from evaluation.embedders.base import embed_frames, embed_queries, open_embedders
     from evaluation.metrics import breakdown
     from evaluation.reporting import tables
     from evaluation.retrieval import faiss_index, standard_test
@@ -43,36 +44,36 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
 
     queries, database = standard_test.load_standard_test(store)
     frames = FrameReader(store, preset.image_size)
-    ids = [q.query_id for q in queries]
     names = [f.name for f in database]
     targets = [q.target.name for q in queries]
-    rows, curves, indexes, found = [], [], [], {}
+    rows, curves, indexes, ranks = [], [], [], {}
     precision = resolve_precision(trained.train.precision)
-    for embedder in embed.embedders(folder, preset, precision, store, run.folder):
-        asked = embed.embed_queries(embedder, queries, store, frames, cfg.batch).rows(ids)
-        shown = embed.embed_frames(embedder, database, store, frames, cfg.batch)
+    for embedder in open_embedders(folder, preset, precision, store, run.folder):
+        query_embeddings = embed_queries(embedder, queries, store, frames, cfg.batch)
+        query_rows = query_embeddings.rows([q.query_id for q in queries])
+        embeddings = embed_frames(embedder, database, store, frames, cfg.batch)
         name = embedder.name
         log.info("ranking %s frames with %s", f"{len(names):,}", name)
         if cfg.index == "exact":
-            parts = standard_test.in_parts(shown, names)
-            ranks = standard_test.rank_targets(preset, asked, shown.rows(targets), parts)
+            parts = standard_test.read_parts(embeddings, names)
+            target_rows = embeddings.rows(targets)
+            ranks[name] = standard_test.rank_targets(preset, query_rows, target_rows, parts)
         else:
             name = f"{name} ({cfg.index})"
-            ranks, told = faiss_index.approximate_ranks(
-                asked, targets, shown, names, preset.widths, cfg.probes, cfg.seed
+            ranks[name], summaries = faiss_index.approximate_ranks(
+                query_rows, targets, embeddings, names, preset.widths, cfg.probes, cfg.seed
             )
-            indexes += [{"name": name, **of_width} for of_width in told]
-        found[name] = ranks
-        rows += breakdown.retrieval_rows(store.name, name, ranks, queries, cfg.seed)
-        curves += breakdown.recall_curves(name, ranks, queries)
+            indexes += [{"name": name, **summary} for summary in summaries]
+        rows += breakdown.retrieval_rows(store.name, name, ranks[name], queries, cfg.seed)
+        curves += breakdown.recall_curves(name, ranks[name], queries)
 
-    apart = breakdown.compare_retrievers(found, queries, cfg.seed)
-    told = [tables.rank_differences_table(apart)] if apart else []
-    told += [tables.index_table(indexes)] if indexes else []
-    standard_test.write_ranks(run.folder, found, queries)
-    also = {"build": store.identity, "indexes": indexes, "differences": apart}
-    standard_test.write_report(run.folder, rows, curves, told, **also)
-    return {name: found.value for name, found in rows[0].measures.items() if name != "tie_rate"}
+    differences = breakdown.compare_retrievers(ranks, queries, cfg.seed)
+    extra = [tables.rank_differences_table(differences)] if differences else []
+    extra += [tables.index_table(indexes)] if indexes else []
+    standard_test.write_ranks(run.folder, ranks, queries)
+    entries = {"build": store.identity, "indexes": indexes, "differences": differences}
+    standard_test.write_report(run.folder, rows, curves, extra, **entries)
+    return {name: of.value for name, of in rows[0].measures.items() if name != "tie_rate"}
 
 
 if __name__ == "__main__":

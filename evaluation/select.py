@@ -1,5 +1,4 @@
-"""Measure a model on the selection track's test items: a student in reasoning and in answer mode, a
-base by the structured record; loaded here, or asked at servers."""
+"""Measure a student or a base on the selection track's test items, local or on servers."""
 
 from __future__ import annotations
 
@@ -14,6 +13,7 @@ from conf.schema import SelectCommand, SftCommand
 
 if TYPE_CHECKING:
     from data.records import SelectionItem
+    from data.render.frame_cache import FrameReader
     from data.store import Store
 
 log = logging.getLogger(__name__)
@@ -34,43 +34,42 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.render.frame_cache import FrameReader
-    from evaluation.generators import model_source, response_log
+    from evaluation.generators import base, response_log
     from evaluation.reporting import selection_report
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = FrameReader(store, student.image_size)
-    model = model_source.open_generator(cfg, folder, trained)
-    given, keys, runs = {}, {}, Path(cfg.checkpoints, "select")
-    # What a control changes shows only beside the same items as they are.
+    model = base.open_generator(cfg, folder, trained)
+    answers, keys, runs = {}, {}, Path(cfg.checkpoints, "select")
+    # The effect of a control needs the same items without it.
     for control in dict.fromkeys([None, cfg.control]):
-        known = {
-            mode: model_source.response_settings(
+        settings = {
+            mode: base.response_settings(
                 mode, regime, student, cfg.seed, model.revision, store.identity, control
             )
             for mode in modes
         }
-        journal = response_log.ResponseLog(run.folder / "answers.jsonl", known, items)
-        if cfg.control and (taken := journal.take_over(sorted(runs.glob("**/answers.jsonl")))):
-            log.info("%d answers are there already, from other runs of this model", taken)
-        sample_of = partial(model_source.shown, regime, frames, student, control)
+        responses = response_log.ResponseLog(run.folder / "answers.jsonl", settings, items)
+        if cfg.control and (count := responses.take_over(sorted(runs.glob("**/answers.jsonl")))):
+            log.info("reusing %d answers from other runs of this model", count)
         for mode in modes:
-            log.info("asking %s in %s mode%s", model.name, mode, f", {control}" if control else "")
-            given[mode, control] = response_log.collect_responses(
-                items, mode, model.say(mode, sample_of), journal
-            )
-            keys[mode, control] = journal.keys[mode]
+            log.info("measuring %s in %s mode, control %s", model.name, mode, control or "none")
+            sample_of = partial(base.item_sample, regime, frames, student, control, mode)
+            respond = partial(model.respond, mode, sample_of)
+            answers[mode, control] = response_log.collect_responses(items, mode, respond, responses)
+            keys[mode, control] = responses.keys[mode]
 
-    about = {"build": store.identity, "asked": [[*how, key] for how, key in keys.items()]}
+    about = {"build": store.identity, "asked": [[*group, key] for group, key in keys.items()]}
     metrics = selection_report.write_report(
-        given, items, model.name, store.name, cfg, run.folder, about
+        answers, items, model.name, store.name, cfg, run.folder, about
     )
-    letter = given[modes[0], cfg.control][0].letter
+    letter = answers[modes[0], cfg.control][0].letter
     draw_item(items[0], letter, FrameReader(store), run.folder / "item.png")
     return metrics
 
 
 def default_modes(cfg: SelectCommand, regime: str) -> list[str]:
-    """The modes that a student was trained in; of a base, the record, free and held to its form."""
+    """Return the modes that a student was trained in, or both record modes for a base."""
     from models.trained_runs import modes_of
 
     if cfg.model is not None:
@@ -78,18 +77,18 @@ def default_modes(cfg: SelectCommand, regime: str) -> list[str]:
     return ["record", "constrained"]
 
 
-def draw_item(item, chosen, frames, path: Path) -> None:
-    """An item's prefix and candidates at full size, with what was chosen."""
+def draw_item(item: SelectionItem, letter: str | None, frames: FrameReader, path: Path) -> None:
+    """Draw an item's prefix and candidates at full size, with the chosen letter."""
     from data.records import LETTERS, sample_prefix_frames
     from evaluation.reporting.figures import item_figure
 
-    shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, 6)
+    prefix = sample_prefix_frames(item.prefix_start, item.prefix_stop, 6)
     item_figure(
-        [frames.image(item.scene_id, f) for f in shown],
+        [frames.image(item.scene_id, f) for f in prefix],
         [frames.image(c.scene_id, c.frame) for c in item.candidates],
         LETTERS,
         item.letter,
-        chosen,
+        letter,
         item.question,
         path,
     )
@@ -98,28 +97,32 @@ def draw_item(item, chosen, frames, path: Path) -> None:
 def select_items(
     store: Store, suite: str | None, limit: int | None, seed: int
 ) -> list[SelectionItem]:
-    """The test items of a suite that are asked, see `spread`.
+    """Return the test items of a suite, at most `limit`.
 
     Raises:
-        UserError: the benchmark has none.
+        UserError: The benchmark has none.
     """
     from data.tracks.controls import MATCHED_ANCHOR
 
     items = store.selection("test", suite)
     if not items:
         hint = (
-            "; a benchmark has pairs by benchmark.selection.matched.test, such as benchmark=small"
+            ": set benchmark.selection.matched.test, or choose a benchmark with pairs, such as "
+            "benchmark=small"
         )
         raise UserError(
-            f"{store.folder} has no test items of the {suite or store.suite} suite to measure on"
-            f"{hint if suite == MATCHED_ANCHOR else ''}"
+            f"{store.folder} has no test items of the {suite or store.suite} suite"
+            f"{hint if suite == MATCHED_ANCHOR else ''}",
+            code="no-items",
         )
     return limit_items(items, limit, seed)
 
 
 def limit_items(items: list[SelectionItem], limit: int | None, seed: int) -> list[SelectionItem]:
-    """`limit` items in a seeded order that takes the families in turn; all where it is null. Of
-    matched-anchor pairs it takes both items or neither."""
+    """Return `limit` random items with equally many of each family; None keeps all.
+
+    Of a matched-anchor pair it returns both items or neither.
+    """
     import numpy as np
 
     from data.tracks.controls import MATCHED_ANCHOR, pair_items
@@ -127,11 +130,11 @@ def limit_items(items: list[SelectionItem], limit: int | None, seed: int) -> lis
 
     if limit is None:
         return items
+    rng = np.random.default_rng(seed)
     if items[0].suite == MATCHED_ANCHOR:
-        matched = pair_items(items)
-        order = np.random.default_rng(seed).permutation(len(matched))
-        return [item for k in order[: limit // 2] for item in matched[k]]
-    order = np.random.default_rng(seed).permutation(len(items))
+        pairs = pair_items(items)
+        return [item for k in rng.permutation(len(pairs))[: limit // 2] for item in pairs[k]]
+    order = rng.permutation(len(items))
     return interleave([items[k] for k in order], lambda item: item.family)[:limit]
 
 

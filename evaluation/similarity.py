@@ -1,5 +1,4 @@
-"""Measure a retriever on the selection track: the candidate that is nearest to the prefix and the
-question is its choice, and no future is generated."""
+"""Measure a retriever on the selection track: it chooses the candidate nearest to the query."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from data.records import FrameRef
     from data.render.frame_cache import FrameReader
     from data.tracks.controls import MATCHED_ANCHOR
-    from evaluation.embedders import embed
+    from evaluation.embedders.base import embed_frames, embed_queries, open_embedders
     from evaluation.metrics.breakdown import accuracy_by_subtype, selection_row
     from evaluation.metrics.calibration import measure_position_bias
     from evaluation.metrics.significance import compare_anchors
@@ -45,42 +44,44 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     candidates = {FrameRef(c.scene_id, c.frame) for item in items for c in item.candidates}
     frames = FrameReader(store, preset.image_size)
     precision = resolve_precision(trained.train.precision)
-    rows, told, subtypes, letters, apart = [], [], {}, {}, []
-    for embedder in embed.embedders(folder, preset, precision, store, run.folder):
-        asked = embed.embed_queries(embedder, items, store, frames, cfg.batch)
-        shown = embed.embed_frames(embedder, candidates, store, frames, cfg.batch)
-        log.info("choosing for %s items with %s", f"{len(items):,}", embedder.name)
-        scores = nearest_candidate.candidate_scores(items, asked, shown, preset)
-        right = nearest_candidate.credits(scores, [item.answer for item in items])
+    rows, score_lines, subtypes, positions, anchors = [], [], {}, {}, []
+    for embedder in open_embedders(folder, preset, precision, store, run.folder):
         name = embedder.name
-        told += nearest_candidate.told(name, items, scores)
-        how = (None, cfg.seed, cfg.suite)
-        rows.append(selection_row(store.name, name, SIMILARITY, items, right, *how))
-        subtypes[name] = accuracy_by_subtype(items, right)
-        letters[name] = measure_position_bias(
-            nearest_candidate.letters(scores), [item.letter for item in items]
+        queries = embed_queries(embedder, items, store, frames, cfg.batch)
+        embeddings = embed_frames(embedder, candidates, store, frames, cfg.batch)
+        log.info("scoring %s items with %s", f"{len(items):,}", name)
+        scores = nearest_candidate.score_candidates(items, queries, embeddings, preset)
+        credits = nearest_candidate.credit_choices(scores, [item.answer for item in items])
+        score_lines += nearest_candidate.format_scores(name, items, scores)
+        rows.append(
+            selection_row(store.name, name, SIMILARITY, items, credits, None, cfg.seed, cfg.suite)
+        )
+        subtypes[name] = accuracy_by_subtype(items, credits)
+        positions[name] = measure_position_bias(
+            nearest_candidate.choose_letters(scores), [item.letter for item in items]
         )
         if cfg.suite == MATCHED_ANCHOR:
-            credits = {item.item_id: credit for item, credit in zip(items, right, strict=True)}
-            apart.append((name, compare_anchors(items, credits, cfg.seed)))
+            by_item = {item.item_id: credit for item, credit in zip(items, credits, strict=True)}
+            anchors.append((name, compare_anchors(items, by_item, cfg.seed)))
 
-    write_text(run.folder / "scores.jsonl", "".join(f"{line}\n" for line in told))
+    write_text(run.folder / "scores.jsonl", "".join(f"{line}\n" for line in score_lines))
     suite = items[0].suite
-    parts = [tables.selection_table(rows, suite), *([tables.paired_table(apart)] if apart else [])]
+    parts = [tables.selection_table(rows, suite)]
+    parts += [tables.paired_table(anchors)] if anchors else []
     log.info("%s", "\n\n".join(map(str, parts)))
-    parts += [tables.subtype_table(subtypes), tables.position_table(letters)]
+    parts += [tables.subtype_table(subtypes), tables.position_table(positions)]
     write_text(run.folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")
     report = {
         "build": store.identity,
         "rows": [r.to_dict() for r in rows],
-        "controls": [{"mode": name, **asdict(p)} for name, found in apart for p in found],
+        "controls": [{"mode": name, **asdict(p)} for name, pairs in anchors for p in pairs],
         "subtypes": {n: {c: vars(i) for c, i in by.items()} for n, by in subtypes.items()},
-        "positions": {n: asdict(found) for n, found in letters.items()},
+        "positions": {n: asdict(bias) for n, bias in positions.items()},
     }
     write_text(run.folder / "report.json", json.dumps(report, indent=1))
     figures.selection_figure(rows, run.folder / "selection.png", suite == reference.SUITE)
     first = rows[0]
-    metrics = {family: found.value for family, found in first.families.items()}
+    metrics = {family: interval.value for family, interval in first.families.items()}
     return metrics | {"macro": first.macro, "micro": first.micro.value}
 
 

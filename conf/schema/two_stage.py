@@ -13,7 +13,7 @@ from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import ImageServerConfig, ServerConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
 
-ROUTES = ("cot_text", "predict_caption", "predict_image", "predict_drawn")
+ROUTES = ("cot_text", "predict_caption", "predict_image", "predict_generated_image")
 
 
 @dataclass
@@ -48,9 +48,9 @@ class TwoStageCommand(CommandConfig):
     routes: list[str] | None = None
     """Routes to measure: cot_text (the future state in a rationale, matched to frames),
     predict_caption (a description of the future frame, matched to the same model's descriptions of
-    the database's frames), predict_image (that description, matched to frames) and predict_drawn
-    (an image that the image server generates from it, matched to frames). null uses cot_text for a
-    student, and the first three for a base."""
+    the database's frames), predict_image (that description, matched to frames) and
+    predict_generated_image (an image that the image server generates from it, matched to frames).
+    null uses cot_text for a student, and the first three for a base."""
     batch: int = 16
     """Queries or frames per forward pass of the writing model."""
     seed: int = 0
@@ -58,10 +58,13 @@ class TwoStageCommand(CommandConfig):
 
     def check(self) -> list[str]:
         problems = super().check() + check_minimum(self, "", {"batch": 1})
+        if "predict_drawn" in (self.routes or ()):
+            return [*problems, "routes: predict_drawn is now called predict_generated_image"]
         problems += check_choices("routes", self.routes, ROUTES)
-        if "predict_drawn" in (self.routes or ()) and not (self.images.urls and self.images.model):
+        generates = "predict_generated_image" in (self.routes or ())
+        if generates and not (self.images.urls and self.images.model):
             problems.append(
-                "routes: predict_drawn needs an image server: give "
+                "routes: predict_generated_image needs an image server: set "
                 "images.url=http://HOST:PORT/v1 and images.model=NAME"
             )
         return problems

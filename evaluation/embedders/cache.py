@@ -1,13 +1,13 @@
-"""Embeddings on disk, so that nothing is embedded twice by one model.
+"""Embeddings on disk, so that a model embeds each input once.
 
     store/<name>/embeddings/<kind>-<key>/
-        about.json          what all of them were made by and of; the key is its hash
-        00000.npy           some embeddings, (rows, entries) fp32
-        00000.json          whose they are, row by row, and the array's SHA-256; written last
+        about.json          the settings that all of them depend on; the key is their hash
+        00000.npy           a part: (rows, entries) fp32
+        00000.json          the names of its rows and its SHA-256; written last
         index/              approximate indexes over them
 
-Parts are written whole or not at all, so that a killed evaluation goes on with those it has. All of
-it can be deleted at any time.
+A part is written atomically, so that a killed evaluation resumes after the last one. All of it can
+be deleted at any time.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from data.store import hash_file, write_atomically
 log = logging.getLogger(__name__)
 
 ABOUT, NOTES = "about.json", "[0-9]*.json"
-KINDS = {"frame": "frames", "query": "queries", "text": "texts", "image": "images"}
-PART, SECONDS = 512, 30
-"""A file is written after so many embeddings, or so long: a kill costs no more. It is read at once,
-and ends with a batch, so that what goes on after a kill passes the model in the same batches."""
+PLURALS = {"frame": "frames", "query": "queries", "text": "texts", "image": "images"}
+PART_ROWS, PART_SECONDS = 512, 30
+"""A part is written after this many embeddings or seconds: a kill costs no more. It ends with a
+batch, so that a resumed evaluation has the same batches."""
 
-Thing = TypeVar("Thing")
+Input = TypeVar("Input")
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class Part:
 
 
 class EmbeddingCache:
-    """One model's embeddings of one kind of thing, by name."""
+    """One model's embeddings of one kind of input, by name."""
 
     def __init__(self, root: Path, kind: str, about: Mapping[str, Any]) -> None:
-        """`kind` is one of `KINDS`; `about` is everything that the embeddings depend on, as JSON
-        holds it."""
+        """`kind` is a key of `PLURALS`; `about` has all settings that the embeddings depend on, as
+        JSON."""
         self.kind, self.about = kind, dict(about)
         key = hashlib.sha256(json.dumps(self.about, sort_keys=True).encode()).hexdigest()[:16]
         self.folder = root / f"{kind}-{key}"
@@ -60,49 +60,47 @@ class EmbeddingCache:
         self._place: dict[str, tuple[int, int]] = {}
 
     def complete(
-        self, things: Mapping[str, Thing], embed: Callable[[list[Thing]], np.ndarray], batch: int
+        self, inputs: Mapping[str, Input], embed: Callable[[list[Input]], np.ndarray], batch: int
     ) -> None:
-        """Embed those of `things` that are not there yet, `batch` at a time, under a progress bar.
+        """Embed the `inputs` that the cache lacks, `batch` at a time.
 
         Args:
-            things: by name; they are embedded in this order.
-            embed: gives (things, entries) fp32; where it gives fewer entries for some than for
-                others, their rows are filled up with zeros.
+            inputs: By name, in the order in which they are embedded.
+            embed: Returns (inputs, entries) fp32; shorter rows are padded with zeros.
 
         Raises:
-            UserError: an embedding is not finite, or another process is filling the folder.
+            UserError: An embedding is non-finite, or another process fills the folder.
         """
         self._read()
-        if not self._missing(things):
+        if not self._missing(inputs):
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        busy = f"{self.folder} is being filled by another process; run this again when it is done"
+        busy = f"{self.folder} is in use by another process; run this again when it is done"
         with lock_folder(self.folder, busy):
-            # Another process may have filled it since.
-            self._clean(self._read())
+            # Another process may have completed it in the meantime.
+            self._delete_damaged(self._read())
             write_json(self.folder / ABOUT, self.about)
-            waiting = self._missing(things)
+            missing = self._missing(inputs)
             with tqdm(
-                total=len(things),
-                initial=len(things) - len(waiting),
-                desc=f"embedding {KINDS[self.kind]}",
+                total=len(inputs),
+                initial=len(inputs) - len(missing),
+                desc=f"embedding {PLURALS[self.kind]}",
                 unit=self.kind,
             ) as bar:
-                names, rows, begun = [], [], time.monotonic()
-                for some in batched(waiting, batch):
+                names, rows, began = [], [], time.monotonic()
+                for some in batched(missing, batch):
                     names += some
-                    rows.append(embed([things[name] for name in some]))
+                    rows.append(embed([inputs[name] for name in some]))
                     self._check_finite(rows[-1], some)
                     bar.update(len(some))
-                    if len(names) >= PART or time.monotonic() - begun > SECONDS:
-                        self._add(names, filled_up(rows))
-                        names, rows, begun = [], [], time.monotonic()
+                    if len(names) >= PART_ROWS or time.monotonic() - began > PART_SECONDS:
+                        self._write(names, pad_rows(rows))
+                        names, rows, began = [], [], time.monotonic()
                 if names:
-                    self._add(names, filled_up(rows))
+                    self._write(names, pad_rows(rows))
 
     def parts(self, names: Sequence[str]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """All embeddings of `names`, in no order, a file at a time: which of `names` they are, and
-        the rows (some, entries)."""
+        """Yield the embeddings of `names` one file at a time, as indices into `names` and rows."""
         wanted = {name: k for k, name in enumerate(names)}
         for number, part in enumerate(self._parts):
             rows = [
@@ -111,17 +109,17 @@ class EmbeddingCache:
                 if name in wanted and self._place[name] == (number, row)
             ]
             if rows:
-                numbers = np.array([wanted[part.names[row]] for row in rows])
-                yield numbers, np.load(part.path)[rows]
+                indices = np.array([wanted[part.names[row]] for row in rows])
+                yield indices, np.load(part.path)[rows]
 
     def rows(self, names: Sequence[str]) -> np.ndarray:
-        """(names, entries) in their order; a name may stand there twice."""
-        once = list(dict.fromkeys(names))
-        found = np.zeros((len(once), self.width), np.float32)
-        for numbers, rows in self.parts(once):
-            found[numbers, : rows.shape[1]] = rows
-        row_of = {name: k for k, name in enumerate(once)}
-        return found[[row_of[name] for name in names]]
+        """Return (names, entries) in the order of `names`, which may repeat."""
+        unique = list(dict.fromkeys(names))
+        embeddings = np.zeros((len(unique), self.width), np.float32)
+        for indices, rows in self.parts(unique):
+            embeddings[indices, : rows.shape[1]] = rows
+        row_of = {name: k for k, name in enumerate(unique)}
+        return embeddings[[row_of[name] for name in names]]
 
     @property
     def width(self) -> int:
@@ -132,24 +130,25 @@ class EmbeddingCache:
         return [name for name in names if name not in self._place]
 
     def _read(self) -> list[Path]:
-        """Find the parts that are there; the notes of those that are not whole."""
-        notes = sorted(self.folder.glob(NOTES))
-        parts = [_whole(note) for note in notes]
+        """Find the intact parts, and return the notes of the others."""
         self._parts, self._place = [], {}
-        for part in filter(None, parts):
-            self._know(part)
-        return [note for note, part in zip(notes, parts, strict=True) if part is None]
+        damaged = []
+        for note in sorted(self.folder.glob(NOTES)):
+            if part := _read_part(note):
+                self._add(part)
+            else:
+                damaged.append(note)
+        return damaged
 
-    def _know(self, part: Part) -> None:
+    def _add(self, part: Part) -> None:
         number = len(self._parts)
         self._parts.append(part)
         self._place |= {name: (number, row) for row, name in enumerate(part.names)}
 
-    def _clean(self, damaged: list[Path]) -> None:
-        """Delete what is damaged, which is told, and what a kill left."""
-        for note in damaged:
-            array = note.with_suffix(".npy")
-            log.warning("%s is damaged; its embeddings are made again", array)
+    def _delete_damaged(self, notes: list[Path]) -> None:
+        """Delete damaged parts, with a warning, and leftovers of a killed process."""
+        for note in notes:
+            log.warning("%s is damaged; embedding its rows again", note.with_suffix(".npy"))
             note.unlink()
         for array in self.folder.glob("*.npy"):
             if not array.with_suffix(".json").exists():
@@ -157,40 +156,41 @@ class EmbeddingCache:
         for leftover in self.folder.glob(".*.partial"):
             leftover.unlink()
 
-    def _add(self, names: list[str], rows: np.ndarray) -> None:
+    def _write(self, names: list[str], rows: np.ndarray) -> None:
         buffer = io.BytesIO()
         np.save(buffer, rows)
-        taken = [int(note.stem) for note in self.folder.glob(NOTES)]
-        array = self.folder / f"{max(taken, default=-1) + 1:05d}.npy"
+        numbers = [int(note.stem) for note in self.folder.glob(NOTES)]
+        array = self.folder / f"{max(numbers, default=-1) + 1:05d}.npy"
         write_atomically(array, buffer.getvalue())
         note = {"names": names, "sha256": hash_file(array)}
         write_atomically(array.with_suffix(".json"), json.dumps(note).encode())
-        self._know(Part(array, names))
+        self._add(Part(array, names))
 
     def _check_finite(self, rows: np.ndarray, names: list[str]) -> None:
-        bad = [
-            n for n, whole in zip(names, np.isfinite(rows).all(axis=1), strict=True) if not whole
-        ]
+        finite = np.isfinite(rows).all(axis=1)
+        bad = [name for name, is_finite in zip(names, finite, strict=True) if not is_finite]
         if bad:
-            more = f", and of {len(bad) - 1} more" if len(bad) > 1 else ""
+            more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
             raise UserError(
-                f"the embedding of {self.kind} {bad[0]}{more} is not finite (NaN or infinite): the "
-                "weights are broken or overflow; measure in train.precision=fp32, or train again "
-                "with a lower train.lr"
+                f"non-finite embedding (NaN or Inf) for {self.kind} {bad[0]}{more}: the weights "
+                "are broken or overflow; measure in train.precision=fp32, or train again with a "
+                "lower train.lr",
+                code="non-finite-embedding",
             )
 
 
-def filled_up(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Rows (some, entries) of several lengths below each other, zeros where some are shorter."""
-    longest = max(part.shape[1] for part in rows)
-    return np.concatenate([np.pad(r, ((0, 0), (0, longest - r.shape[1]))) for r in rows])
+def pad_rows(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Concatenate rows (some, entries) of several lengths, padded with zeros."""
+    longest = max(part.shape[1] for part in parts)
+    return np.concatenate([np.pad(r, ((0, 0), (0, longest - r.shape[1]))) for r in parts])
 
 
-def _whole(note: Path) -> Part | None:
-    """A part by its note; None where it is not whole."""
+def _read_part(note: Path) -> Part | None:
+    """Return the part of a note, or None if it is damaged."""
     array = note.with_suffix(".npy")
     try:
-        there = json.loads(note.read_text())
-        return Part(array, there["names"]) if hash_file(array) == there["sha256"] else None
+        content = json.loads(note.read_text())
+        is_intact = hash_file(array) == content["sha256"]
+        return Part(array, content["names"]) if is_intact else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -15,25 +15,25 @@ from models.loading import DTYPES, UNREADABLE, check_reachable, load_error, pin_
 from models.retriever.embedder import PROCESSING
 
 TEMPLATE = (
-    "{%- set told = namespace(media='', texts=[]) -%}"
+    "{%- set parts = namespace(media='', texts=[]) -%}"
     "{%- for message in messages -%}"
-    "{%- if message.content is string -%}{%- set told.texts = told.texts + [message.content] -%}"
+    "{%- if message.content is string -%}{%- set parts.texts = parts.texts + [message.content] -%}"
     "{%- else -%}{%- for part in message.content -%}"
-    "{%- if part.type == 'text' -%}{%- set told.texts = told.texts + [part.text] -%}"
-    "{%- else -%}{%- set told.media = told.media + '<|' + part.type + '_pad|> ' -%}{%- endif -%}"
+    "{%- if part.type == 'text' -%}{%- set parts.texts = parts.texts + [part.text] -%}"
+    "{%- else -%}{%- set parts.media = parts.media + '<|' + part.type + '_pad|> ' -%}{%- endif -%}"
     "{%- endfor -%}{%- endif -%}"
     "{%- endfor -%}"
-    "{{ told.media + told.texts | join(' ') }}"
+    "{{ parts.media + parts.texts | join(' ') }}"
 )
-"""As the model was trained: no roles; the medium bare, the instruction, the text."""
+"""The training format: no roles; the medium's bare token, the instruction, the text."""
 
 
 def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer:
-    """The last token's state, normalised, is the embedding.
+    """Load VLM2Vec; an embedding is the normalised state of the last token.
 
     Raises:
-        UserError: the model or its base is not on this machine and cannot be fetched, is no
-            Qwen2-VL, lacks a part, or has a processor of another model.
+        UserError: The model or its base cannot be loaded, is not a Qwen2-VL, is incomplete, or has
+            the processor of another model.
     """
     check_reachable("retriever", preset.model)
     origin = {"revision": preset.revision, "trust_remote_code": preset.trust_remote_code}
@@ -50,23 +50,26 @@ def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer
     config = backbone.model.config
     if config.model_type != "qwen2_vl":
         raise UserError(
-            f"retriever.model={preset.model} ({config.model_type}) is no VLM2Vec over Qwen2-VL: "
-            "give VLM2Vec/VLM2Vec-V2.0, or another retriever.encoder"
+            f"retriever.model={preset.model} ({config.model_type}) is not a VLM2Vec over Qwen2-VL: "
+            "set VLM2Vec/VLM2Vec-V2.0, or another retriever.encoder",
+            code="wrong-model-type",
         )
     check_processor("retriever", preset.model, config, backbone.processor)
     pin_sizes(backbone.processor, preset.image_size, preset.frames)
     backbone.processor.chat_template = TEMPLATE
     backbone.processor.tokenizer.padding_side = "left"
-    backbone.register_forward_pre_hook(flat_positions)
+    backbone.register_forward_pre_hook(use_text_positions)
     pooling = Pooling(backbone.get_embedding_dimension(), pooling_mode="lasttoken")
     device = "cuda" if torch.cuda.is_available() else "cpu"
     return SentenceTransformer(modules=[backbone, pooling, Normalize()], device=device)
 
 
-def flat_positions(module: Any, given: tuple[dict[str, Any]]) -> None:
-    """Before the transformer, as a hook of its forward: positions count on through a medium as
-    through text. A medium without its start token had no places of its own when the model was
-    trained; newer versions of transformers would give it some."""
-    (features,) = given
+def use_text_positions(module: Any, args: tuple[dict[str, Any]]) -> None:
+    """A forward pre-hook that numbers a medium's positions like those of text.
+
+    The model was trained without a medium's start token, and so without spatial positions; newer
+    versions of transformers would assign some.
+    """
+    (features,) = args
     if "mm_token_type_ids" in features:
         features["mm_token_type_ids"] = torch.zeros_like(features["mm_token_type_ids"])

@@ -1,25 +1,90 @@
-"""A model that answers on this machine, a batch of what it is asked at a time."""
+"""A model that is loaded on this machine and responds in batches."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 from torch import nn
 from transformers import ProcessorMixin
 from xgrammar.contrib.hf import LogitsProcessor
 
-from conf.schema import StudentConfig
-from evaluation.generators.constrained_decoding import record_grammar
+from conf.schema import SelectCommand, StudentConfig, TwoStageCommand
+from evaluation.generators.constrained_decoding import compile_record_grammar
 from evaluation.generators.response_log import SaveResponses, Subject, response_seed
+from models import loading
+from models.compat import keep_freed_memory
+from models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
 from models.memory import explain_out_of_memory
+from models.resolved import check_base
 from models.student.collator import Collator
 from models.student.generation import THOUGHT, generate, response_token_limit
 from models.student.prompts import Sample
 from models.student.token_sampling import sampling_processors
+from models.trained_runs import product_folder, run_title
 
 
-def say(
+class LocalModel:
+    """A generator: the student of a run or an export in `folder`, or the base without a folder.
+
+    The model is loaded at the first response, so that a run whose responses are all in its log
+    needs no memory for it.
+    """
+
+    def __init__(
+        self,
+        cfg: SelectCommand | TwoStageCommand,
+        folder: Path | None,
+        student: StudentConfig,
+        precision: str,
+    ) -> None:
+        """
+        Raises:
+            UserError: The student's base is not the one that it was trained on.
+        """
+        if folder is None:
+            student, self._weights = pin_revisions(student), None
+        else:
+            check_base(folder, student)
+            self._weights = product_folder(folder, "student")
+        self._student, self._precision = student, precision
+        self._batch, self._seed = cfg.batch, cfg.seed
+        self.name = run_title(folder) if folder else f"{student.name} base"
+        self.revision: dict[str, Any] = {
+            "weights": weights_digest(model_id(student), self._weights),
+            "processor": processor_digest(self._weights or model_id(student)),
+            "revision": student.revision,
+            "quantization": student.quantization,
+            "precision": precision,
+        }
+        if student.architecture is not None and folder is None:
+            self.revision["architecture"] = asdict(student.architecture)
+
+    @cached_property
+    def _loaded(self) -> tuple[nn.Module, ProcessorMixin]:
+        keep_freed_memory()
+        if self._weights is not None:
+            return loading.load_trained(self._student, self._precision, self._weights)
+        model, processor = loading.load_base(self._student, self._precision, list)
+        return loading.for_inference(model), processor
+
+    def respond(
+        self,
+        mode: str,
+        sample_of: Callable[[Subject], Sample],
+        subjects: list[Subject],
+        save: SaveResponses,
+    ) -> None:
+        generate_responses(
+            *self._loaded, self._student, self._precision, self._batch, self._seed,
+            mode, sample_of, subjects, save,
+        )  # fmt: skip
+
+
+def generate_responses(
     model: nn.Module,
     processor: ProcessorMixin,
     cfg: StudentConfig,
@@ -28,29 +93,31 @@ def say(
     seed: int,
     mode: str,
     sample_of: Callable[[Subject], Sample],
-    things: list[Subject],
-    keep: SaveResponses,
+    subjects: list[Subject],
+    save: SaveResponses,
 ) -> None:
-    """Have a model answer in `mode`, as `sample_of` shows and asks each; in constrained mode it can
-    write nothing but a record.
+    """Generate a response to each subject, `batch` at a time.
+
+    In constrained mode the tokens are restricted to those of a valid record.
 
     Raises:
-        UserError: memory runs out.
+        UserError: Memory runs out.
     """
     collator = Collator(processor, cfg.max_length, cfg.thinking)
     limit = response_token_limit(mode, cfg.max_new_tokens, cfg.thinking)
-    grammar = record_grammar(model, processor) if mode == "constrained" else None
-    for start in range(0, len(things), batch):
-        group = things[start : start + batch]
-        steps = sampling_processors(cfg, [response_seed(seed, thing, mode) for thing in group])
+    grammar = compile_record_grammar(model, processor) if mode == "constrained" else None
+    for start in range(0, len(subjects), batch):
+        group = subjects[start : start + batch]
+        processors = sampling_processors(cfg, [response_seed(seed, s, mode) for s in group])
         if grammar is not None:
-            # Before tokens are drawn from what is left.
-            steps.insert(0, LogitsProcessor(grammar))
-        inputs = collator([sample_of(thing) for thing in group])
-        when = f"where {len(group)} items are answered at once"
-        with explain_out_of_memory(when, "lower batch, in a run of its own (run=NAME)"):
-            written = generate(model, processor, inputs, limit, precision, steps)
+            # The grammar comes first, so that tokens are sampled from those that it allows.
+            processors.insert(0, LogitsProcessor(grammar))
+        inputs = collator([sample_of(subject) for subject in group])
+        with explain_out_of_memory(
+            f"with {len(group)} items in a batch", "lower batch, in a separate run (run=NAME)"
+        ):
+            texts = generate(model, processor, inputs, limit, precision, processors)
         if grammar is not None:
-            # What is held to a record from its first token on has no thought.
-            written = [replace(w, text=w.text.removeprefix(THOUGHT)) for w in written]
-        keep(list(zip(group, written, strict=True)))
+            # A response that is a record from its first token on holds no thought.
+            texts = [replace(t, text=t.text.removeprefix(THOUGHT)) for t in texts]
+        save(list(zip(group, texts, strict=True)))

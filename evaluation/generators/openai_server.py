@@ -1,13 +1,15 @@
-"""A model that answers on servers, which are asked with its frames."""
+"""A model on OpenAI-compatible servers, prompted with frames over HTTP."""
 
 from __future__ import annotations
 
 import asyncio
 import base64
 import io
+import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,11 +17,13 @@ import openai
 from PIL import Image
 
 from conf.errors import UserError
-from conf.schema import ServerConfig, StudentConfig
+from conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageCommand
 from evaluation.generators.response_log import SaveResponses, Subject, response_seed
 from evaluation.generators.response_schema import schema
+from models.fingerprints import processor_digest, weights_digest
 from models.student.generation import THOUGHT, GeneratedText, response_token_limit
 from models.student.prompts import Clip, Sample
+from models.trained_runs import product_folder, run_title
 from teacher.servers.concurrency import run_limited
 from teacher.servers.pool import NoResponseError, ServerPool
 from teacher.servers.responses import TRUNCATED, Response
@@ -31,96 +35,172 @@ from teacher.servers.server import (
     get_api_key,
 )
 
-ANY_SIZE = 1
-"""Pixels that an image has at least; none is enlarged."""
-BLANK = 64
-"""Edge in px of the frames of a canary."""
+log = logging.getLogger(__name__)
+
+MIN_PIXELS = 1
+"""Lower bound of an image's pixels; no image is enlarged."""
+CANARY_SIZE = 64
+"""Edge in px of the blank frames of a canary request."""
 
 
-async def say(
+class ServedModel:
+    """A generator on servers: the student of a run or an export in `folder`, or a base."""
+
+    def __init__(
+        self, cfg: SelectCommand | TwoStageCommand, folder: Path | None, student: StudentConfig
+    ) -> None:
+        """
+        Raises:
+            UserError: No server responds, or `server.model` is not the model that `cfg` selects.
+        """
+        if folder is not None and cfg.server.model is None:
+            raise UserError(
+                f"model={folder} is measured at server.url: set server.model=NAME to the server's "
+                "name of that student, so that the responses are not those of its base",
+                code="missing-server-model",
+            )
+        self._student, self._seed = student, cfg.seed
+        self._server = replace(cfg.server, model=cfg.server.model or student.model)
+        self.name = run_title(folder) if folder else f"{student.name} base"
+        origin = served_origin(self._server)
+        self._check_adapter(folder, origin["parent"])
+        weights = product_folder(folder, "student") if folder else None
+        source = origin["parent"] or origin["root"]
+        if source is None or not Path(source).is_dir():
+            log.info(
+                "the server identifies %s only by name (%s): when that name gets other weights, "
+                "set student.revision=COMMIT, or the earlier responses are reused",
+                self._server.model,
+                source,
+            )
+        self.revision: dict[str, Any] = {
+            "served": self._server.model,
+            **origin,
+            "revision": student.revision,
+            "weights": weights_digest(origin["root"], origin["parent"], weights),
+            "processor": processor_digest(source),
+        }
+
+    def _check_adapter(self, folder: Path | None, parent: str | None) -> None:
+        if folder is None and parent:
+            raise UserError(
+                f"server.model={self._server.model} is an adapter over {parent}: set model=RUN, "
+                "the run that trained it, so that it gets the prompt that it was trained on",
+                code="adapter-without-run",
+            )
+        if folder is not None and parent and self._student.quantization == "nf4":
+            log.warning(
+                "%s serves the adapters of %s over an unquantised base, but they were trained over "
+                "NF4: its responses differ from those of the student and of its merged export "
+                "(python -m train.export)",
+                self._server.model,
+                folder,
+            )
+
+    def respond(
+        self,
+        mode: str,
+        sample_of: Callable[[Subject], Sample],
+        subjects: list[Subject],
+        save: SaveResponses,
+    ) -> None:
+        asyncio.run(
+            generate_responses(
+                self._server, self._student, self._seed, mode, sample_of, subjects, save
+            )
+        )
+
+
+async def generate_responses(
     server: ServerConfig,
     cfg: StudentConfig,
     seed: int,
     mode: str,
     sample_of: Callable[[Subject], Sample],
-    things: list[Subject],
-    keep: SaveResponses,
+    subjects: list[Subject],
+    save: SaveResponses,
 ) -> None:
-    """Have a served model answer in `mode`, as `sample_of` shows and asks each.
+    """Generate a response to each subject, `server.concurrency` at a time.
 
     Raises:
-        UserError: no server can be asked, does not take a clip and images, or has no answer to
-            one though it answers others.
+        UserError: No server responds, a server does not accept a clip and images, or a single
+            subject has no response.
     """
     loop = asyncio.get_running_loop()
-    # What is held to a record from its first token on has no thought.
+    # A response that is a record from its first token on holds no thought.
     opened = cfg.thinking and mode != "constrained"
-    # Frames are kept in one cache, which takes one thread at a time.
-    with ThreadPoolExecutor(1) as desk:
-        first = await loop.run_in_executor(desk, sample_of, things[0])
-        request = request_of(cfg, mode, first.clip)
-        async with ServerPool(server, request, chat_of(blank(first))) as client:
+    # The frame cache is not thread-safe, so one thread prepares all samples.
+    with ThreadPoolExecutor(1) as preparer:
 
-            async def ask(thing: Subject) -> None:
-                chat, clip = await loop.run_in_executor(desk, _shown, sample_of, thing)
-                own = request_of(cfg, mode, clip)
+        def messages_of(subject: Subject) -> tuple[Messages, Clip | None]:
+            sample = sample_of(subject)
+            return build_messages(sample), sample.clip
+
+        first = await loop.run_in_executor(preparer, sample_of, subjects[0])
+        request = request_fields(cfg, mode, first.clip)
+        async with ServerPool(server, request, build_messages(blank_sample(first))) as pool:
+
+            async def respond(subject: Subject) -> None:
+                messages, clip = await loop.run_in_executor(preparer, messages_of, subject)
+                fields = request_fields(cfg, mode, clip)
                 if cfg.temperature:
-                    own["seed"] = response_seed(seed, thing, mode)
+                    fields["seed"] = response_seed(seed, subject, mode)
                 try:
-                    [reply] = await client.complete(chat, **own)
-                except NoResponseError as fault:
+                    [response] = await pool.complete(messages, **fields)
+                except NoResponseError as error:
                     raise UserError(
-                        f"{server.model} has no answer about {thing.name} ({fault}); once that is "
-                        "mended, run the same command again, it goes on with what is answered"
-                    ) from fault
-                keep([(thing, written(reply, opened))])
+                        f"{server.model} has no response to {subject.name} ({error}): correct "
+                        "that and run the same command again; it resumes after the responses in "
+                        "its log",
+                        code="no-response",
+                    ) from error
+                save([(subject, restore_thought(response, opened))])
 
-            await run_limited(things, server.concurrency, ask)
-
-
-def _shown(sample_of: Callable[[Subject], Sample], thing: Subject) -> tuple[Messages, Clip | None]:
-    sample = sample_of(thing)
-    return chat_of(sample), sample.clip
+            await run_limited(subjects, server.concurrency, respond)
 
 
-def chat_of(sample: Sample) -> Messages:
-    """A conversation in the API's form, its frames as PNGs within it. A clip is vLLM's sequence of
-    images, whose times go with the request."""
-    pictures = iter(sample.images)
+def build_messages(sample: Sample) -> Messages:
+    """Return a sample as messages of the API, with its frames as embedded PNGs.
+
+    A clip becomes vLLM's sequence of images; its timestamps go into the request.
+    """
+    images = iter(sample.images)
     parts: list[dict[str, Any]] = []
     for part in sample.content:
         if part["type"] == "text":
             parts.append(part)
         elif part["type"] == "image":
-            url = f"data:image/png;base64,{_png(next(pictures))}"
+            url = f"data:image/png;base64,{_encode_png(next(images))}"
             parts.append({"type": "image_url", "image_url": {"url": url}})
         else:
-            frames = ",".join(map(_png, sample.clip.pixels))
+            frames = ",".join(map(_encode_png, sample.clip.pixels))
             url = f"data:video/jpeg;base64,{frames}"
             parts.append({"type": "video_url", "video_url": {"url": url}})
     return [{"role": "user", "content": parts}]
 
 
-def _png(pixels: np.ndarray) -> str:
+def _encode_png(pixels: np.ndarray) -> str:
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG", compress_level=1)
     return base64.b64encode(buffer.getvalue()).decode()
 
 
-def blank(sample: Sample) -> Sample:
-    """A sample of the same form that shows nothing."""
-    empty = np.zeros((BLANK, BLANK, 3), np.uint8)
-    clip = sample.clip and replace(sample.clip, pixels=np.stack([empty] * len(sample.clip.indices)))
-    return replace(sample, clip=clip, images=[empty] * len(sample.images))
+def blank_sample(sample: Sample) -> Sample:
+    """Return a sample of the same form with blank frames."""
+    blank = np.zeros((CANARY_SIZE, CANARY_SIZE, 3), np.uint8)
+    clip = sample.clip and replace(sample.clip, pixels=np.stack([blank] * len(sample.clip.indices)))
+    return replace(sample, clip=clip, images=[blank] * len(sample.images))
 
 
-def request_of(cfg: StudentConfig, mode: str, clip: Clip | None) -> RequestFields:
-    """What goes with a chat: how tokens are drawn, what may be written, and that frames are neither
-    sampled again nor shrunk, as where a model is loaded here."""
+def request_fields(cfg: StudentConfig, mode: str, clip: Clip | None) -> RequestFields:
+    """Return the fields of a request besides its messages: sampling, schema and preprocessing.
+
+    Frames are neither sampled again nor resized, as with a local model.
+    """
     area = cfg.image_size**2
-    # Twice the pixels there are, as where a model is loaded here: no budget shrinks a frame.
-    images = {"size": {"shortest_edge": ANY_SIZE, "longest_edge": 2 * area}}
-    videos = {"size": {"shortest_edge": ANY_SIZE, "longest_edge": 2 * cfg.frames * area}}
+    # Twice the actual pixels, as with a local model: no budget shrinks a frame.
+    images = {"size": {"shortest_edge": MIN_PIXELS, "longest_edge": 2 * area}}
+    videos = {"size": {"shortest_edge": MIN_PIXELS, "longest_edge": 2 * cfg.frames * area}}
     extra: dict[str, Any] = {
         "chat_template_kwargs": {"enable_thinking": cfg.thinking},
         "mm_processor_kwargs": {
@@ -131,7 +211,7 @@ def request_of(cfg: StudentConfig, mode: str, clip: Clip | None) -> RequestField
     if clip:
         extra["media_io_kwargs"] = {"video": {"num_frames": -1, **clip.metadata}}
     if cfg.temperature:
-        # Left out, a server takes the bound of the model's own generation_config.json.
+        # Without top_k a server uses that of the model's generation_config.json.
         extra["top_k"] = cfg.top_k or -1
     request = {
         "temperature": cfg.temperature,
@@ -140,31 +220,34 @@ def request_of(cfg: StudentConfig, mode: str, clip: Clip | None) -> RequestField
         "extra_body": extra,
     }
     if mode == "constrained":
-        held = {"name": "record", "strict": True, "schema": schema()}
-        request["response_format"] = {"type": "json_schema", "json_schema": held}
+        record = {"name": "record", "strict": True, "schema": schema()}
+        request["response_format"] = {"type": "json_schema", "json_schema": record}
     return request
 
 
-def written(reply: Response, opened: bool) -> GeneratedText:
-    """What a server's model wrote, its thought within the text. A thought that the prompt has
-    `opened`, or that the server has taken out, is opened again."""
-    text = reply.text
-    if reply.reasoning:
-        text = f"{THOUGHT}{reply.reasoning}" + (f"</think>{text}" if text else "")
+def restore_thought(response: Response, opened: bool) -> GeneratedText:
+    """Return a response's text with its thought inside `<think>` tags.
+
+    Args:
+        opened: Whether the prompt ends with `<think>`, so that the response lacks it. A server's
+            reasoning parser removes it as well.
+    """
+    text = response.text
+    if response.reasoning:
+        text = f"{THOUGHT}{response.reasoning}" + (f"</think>{text}" if text else "")
     elif opened and THOUGHT not in text:
         text = f"{THOUGHT}{text}"
-    return GeneratedText(text, reply.flaw == TRUNCATED)
+    return GeneratedText(text, response.flaw == TRUNCATED)
 
 
-def revision(server: ServerConfig) -> dict[str, Any]:
-    """What the servers that answer tell of `server.model`: the `root` that it was loaded from, and
-    that of the `parent` that it is an adapter of.
+def served_origin(server: ServerConfig) -> dict[str, str | None]:
+    """Ask the servers for the `root` path of `server.model` and of the `parent` that it adapts.
 
     Raises:
-        UserError: none answers, or one does not serve the model or accept the key, or two have
-            another one by that name.
+        UserError: No server responds, one lacks the model or rejects the key, or two serve
+            different models by this name.
     """
-    problems, told = [], {}
+    problems, origins = [], {}
     for url in server.urls:
         try:
             with openai.OpenAI(
@@ -178,26 +261,28 @@ def revision(server: ServerConfig) -> dict[str, Any]:
             continue
         if server.model not in models:
             raise UserError(
-                f"{url} does not serve server.model={server.model}; it has {', '.join(models)}"
+                f"{url} does not serve server.model={server.model}; it serves {', '.join(models)}",
+                code="unknown-model",
             )
-        own = models[server.model]
-        parent = models.get(own.get("parent"), {}).get("root")
-        told[url] = {"root": own.get("root"), "parent": parent}
-    if not told:
+        served = models[server.model]
+        parent = models.get(served.get("parent"), {}).get("root")
+        origins[url] = {"root": served.get("root"), "parent": parent}
+    if not origins:
         raise UserError(
-            f"no server of server.url can be asked ({'; '.join(problems)}): start one, such as "
-            "with python -m teacher.serve frames=true, and run this again"
+            f"no server of server.url responds ({'; '.join(problems)}): start one, such as with "
+            "python -m teacher.serve frames=true, and run this again",
+            code="no-server",
         )
-    first, *others = told
-    for url in others:
-        if told[url] != told[first]:
+    (url, origin), *others = origins.items()
+    for other_url, other in others:
+        if other != origin:
             raise UserError(
-                f"server.url: by the name {server.model} {first} has {_loaded(told[first])} and "
-                f"{url} {_loaded(told[url])}: give servers of one model"
+                f"server.url: the name {server.model} is {_describe(origin)} at {url} and "
+                f"{_describe(other)} at {other_url}: list servers of one model",
+                code="different-models",
             )
-    return told[first]
+    return origin
 
 
-def _loaded(told: dict[str, Any]) -> str:
-    over = f" over {told['parent']}" if told["parent"] else ""
-    return f"{told['root']}{over}"
+def _describe(origin: dict[str, str | None]) -> str:
+    return f"{origin['root']} over {origin['parent']}" if origin["parent"] else f"{origin['root']}"

@@ -1,5 +1,4 @@
-"""Ask a model for its answers, and keep every one: an append-only file that a killed evaluation
-goes on from."""
+"""Collect a model's responses in an append-only file, from which a killed evaluation resumes."""
 
 from __future__ import annotations
 
@@ -19,21 +18,26 @@ from models.student.answer_parser import parse_choice
 from models.student.generation import GeneratedText
 
 Subject = SelectionItem | RetrievalQuery | FrameRef
-"""What a model is asked about."""
+"""What a response is about."""
 SaveResponses = Callable[[list[tuple[Subject, GeneratedText]]], None]
-"""Takes what was said to some things as soon as it is there."""
+"""Saves the responses of a batch as soon as it is finished."""
 Respond = Callable[[list[Subject], SaveResponses], None]
-"""Has a model answer and keeps what it says."""
+"""Generates and saves the responses to subjects."""
 
 RECORD_MODES = ("record", "constrained")
-"""Modes in which the structured record is asked for."""
+"""Modes that request the structured record."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a model said to one item in one mode. `letter` is None where no choice could be read,
-    and `reason` then says why; `valid` is whether the structured record is as it was asked for,
-    None where none was; `cut` whether the model was stopped before its end."""
+    """A response to an item in a mode.
+
+    Attributes:
+        letter: The chosen letter; None if the response cannot be parsed.
+        reason: Why the letter is None.
+        valid: Whether the structured record is valid; None in modes without a record.
+        cut: Whether generation stopped at the token limit.
+    """
 
     item_id: str
     mode: str
@@ -46,13 +50,13 @@ class Answer:
 
     @property
     def record(self) -> Record | None:
-        """The structured record, where it is valid."""
+        """The structured record, if it is valid."""
         return read_record(self.text) if self.valid else None
 
 
 @dataclass(frozen=True)
 class FreeTextResponse:
-    """What a model said where no letter is asked for, about the query or frame of that name."""
+    """A response without a letter, to the query or frame named `item_id`."""
 
     item_id: str
     mode: str
@@ -63,119 +67,125 @@ class FreeTextResponse:
 Response = Answer | FreeTextResponse
 
 
-def score_response(item: SelectionItem, mode: str, written: GeneratedText) -> Answer:
-    """What a text says to an item, and whether that is right."""
-    choice = parse_choice(written.text, cut=written.cut)
-    valid = read_record(written.text) is not None if mode in RECORD_MODES else None
+def score_response(item: SelectionItem, mode: str, generated: GeneratedText) -> Answer:
+    """Parse a response to an item and compare its letter with the item's."""
+    answer = parse_choice(generated.text, cut=generated.cut)
     return Answer(
         item.item_id,
         mode,
-        written.text,
-        choice.letter,
-        str(choice.reason) if choice.letter is None and choice.reason else None,
-        choice.letter == item.letter,
-        valid,
-        written.cut,
+        generated.text,
+        answer.letter,
+        str(answer.reason) if answer.letter is None and answer.reason else None,
+        right=answer.letter == item.letter,
+        valid=read_record(generated.text) is not None if mode in RECORD_MODES else None,
+        cut=generated.cut,
     )
 
 
-def free_text_response(thing: Subject, mode: str, written: GeneratedText) -> FreeTextResponse:
-    """A text as it was written, which nothing judges."""
-    return FreeTextResponse(thing.name, mode, written.text, written.cut)
+def free_text_response(subject: Subject, mode: str, generated: GeneratedText) -> FreeTextResponse:
+    return FreeTextResponse(subject.name, mode, generated.text, generated.cut)
 
 
 class ResponseLog:
-    """The answers in a file, one JSON line each, by what they are answers to.
+    """Responses in a file, one JSON line each, under keys of the settings that they depend on.
 
-    `asked` says it of each mode, in plain values: the model's revision, the items, the prompt, how
-    tokens are drawn, the seed. A line of its own tells it once, under a key that the answers bear.
-    Answers under other keys stay in the file and are no answers to these. Only what was said is
-    taken from a line; what it says and whether that is right is `judged` again.
+    `settings` has these by mode, as JSON: the model's revision, the benchmark, the prompt, the
+    sampling, the seed. A line of the file records them once, with their key. Responses under other
+    keys stay in the file and are not used. Only a response's text is read back; it is parsed and
+    scored again.
     """
 
     def __init__(
         self,
         path: Path,
-        asked: dict[str, dict[str, Any]],
-        things: Sequence[Subject],
-        judged: Callable[[Subject, str, GeneratedText], Response] = score_response,
+        settings: dict[str, dict[str, Any]],
+        subjects: Sequence[Subject],
+        score: Callable[[Subject, str, GeneratedText], Response] = score_response,
     ) -> None:
         self._path = path
-        self.keys = {mode: _key(mode, what) for mode, what in asked.items()}
-        self.judged = judged
-        self._thing_of = {thing.name: thing for thing in things}
-        read = self._read(path)
-        self.answers = {(a.item_id, a.mode): a for a, _ in read if a}
-        told = {row.get("key") for _, row in read if "asked" in row}
+        self.keys = {mode: _key(mode, of_mode) for mode, of_mode in settings.items()}
+        self.score = score
+        self._subject_of = {subject.name: subject for subject in subjects}
+        rows = _read_rows(path)
+        self.answers = self._answers(rows)
+        recorded = {row.get("key") for row in rows if "asked" in row}
         heads = [
-            json.dumps({"key": key, "mode": mode, "asked": asked[mode]})
+            {"key": key, "mode": mode, "asked": settings[mode]}
             for mode, key in self.keys.items()
-            if key not in told
+            if key not in recorded
         ]
-        # What a kill tore in the midst of a line ends there.
+        # A kill may have left an incomplete last line: end it.
         torn = path.exists() and path.read_bytes()[-1:] not in (b"", b"\n")
-        self._write([*([""] if torn else []), *heads])
+        self._write([*([""] if torn else []), *map(json.dumps, heads)])
 
     def take_over(self, others: Iterable[Path]) -> int:
-        """Keep also what other files hold of answers to the same, which are not asked again; how
-        many these are."""
+        """Add other files' responses under the same keys; return their number."""
         before = len(self.answers)
         for path in others:
-            found = [answer for answer, _ in self._read(path) if answer]
-            self.append([a for a in found if (a.item_id, a.mode) not in self.answers])
+            found = self._answers(_read_rows(path))
+            self.append([answer for key, answer in found.items() if key not in self.answers])
         return len(self.answers) - before
 
-    def _read(self, path: Path) -> list[tuple[Response | None, dict[str, Any]]]:
-        """The objects in a file's lines, each with the answer where it is one to what is asked.
-        What a kill tore is left out: that is asked again."""
-        found = []
-        for line in path.read_bytes().splitlines() if path.exists() else []:
+    def _answers(self, rows: list[dict[str, Any]]) -> dict[tuple[str, str], Response]:
+        """Score the rows under this log's keys; damaged ones are left out and generated again."""
+        answers = {}
+        for row in rows:
             try:
-                row, answer = json.loads(line), None
-                thing = None if "asked" in row else self._thing_of.get(row["item_id"])
-                if thing and self._bears_key(row):
-                    answer = self.judged(thing, row["mode"], GeneratedText(row["text"], row["cut"]))
-                found.append((answer, row))
+                name, mode = row["item_id"], row["mode"]
+                if name in self._subject_of and row["key"] == self.keys.get(mode, ""):
+                    generated = GeneratedText(row["text"], row["cut"])
+                    answers[name, mode] = self.score(self._subject_of[name], mode, generated)
             except (ValueError, TypeError, KeyError, AttributeError):
                 continue
-        return found
-
-    def _bears_key(self, row: dict[str, Any]) -> bool:
-        return row["mode"] in self.keys and row["key"] == self.keys[row["mode"]]
+        return answers
 
     def append(self, answers: list[Response]) -> None:
         self._write([json.dumps({**asdict(a), "key": self.keys[a.mode]}) for a in answers])
         self.answers |= {(a.item_id, a.mode): a for a in answers}
 
     def _write(self, lines: list[str]) -> None:
-        """Add lines, which no failure of the machine takes away again."""
+        """Append lines durably: they survive a crash of the machine."""
         with open(self._path, "a", encoding="utf-8") as file:
             file.writelines(f"{line}\n" for line in lines)
             file.flush()
             os.fsync(file.fileno())
 
 
-def _key(mode: str, asked: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps([mode, asked], sort_keys=True).encode()).hexdigest()[:16]
+def _read_rows(path: Path) -> list[dict[str, Any]]:
+    """Read the JSON objects of a file, without lines that a kill cut off."""
+    rows = []
+    for line in path.read_bytes().splitlines() if path.exists() else []:
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(row, dict):
+            rows.append(row)
+    return rows
+
+
+def _key(mode: str, settings: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps([mode, settings], sort_keys=True).encode()).hexdigest()[:16]
 
 
 def collect_responses(
-    things: Sequence[Subject], mode: str, say: Respond, log: ResponseLog, unit: str = "item"
+    subjects: Sequence[Subject], mode: str, respond: Respond, log: ResponseLog, unit: str = "item"
 ) -> list[Response]:
-    """What is said to each in `mode`; what the log holds is not asked."""
-    waiting = [t for t in things if (t.name, mode) not in log.answers]
-    with tqdm(total=len(things), initial=len(things) - len(waiting), desc=mode, unit=unit) as bar:
+    """Return the response to each subject in `mode`, and generate those that the log lacks."""
+    missing = [s for s in subjects if (s.name, mode) not in log.answers]
+    done = len(subjects) - len(missing)
+    with tqdm(total=len(subjects), initial=done, desc=mode, unit=unit) as bar:
 
-        def keep(said: list[tuple[Subject, GeneratedText]]) -> None:
-            log.append([log.judged(thing, mode, written) for thing, written in said])
-            bar.update(len(said))
+        def save(responses: list[tuple[Subject, GeneratedText]]) -> None:
+            log.append([log.score(subject, mode, generated) for subject, generated in responses])
+            bar.update(len(responses))
 
-        if waiting:
-            say(waiting, keep)
-    return [log.answers[t.name, mode] for t in things]
+        if missing:
+            respond(missing, save)
+    return [log.answers[s.name, mode] for s in subjects]
 
 
-def response_seed(seed: int, thing: Subject, mode: str) -> int:
-    """The seed (32 bits) of the answer that is drawn for a thing in a mode."""
-    digest = hashlib.sha256(f"{seed} {mode} {thing.name}".encode()).digest()
+def response_seed(seed: int, subject: Subject, mode: str) -> int:
+    """Return the 32-bit sampling seed of a response, independent of the batch that it is in."""
+    digest = hashlib.sha256(f"{seed} {mode} {subject.name}".encode()).digest()
     return int.from_bytes(digest[:4], "big")

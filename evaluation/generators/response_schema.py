@@ -1,7 +1,6 @@
-"""The structured record that a model is asked for, and how what it says is read.
+"""The structured record of a response: its prompt, its JSON schema, and how it is read.
 
-Only the record's forced choice is scored. The other fields let a refusal, a hedge or a tie be seen
-that a bare letter would hide.
+Only the forced choice is scored. The other fields reveal refusals, hedges and ties.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ from data.records import LETTERS
 from models.student.answer_parser import parse_choice
 
 AMBIGUITY = ("none", "some", "high")
-"""How hard the candidates are to tell apart."""
+"""How hard the candidates are to distinguish."""
 SHORT, LONG = 200, 400
-"""Characters that the schema gives a candidate's rationale and the justification, so that a record
-ends within the 512 tokens of an answer."""
+"""Maximum characters of a candidate's rationale and of the justification: a record fits in the 512
+new tokens of a response."""
 FIELDS = {
     "forced_choice": "the letter of the one candidate that you choose, however unsure you are",
     "confidence": "how sure you are that it is right, a number from 0 to 1",
@@ -30,13 +29,15 @@ FIELDS = {
     "rationales": "an object that gives each of the letters one short sentence for or against it",
     "justification": "one or two sentences on why you choose as you do",
 }
-"""What is asked for, in the order in which it is to be written."""
+"""Fields and their instructions, in the order of the record."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """A valid record. `confidence` and the probabilities lie between 0 and 1; nothing holds the
-    probabilities to a sum of 1."""
+    """A valid record.
+
+    `confidence` and the probabilities are from 0 to 1; the probabilities need not sum to 1.
+    """
 
     forced_choice: str
     confidence: float
@@ -48,7 +49,7 @@ class Record:
 
 
 def instruction() -> str:
-    """What a model is told to write."""
+    """Return the instruction of the record modes."""
     fields = "\n".join(f'"{name}": {meaning}' for name, meaning in FIELDS.items())
     return (
         f"Reply with one JSON object and nothing else. It has these keys, in this order:\n{fields}"
@@ -56,8 +57,7 @@ def instruction() -> str:
 
 
 def schema(bound: bool = True) -> dict[str, Any]:
-    """The record's JSON schema, its properties in the order in which they are written; `bound`
-    keeps the texts short."""
+    """Return the record's JSON schema; `bound` limits the length of its texts."""
     letter = {"enum": list(LETTERS)}
     share = {"type": "number", "minimum": 0, "maximum": 1}
     properties = {
@@ -86,25 +86,27 @@ def _text(most: int) -> dict[str, Any]:
 
 
 def read_record(raw: str) -> Record | None:
-    """The record in a model's output, where it is valid: the one that holds a choice, JSON that
-    has every field as the schema has it, and one letter that nothing contradicts. What stands
-    around it does not count."""
-    choice = parse_choice(raw)
-    if choice.record is None or choice.letter is None:
+    """Return the record in a response, or None unless it is valid.
+
+    It must be the only record with a choice, be JSON that the schema accepts, and name one letter.
+    Text around it is ignored.
+    """
+    answer = parse_choice(raw)
+    if answer.record is None or answer.letter is None:
         return None
     try:
-        value = json.loads(choice.record, parse_constant=_no_number)
+        value = json.loads(answer.record, parse_constant=_refuse_constant)
     except ValueError:
         return None
     return Record(**value) if _validator().is_valid(value) else None
 
 
-def _no_number(word: str) -> float:
-    """Python reads NaN and Infinity, which JSON does not have."""
-    raise ValueError(f"{word} is no number")
+def _refuse_constant(word: str) -> float:
+    """Python reads NaN and Infinity, which are not JSON."""
+    raise ValueError(f"{word} is not JSON")
 
 
 @cache
 def _validator() -> Draft202012Validator:
-    # A model that is not held to the schema is told of no bound.
+    # The prompt names no length limit, so a response may exceed it.
     return Draft202012Validator(schema(bound=False))

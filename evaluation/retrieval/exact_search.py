@@ -1,9 +1,9 @@
-"""Exact ranks: every frame of a database held against every query, at every width, in blocks.
+"""Exact ranks: every frame of a database is scored for every query, at every width, in blocks.
 
-A score is the fp32 number nearest to the cosine of two embeddings' first entries. It comes out the
-same to the last bit in whatever block and place a frame stands, so that equal frames tie, wherever
-they are, and a target never loses to itself: floating-point sums depend on the order in which a
-library adds, and that changes with the shape of a block. Here no sum is rounded at all (`Cut`).
+A score is the fp32 number nearest to the cosine of two embeddings' first entries. It is
+bit-identical in any block and position, so that equal frames tie and a target never loses to
+itself. Plain floating-point sums would depend on the order of the additions, which changes with the
+shape of a block; here no sum is rounded at all (see `GridEmbeddings`).
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ GRID = 2.0**26
 """Steps of a unit vector's entries."""
 FP32 = np.dtype(np.float32).itemsize
 QUERIES, FRAMES = 256, 1024
-"""Of a block: its scores stay in a core's cache while they are counted."""
+"""Size of a block: its scores stay in a core's cache while they are counted."""
 
 
 @dataclass(frozen=True)
 class Ranks:
-    """What stands before each query's target.
+    """The frames that rank before each query's target.
 
     Attributes:
-        widths: widest first.
+        widths: Widest first.
         greater, tied: (widths, queries) frames that score above the target, and other frames that
             score exactly as it does.
-        found: (widths, queries) False where the target was not found; an exact search finds it.
-        frames: size of the database.
-        bytes: at each width, of what stands for the database: its vectors, or an index of them.
-        seconds: at each width, to rank for all queries; an exact search ranks at all at once.
+        found: (widths, queries) whether the target was found; an exact search always finds it.
+        frames: Size of the database.
+        bytes: Size of the database's vectors or of their index, at each width.
+        seconds: Time to rank for all queries, at each width; an exact search ranks all widths at
+            once.
     """
 
     widths: tuple[int, ...]
@@ -47,17 +48,17 @@ class Ranks:
     seconds: tuple[float, ...] | None = None
 
 
-class Cut:
-    """Embeddings cut where their widths end, each piece a unit vector of whole numbers.
+class GridEmbeddings:
+    """Embeddings split at their widths, each piece a unit vector rounded to an integer grid.
 
-    The numbers count steps of 1/`GRID`. By Cauchy and Schwarz the products of two such pieces add
-    up, in whatever order, to little more than 2^52, and float64 holds every whole number to 2^53:
-    a dot product of pieces is exact. The grid moves a cosine by about 2^-27, less than fp32 tells.
+    The integers count steps of 1/`GRID`. By Cauchy-Schwarz, the products of two such pieces add up
+    to little more than 2^52 in any order, and float64 holds every integer up to 2^53: a dot product
+    of pieces is exact. The grid changes a cosine by about 2^-27, less than fp32 resolves.
 
     Attributes:
         pieces: (rows, entries) float64 of each piece, narrowest first.
-        lengths: (pieces, rows) of each piece, divided by `GRID`.
-        norms: (pieces, rows) of all entries up to the piece's end; 1 where they are all zero.
+        lengths: (pieces, rows) length of each piece, divided by `GRID`.
+        norms: (pieces, rows) length of all entries up to the piece's end; 1 if they are all zero.
     """
 
     def __init__(self, embeddings: np.ndarray, widths: Sequence[int]) -> None:
@@ -75,16 +76,18 @@ class Cut:
     def __len__(self) -> int:
         return len(self.pieces[0])
 
-    def __getitem__(self, rows: slice | np.ndarray) -> Cut:
-        part = object.__new__(Cut)
+    def __getitem__(self, rows: slice | np.ndarray) -> GridEmbeddings:
+        part = object.__new__(GridEmbeddings)
         part.pieces = [piece[rows] for piece in self.pieces]
         part.lengths, part.norms = self.lengths[:, rows], self.norms[:, rows]
         return part
 
 
 def row_sums(values: np.ndarray) -> np.ndarray:
-    """Sums (rows,) of the rows, which are used up: halves are added to halves, so that each row's
-    sum is the same whatever rows stand beside it."""
+    """Sum each row in place (rows,), by adding halves.
+
+    Each row's sum is then the same whatever the other rows are.
+    """
     while (width := values.shape[1]) > 1:
         half = (width + 1) // 2
         values[:, : width - half] += values[:, half:]
@@ -92,79 +95,83 @@ def row_sums(values: np.ndarray) -> np.ndarray:
     return values[:, 0]
 
 
-def block_scores(asked: Cut, shown: Cut) -> Iterator[np.ndarray]:
-    """The fp32 scores (queries, frames) of every query and frame at each width, narrowest first."""
-    products = (a @ b.T for a, b in zip(asked.pieces, shown.pieces, strict=True))
-    return _cosines(products, asked.lengths[..., None], asked.norms[..., None], shown)
+def block_scores(queries: GridEmbeddings, frames: GridEmbeddings) -> Iterator[np.ndarray]:
+    """Yield the fp32 scores (queries, frames) of all pairs at each width, narrowest first."""
+    products = (a @ b.T for a, b in zip(queries.pieces, frames.pieces, strict=True))
+    return _cosines(products, queries.lengths[..., None], queries.norms[..., None], frames)
 
 
-def pair_scores(asked: Cut, shown: Cut) -> Iterator[np.ndarray]:
-    """The fp32 scores (rows,) of each query and the frame in the same row, narrowest first: those
-    that `block_scores` gives, to the last bit."""
+def pair_scores(queries: GridEmbeddings, frames: GridEmbeddings) -> Iterator[np.ndarray]:
+    """Yield the fp32 scores (rows,) of each query and the frame in the same row, narrowest first.
+
+    They are bit-identical to those of `block_scores`.
+    """
     products = (
-        np.einsum("ij,ij->i", a, b) for a, b in zip(asked.pieces, shown.pieces, strict=True)
+        np.einsum("ij,ij->i", a, b) for a, b in zip(queries.pieces, frames.pieces, strict=True)
     )
-    return _cosines(products, asked.lengths, asked.norms, shown)
+    return _cosines(products, queries.lengths, queries.norms, frames)
 
 
 def _cosines(
-    products: Iterable[np.ndarray], lengths: np.ndarray, norms: np.ndarray, shown: Cut
+    products: Iterable[np.ndarray], lengths: np.ndarray, norms: np.ndarray, frames: GridEmbeddings
 ) -> Iterator[np.ndarray]:
-    """From the exact products of pieces on, each score is made by itself, in one fixed order."""
+    """Combine the exact products of pieces into each score separately, in one fixed order."""
     total = None
     for k, product in enumerate(products):
         product *= lengths[k]
-        product *= shown.lengths[k]
+        product *= frames.lengths[k]
         total = product if total is None else np.add(total, product, out=total)
-        yield (total / (norms[k] * shown.norms[k])).astype(np.float32)
+        yield (total / (norms[k] * frames.norms[k])).astype(np.float32)
 
 
 def exact_ranks(
-    asked: np.ndarray, targets: np.ndarray, database: Iterable[np.ndarray], widths: Sequence[int]
+    queries: np.ndarray, targets: np.ndarray, database: Iterable[np.ndarray], widths: Sequence[int]
 ) -> Ranks:
-    """Count, for every query and width, the frames that score above and as its target does.
+    """Count, for every query and width, the frames above its target and those that tie with it.
 
     Args:
-        asked: (queries, entries) fp32 embeddings, finite.
-        targets: (queries, entries) those of each query's target, which is in the database.
-        database: (some frames, entries) each, in whatever order and numbers; one at a time is held.
-        widths: widest first.
+        queries: (queries, entries) finite fp32 embeddings.
+        targets: (queries, entries) embeddings of each query's target, which is in the database.
+        database: Parts (frames, entries) of any size and order, of which one is in memory.
+        widths: Widest first.
     """
     began = time.perf_counter()
-    queries = Cut(asked, widths)
-    gold = list(pair_scores(queries, Cut(targets, widths)))
-    counts = np.zeros((2, len(widths), len(asked)), np.int64)
+    grid = GridEmbeddings(queries, widths)
+    targets_of = list(pair_scores(grid, GridEmbeddings(targets, widths)))
+    counts = np.zeros((2, len(widths), len(queries)), np.int64)
     frames = 0
-    for shown in blocks(database, widths):
-        frames += len(shown)
-        for start in range(0, len(asked), QUERIES):
+    for block in blocks(database, widths):
+        frames += len(block)
+        for start in range(0, len(queries), QUERIES):
             some = slice(start, start + QUERIES)
-            for k, scores in enumerate(block_scores(queries[some], shown)):
-                counts[:, k, some] += count_above_and_equal(scores, gold[k][some])
+            for k, scores in enumerate(block_scores(grid[some], block)):
+                counts[:, k, some] += count_above_and_equal(scores, targets_of[k][some])
     greater, equal = counts[:, ::-1]
-    # The target itself is among those that score as it does.
+    # The target itself is among the equal ones.
     found = np.ones(greater.shape, bool)
     sizes = tuple(frames * width * FP32 for width in widths)
     seconds = (time.perf_counter() - began,) * len(widths)
     return Ranks(tuple(widths), greater, equal - 1, found, frames, sizes, seconds)
 
 
-def least_of_top(
-    asked: np.ndarray, database: Iterable[np.ndarray], widths: Sequence[int], ks: Sequence[int]
+def kth_scores(
+    queries: np.ndarray, database: Iterable[np.ndarray], widths: Sequence[int], ks: Sequence[int]
 ) -> np.ndarray:
-    """The k-th highest score of each query's whole ranking: (widths, ks, queries) fp32, widest
-    first; -inf where the database has fewer frames."""
-    queries = Cut(asked, widths)
-    best = [np.full((len(asked), max(ks)), -np.inf, np.float32) for _ in widths]
-    for shown in blocks(database, widths):
-        for k, scores in enumerate(block_scores(queries, shown)):
+    """Return the k-th highest score of each query's ranking: (widths, ks, queries) fp32.
+
+    Widths are widest first; a score is -inf if the database has fewer than k frames.
+    """
+    grid = GridEmbeddings(queries, widths)
+    best = [np.full((len(queries), max(ks)), -np.inf, np.float32) for _ in widths]
+    for block in blocks(database, widths):
+        for k, scores in enumerate(block_scores(grid, block)):
             both = np.concatenate([best[k], scores], axis=1)
             best[k] = np.partition(both, -max(ks), axis=1)[:, -max(ks) :]
     falling = np.sort(np.stack(best[::-1]), axis=2)[:, :, ::-1]
     return falling[:, :, [k - 1 for k in ks]].transpose(0, 2, 1)
 
 
-def blocks(database: Iterable[np.ndarray], widths: Sequence[int]) -> Iterator[Cut]:
+def blocks(database: Iterable[np.ndarray], widths: Sequence[int]) -> Iterator[GridEmbeddings]:
     for part in database:
         for start in range(0, len(part), FRAMES):
-            yield Cut(part[start : start + FRAMES], widths)
+            yield GridEmbeddings(part[start : start + FRAMES], widths)

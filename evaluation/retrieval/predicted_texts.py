@@ -1,52 +1,59 @@
-"""What a model writes of the frames that queries ask for, and of the frames of a database.
+"""Texts that a model writes about queries' future frames and about a database's frames.
 
 store/<name>/texts/<key>/
-    texts.jsonl         every text, as `evaluation.generators.response_log` logs it; the key is the
-                        hash of the
-                        model's revision, so that any matcher finds what a model has written
+    texts.jsonl         the texts, in a `ResponseLog`; the key is the hash of the model's revision,
+                        so that they serve any matcher
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from conf.runs import lock_folder
 from conf.schema import StudentConfig, TwoStageCommand
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
-from evaluation.generators.model_source import Generator, SampleOf, response_settings
+from evaluation.generators.base import Generator, response_settings
+from evaluation.generators.image_server import short_hash
 from evaluation.generators.response_log import (
     FreeTextResponse,
     ResponseLog,
+    Subject,
     collect_responses,
     free_text_response,
 )
-from evaluation.retrieval.image_server import short_hash
 from models.student.answer_parser import strip_thought
+from models.student.prompts import Sample
 from teacher.sections import SECTIONS, split_sections
 
 TEXTS = "texts"
-"""Folder of them in a store."""
-FORESEEN = ("Prediction", "Outcome")
-"""The sections of a rationale that tell the future state."""
-MARKED = re.compile(
+"""Their folder in a store."""
+FUTURE_SECTIONS = ("Prediction", "Outcome")
+"""The sections of a rationale that describe the future state."""
+HEADING = re.compile(
     rf"^[\W\d_]*({'|'.join(SECTIONS)})(?:[*_ \t]*:[*_ \t]*|[*_ \t]*$)", re.MULTILINE | re.IGNORECASE
 )
-"""A heading as models like to write it, such as "### 3. **Prediction**"."""
+"""A section heading with the markup that models add, such as "### 3. **Prediction**"."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """How a query is matched, as the paper's table of retrieval names it: what is written, whether
-    it is drawn before it is embedded, and whether the database is matched by texts of its frames
-    rather than by the frames themselves."""
+    """A pipeline from a query to its ranking.
+
+    Attributes:
+        title: Its name in tables, as in the paper's.
+        mode: The mode in which the model writes about a query.
+        generates_image: Whether an image of the text is matched instead of the text.
+        captions: Whether captions of the database's frames are matched instead of the frames.
+    """
 
     title: str
     mode: str
-    drawn: bool = False
+    generates_image: bool = False
     captions: bool = False
 
 
@@ -54,16 +61,18 @@ ROUTES = {
     "cot_text": Route("CoT -> text", "rationale"),
     "predict_caption": Route("predict -> caption", "prediction", captions=True),
     "predict_image": Route("predict -> image", "prediction"),
-    "predict_drawn": Route("predict -> drawn", "prediction", drawn=True),
+    "predict_generated_image": Route(
+        "predict -> generated image", "prediction", generates_image=True
+    ),
 }
-"""The paper's three (Models and metrics), and one that has the future drawn."""
+"""The paper's three routes (Models and metrics), and one through an image server."""
 
 Texts = dict[str, str]
-"""By the name of a query or frame; empty where nothing was written."""
+"""Texts by the name of a query or frame; empty if nothing usable was written."""
 
 
 def modes_of(routes: Sequence[str]) -> list[str]:
-    """What has to be written for some routes, in the order in which it is."""
+    """Return the modes in which texts are needed for some routes."""
     needed = {ROUTES[route].mode for route in routes}
     needed |= {"caption" for route in routes if ROUTES[route].captions}
     return [mode for mode in ("rationale", "prediction", "caption") if mode in needed]
@@ -73,66 +82,71 @@ def write_texts(
     cfg: TwoStageCommand,
     student: StudentConfig,
     model: Generator,
-    sample_of: SampleOf,
+    sample_of: Callable[[str, Subject], Sample],
     modes: Sequence[str],
     queries: Sequence[RetrievalQuery],
     database: Sequence[FrameRef],
     store: Store,
 ) -> dict[str, list[FreeTextResponse]]:
-    """What a model writes of every query, or in captions of every frame, by mode; what it has
-    written before is read.
+    """Return a model's responses by mode: to every frame in caption mode, else to every query.
 
     Raises:
-        UserError: another process has it write, or it cannot be asked.
+        UserError: Another process collects this model's texts, or the model cannot respond.
     """
-    known = {
+    settings = {
         mode: response_settings(mode, "", student, cfg.seed, model.revision, store.identity, None)
         for mode in modes
     }
     folder = store.folder / TEXTS / short_hash(json.dumps(model.revision, sort_keys=True))
     folder.mkdir(parents=True, exist_ok=True)
-    busy = f"{folder} is being written by another process; run this again when it is done"
+    busy = f"{folder} is in use by another process; run this again when it is done"
     with lock_folder(folder, busy):
-        log = ResponseLog(folder / "texts.jsonl", known, [*queries, *database], free_text_response)
-        written = {}
+        log = ResponseLog(
+            folder / "texts.jsonl", settings, [*queries, *database], free_text_response
+        )
+        responses = {}
         for mode in modes:
-            things, unit = (database, "frame") if mode == "caption" else (queries, "query")
-            # Scene by scene, so that a scene's frames are decoded once.
-            ordered = sorted(things, key=lambda t: (t.scene_id, t.name))
-            written[mode] = collect_responses(ordered, mode, model.say(mode, sample_of), log, unit)
-        return written
+            subjects, unit = (database, "frame") if mode == "caption" else (queries, "query")
+            # By scene, so that each scene's frames are decoded once.
+            ordered = sorted(subjects, key=lambda s: (s.scene_id, s.name))
+            respond = partial(model.respond, mode, partial(sample_of, mode))
+            responses[mode] = collect_responses(ordered, mode, respond, log, unit)
+        return responses
 
 
-def texts_of(written: Sequence[FreeTextResponse]) -> Texts:
-    return {told.item_id: foreseen(told.text) for told in written}
+def texts_of(responses: Sequence[FreeTextResponse]) -> Texts:
+    return {response.item_id: future_text(response.text) for response in responses}
 
 
-def foreseen(text: str) -> str:
-    """What of a text tells a state: its prediction and outcome where it has these sections, else
-    all of it. A thought is none of it, and one that is not closed leaves nothing."""
-    said = _said(text)
-    return " ".join(_sections(said)) or said
+def future_text(text: str) -> str:
+    """Return the prediction and outcome of a response if it has these sections, else all of it.
+
+    A thought is left out; one that is not closed leaves nothing.
+    """
+    text = _without_thought(text)
+    return " ".join(_future_sections(text)) or text
 
 
-def _said(text: str) -> str:
+def _without_thought(text: str) -> str:
     return (strip_thought(text) or "").strip()
 
 
-def _sections(said: str) -> list[str]:
-    plain = MARKED.sub(lambda found: f"{found[1].capitalize()}: ", said)
-    told = [
-        plain[start:stop].strip() for name, start, stop in split_sections(plain) if name in FORESEEN
+def _future_sections(text: str) -> list[str]:
+    plain = HEADING.sub(lambda heading: f"{heading[1].capitalize()}: ", text)
+    sections = [
+        plain[start:stop].strip()
+        for name, start, stop in split_sections(plain)
+        if name in FUTURE_SECTIONS
     ]
-    return [section for section in told if section]
+    return [section for section in sections if section]
 
 
-def counts(written: Sequence[FreeTextResponse]) -> dict[str, int]:
-    """How many texts there are, how many are empty or cut off, and of how many the sections that
-    tell the future are matched alone."""
-    said = [_said(told.text) for told in written]
+def count_texts(responses: Sequence[FreeTextResponse]) -> dict[str, int]:
+    """Count the texts, the empty and truncated ones, and those with future sections."""
+    texts = [_without_thought(response.text) for response in responses]
     return {
-        "texts": len(written),
-        "  empty: a miss": sum(not text for text in said),
-        "  cut off at student.max_new_tokens": sum(told.cut for told in written),
-        "  prediction and outcome alone": sum(bool(_sections(text)) for text in said),
+        "texts": len(responses),
+        "  empty: a miss": sum(not text for text in texts),
+        "  cut off at student.max_new_tokens": sum(response.cut for response in responses),
+        "  prediction and outcome alone": sum(bool(_future_sections(text)) for text in texts),
     }

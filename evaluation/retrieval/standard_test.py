@@ -1,4 +1,4 @@
-"""What the commands that rank a benchmark's standard test share: how they open, rank and report."""
+"""Open, rank and report the standard test, for the commands that measure retrieval."""
 
 from __future__ import annotations
 
@@ -26,49 +26,51 @@ log = logging.getLogger(__name__)
 
 
 def load_standard_test(store: Store) -> tuple[list[RetrievalQuery], list[FrameRef]]:
-    """The queries and the database. Errors are those of `check_test`."""
+    """Return the queries and the database. Errors are those of `check_test`."""
     queries, database = store.standard_test(), store.database("test")
     check_test(store, queries, database)
     return queries, database
 
 
-def in_parts(shown: EmbeddingCache, names: Sequence[str]) -> Iterator[np.ndarray]:
-    """The embeddings of `names`, in no order, a file at a time, with how many are through."""
+def read_parts(embeddings: EmbeddingCache, names: Sequence[str]) -> Iterator[np.ndarray]:
+    """Yield the embeddings of `names` one file at a time, in any order, with a progress bar."""
     with tqdm(total=len(names), desc="ranking", unit="frame", leave=False) as bar:
-        for numbers, rows in shown.parts(names):
+        for indices, rows in embeddings.parts(names):
             yield rows
-            bar.update(len(numbers))
+            bar.update(len(indices))
 
 
 def rank_targets(
     preset: RetrieverConfig,
-    asked: np.ndarray,
+    queries: np.ndarray,
     targets: np.ndarray,
     database: Iterable[np.ndarray],
 ) -> Ranks:
-    """Exact ranks by a retriever's own scores. Arguments are those of `exact_ranks`."""
+    """Rank exactly with a retriever's own scores. Arguments are those of `exact_ranks`."""
     if preset.late is not None:
         from evaluation.retrieval.late_interaction import late_ranks
 
-        return late_ranks(asked, targets, database, preset.late.width)
-    return exact_ranks(asked, targets, database, preset.widths)
+        return late_ranks(queries, targets, database, preset.late.width)
+    return exact_ranks(queries, targets, database, preset.widths)
 
 
 def write_ranks(
-    folder: Path, found: Mapping[str, Ranks], queries: Sequence[RetrievalQuery]
+    folder: Path, ranks: Mapping[str, Ranks], queries: Sequence[RetrievalQuery]
 ) -> None:
-    """Write ranks.jsonl: for each retriever and query how many frames stand before its target, and
-    how many more score just as it does, at each width; null where it was not found."""
+    """Write ranks.jsonl: by retriever and query, the counts `before` and `tied` at each width.
+
+    A count is null if the target was not found.
+    """
     lines = []
-    for name, ranks in found.items():
+    for name, of_retriever in ranks.items():
         for k, query in enumerate(queries):
-            there = ranks.found[:, k]
+            found = of_retriever.found[:, k]
             counts = {
-                what: [int(n) if known else None for n, known in zip(of[:, k], there, strict=True)]
-                for what, of in (("before", ranks.greater), ("tied", ranks.tied))
+                key: [int(n) if hit else None for n, hit in zip(of[:, k], found, strict=True)]
+                for key, of in (("before", of_retriever.greater), ("tied", of_retriever.tied))
             }
-            told = {"by": name, "query_id": query.query_id, "widths": ranks.widths, **counts}
-            lines.append(json.dumps(told))
+            row = {"by": name, "query_id": query.query_id, "widths": of_retriever.widths, **counts}
+            lines.append(json.dumps(row))
     write_text(folder / "ranks.jsonl", "".join(f"{line}\n" for line in lines))
 
 
@@ -76,17 +78,22 @@ def write_report(
     folder: Path,
     rows: Sequence[RetrievalResult],
     curves: Sequence[dict[str, Any]],
-    told: Sequence[Table] = (),
+    extra_tables: Sequence[Table] = (),
     reference_group: str = "retrieval_distilled",
-    **also: Any,
+    **entries: Any,
 ) -> None:
-    """Write report.txt, report.json and the figures of some rows; `told` are more tables and `also`
-    more entries."""
+    """Write report.txt, report.json and the figures.
+
+    Args:
+        reference_group: The paper's rows beside them, see reference.yaml.
+        extra_tables: Tables for report.txt after the main one.
+        entries: More entries of report.json.
+    """
     table = f"{tables.retrieval_table(rows, reference_group)}\n\n{tables.cost_table(rows)}"
     log.info("%s", table)
-    page = "\n\n".join(map(str, [table, *told, *tables.builder_tables(rows)]))
+    page = "\n\n".join(map(str, [table, *extra_tables, *tables.builder_tables(rows)]))
     write_text(folder / "report.txt", page + "\n")
-    report = {"rows": [r.to_dict() for r in rows], "curves": curves, **also}
+    report = {"rows": [r.to_dict() for r in rows], "curves": curves, **entries}
     write_text(folder / "report.json", json.dumps(report, indent=1))
     figures.retrieval_figure(rows, folder / "retrieval.png")
     figures.builders_figure(rows, curves, folder / "builders.png")

@@ -1,4 +1,4 @@
-"""What was written of queries, matched to a database by a frozen encoder."""
+"""Rank a database by the texts that a model wrote about queries, with a frozen encoder."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from conf.schema import TwoStageCommand
 from data.records import FrameRef, RetrievalQuery
 from data.render.frame_cache import FrameReader
 from data.store import Store
-from evaluation.embedders.embed import Embedder, embed_frames, embed_images, embed_texts
+from evaluation.embedders.base import Embedder, embed_frames, embed_images, embed_texts
+from evaluation.generators.image_server import ImageGenerator
 from evaluation.metrics.ranking import query_metrics
 from evaluation.retrieval.exact_search import Ranks
-from evaluation.retrieval.image_server import draw
 from evaluation.retrieval.predicted_texts import TEXTS, Route, Texts
-from evaluation.retrieval.standard_test import in_parts, rank_targets
+from evaluation.retrieval.standard_test import rank_targets, read_parts
 
 
-def ranks(
+def rank_by_text(
     cfg: TwoStageCommand,
     route: Route,
     matcher: Embedder,
@@ -31,66 +31,73 @@ def ranks(
     database: Sequence[FrameRef],
     store: Store,
 ) -> Ranks:
-    """Rank the database for every query by what was written of it. A query of which nothing was
-    written finds nothing, nor does one whose target has no caption where captions are matched.
+    """Rank the database for every query by its text.
+
+    A query without a text is a miss, and so is one whose target has no caption on a route that
+    matches captions.
 
     Raises:
-        UserError: nothing was written of any query, or what embeds or draws raises it.
+        UserError: No query has a text, or embedding or image generation fails.
     """
     batch, preset = cfg.matcher.batch, matcher.preset
     names = [frame.name for frame in database]
-    said = [texts[route.mode][query.name] for query in queries]
     captions = texts["caption"] if route.captions else {name: name for name in names}
-    there = [bool(s and captions[q.target.name]) for s, q in zip(said, queries, strict=True)]
-    if not any(there):
+    text_of = [texts[route.mode][query.name] for query in queries]
+    valid = [bool(t and captions[q.target.name]) for t, q in zip(text_of, queries, strict=True)]
+    if not any(valid):
         raise UserError(
-            f"{route.title}: nothing was written that could be matched, see "
-            f"{store.folder / TEXTS}; a thought may have taken all of student.max_new_tokens"
+            f"{route.title}: no query has a text to match, see {store.folder / TEXTS}; a thought "
+            "may have taken all of student.max_new_tokens",
+            code="no-texts",
         )
-    said = list(compress(said, there))
-    targets = [query.target.name for query in compress(queries, there)]
+    text_of = list(compress(text_of, valid))
+    targets = [query.target.name for query in compress(queries, valid)]
 
-    if route.drawn:
-        images = draw(cfg.images, sorted(set(said)), store)
+    if route.generates_image:
+        images = ImageGenerator(cfg.images, store).respond(sorted(set(text_of)))
         name_of = {text: f"{path.parent.name}/{path.stem}" for text, path in images.items()}
-        by_name = {name_of[text]: path for text, path in images.items()}
-        asked = embed_images(matcher, by_name, store, batch).rows([name_of[text] for text in said])
+        files = {name_of[text]: path for text, path in images.items()}
+        embeddings = embed_images(matcher, files, store, batch)
+        query_rows = embeddings.rows([name_of[text] for text in text_of])
     else:
-        asked = embed_texts(matcher, said, store, batch).rows(said)
+        query_rows = embed_texts(matcher, text_of, store, batch).rows(text_of)
 
     if route.captions:
-        told = [captions[name] for name in names if captions[name]]
-        shown = embed_texts(matcher, told, store, batch)
-        goals = shown.rows([captions[target] for target in targets])
-        # Frames of one caption tie, and each of them counts.
-        found = rank_targets(preset, asked, goals, [shown.rows(told)])
+        present = [captions[name] for name in names if captions[name]]
+        embeddings = embed_texts(matcher, present, store, batch)
+        target_rows = embeddings.rows([captions[target] for target in targets])
+        # Frames with the same caption tie, and each of them counts.
+        ranks = rank_targets(preset, query_rows, target_rows, [embeddings.rows(present)])
     else:
         frames = FrameReader(store, preset.image_size)
-        shown = embed_frames(matcher, database, store, frames, batch)
-        found = rank_targets(preset, asked, shown.rows(targets), in_parts(shown, names))
-    return with_misses(found, np.array(there), len(names))
+        embeddings = embed_frames(matcher, database, store, frames, batch)
+        ranks = rank_targets(
+            preset, query_rows, embeddings.rows(targets), read_parts(embeddings, names)
+        )
+    return add_misses(ranks, np.array(valid), len(names))
 
 
-def with_misses(found: Ranks, there: np.ndarray, frames: int) -> Ranks:
-    """Ranks of some queries as ranks of all, of which those that are not `there` found nothing
-    among `frames`."""
+def add_misses(ranks: Ranks, valid: np.ndarray, frames: int) -> Ranks:
+    """Extend the ranks of the `valid` queries to all queries, with misses among `frames`."""
 
-    def among_all(counts: np.ndarray) -> np.ndarray:
-        every = np.zeros((len(counts), len(there)), counts.dtype)
-        every[:, there] = counts
-        return every
+    def extend(counts: np.ndarray) -> np.ndarray:
+        extended = np.zeros((len(counts), len(valid)), counts.dtype)
+        extended[:, valid] = counts
+        return extended
 
-    counts = {name: among_all(getattr(found, name)) for name in ("greater", "tied", "found")}
-    return replace(found, frames=frames, **counts)
+    counts = {name: extend(getattr(ranks, name)) for name in ("greater", "tied", "found")}
+    return replace(ranks, frames=frames, **counts)
 
 
-def matched(
-    route: str, queries: Sequence[RetrievalQuery], texts: Texts, found: Ranks
+def matched_texts(
+    route: str, queries: Sequence[RetrievalQuery], texts: Texts, ranks: Ranks
 ) -> list[dict[str, Any]]:
-    """What was matched for each query, and its target's rank at the widest width: the database's
-    size where it was not found."""
-    counts = (found.greater[0], found.tied[0], found.found[0])
-    places = query_metrics(*counts, found.frames, ())["median_rank"]
+    """Return each query's text and its target's rank at the widest width, for matched.jsonl.
+
+    A miss has the database's size as its rank.
+    """
+    counts = (ranks.greater[0], ranks.tied[0], ranks.found[0])
+    places = query_metrics(*counts, ranks.frames, ())["median_rank"]
     return [
         {"query_id": q.query_id, "route": route, "text": texts[q.name], "rank": float(place)}
         for q, place in zip(queries, places, strict=True)

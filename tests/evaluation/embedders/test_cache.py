@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conf.errors import UserError
 from conf.runs import lock_folder
 from evaluation.embedders import cache
 from evaluation.embedders.cache import EmbeddingCache
+from tests.user_errors import raises_user_error
 
 ABOUT = {"weights": "ab12", "image_size": 96}
 THINGS = {f"scene-{k:03d}/{k}": k for k in range(2500)}
@@ -57,17 +57,17 @@ def test_parts_hold_each_asked_one_once(tmp_path) -> None:
     some = list(THINGS)[::-7]
     seen = {}
     for numbers, rows in kept.parts(some):
-        assert len(rows) <= cache.PART
+        assert len(rows) <= cache.PART_ROWS
         seen |= dict(zip(numbers.tolist(), rows, strict=True))
     assert sorted(seen) == list(range(len(some)))
     assert np.array_equal(np.stack([seen[k] for k in range(len(some))]), kept.rows(some))
 
 
 def test_a_slow_model_loses_no_more_than_a_batch(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(cache, "SECONDS", -1)
+    monkeypatch.setattr(cache, "PART_SECONDS", -1)
     model = Model(bad=(70,))
     kept = EmbeddingCache(tmp_path, "frame", ABOUT)
-    with pytest.raises(UserError, match="scene-070/70"):
+    with raises_user_error("non-finite-embedding", contains="scene-070/70"):
         kept.complete(THINGS, model, 16)
     again = Model()
     kept.complete(THINGS, again, 16)
@@ -97,13 +97,13 @@ import os, signal, sys
 from pathlib import Path
 sys.path[:0] = {path!r}
 from test_cache import ABOUT, THINGS, Model
-from evaluation.embedders.cache import Embeddings
+from evaluation.embedders.cache import EmbeddingCache
 class Dying(Model):
     def __call__(self, some):
         if len(self.asked) >= 1300:
             os.kill(os.getpid(), signal.SIGKILL)
         return super().__call__(some)
-Embeddings(Path(sys.argv[1]), "frame", ABOUT).complete(THINGS, Dying(), 64)
+EmbeddingCache(Path(sys.argv[1]), "frame", ABOUT).complete(THINGS, Dying(), 64)
 """
 
 
@@ -116,7 +116,7 @@ def test_a_killed_embedding_goes_on(tmp_path) -> None:
     kept = EmbeddingCache(tmp_path, "frame", ABOUT)
     (torn := kept.folder / "00002.npy").write_bytes(b"half a part")
     kept.complete(THINGS, model, 64)
-    assert model.asked == list(THINGS.values())[2 * cache.PART :]
+    assert model.asked == list(THINGS.values())[2 * cache.PART_ROWS :]
     assert np.array_equal(kept.rows(list(THINGS)), Model()(list(THINGS.values())))
     assert torn.stat().st_size > 1000
 
@@ -137,26 +137,26 @@ def test_a_damaged_part_is_told_and_made_again(tmp_path, damage, caplog) -> None
     model = Model()
     with caplog.at_level(logging.WARNING):
         kept.complete(THINGS, model, 64)
-    assert "00001.npy is damaged; its embeddings are made again" in caplog.text
-    assert sorted(model.asked) == list(range(cache.PART, 2 * cache.PART))
+    assert "00001.npy is damaged" in caplog.text
+    assert sorted(model.asked) == list(range(cache.PART_ROWS, 2 * cache.PART_ROWS))
     assert np.array_equal(kept.rows(list(THINGS)), Model()(list(THINGS.values())))
 
 
 def test_an_embedding_that_is_not_finite_is_named_and_not_kept(tmp_path) -> None:
     kept = EmbeddingCache(tmp_path, "frame", ABOUT)
-    with pytest.raises(UserError, match=r"embedding of frame scene-700/700 is not finite"):
+    with raises_user_error("non-finite-embedding", contains="frame scene-700/700"):
         kept.complete(THINGS, Model(bad=(700,)), 64)
     queries = EmbeddingCache(tmp_path, "query", ABOUT)
-    with pytest.raises(UserError, match=r"query scene-003/3, and of 1 more is not finite"):
+    with raises_user_error("non-finite-embedding", contains="query scene-003/3 and 1 more"):
         queries.complete(THINGS, Model(bad=(3, 9)), 64)
     model = Model()
     kept.complete(THINGS, model, 64)
-    assert model.asked == list(THINGS.values())[cache.PART :]
+    assert model.asked == list(THINGS.values())[cache.PART_ROWS :]
 
 
 def test_two_processes_do_not_fill_one_folder(tmp_path) -> None:
     kept = filled(tmp_path)
     with lock_folder(kept.folder, "unheard"):
         kept.complete(THINGS, Model(), 64)
-        with pytest.raises(UserError, match="is being filled by another process"):
+        with raises_user_error("in-use"):
             kept.complete({"new/1": 1}, Model(), 64)

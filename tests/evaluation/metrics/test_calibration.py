@@ -4,7 +4,6 @@ from scipy.stats import chi2
 
 from evaluation.metrics.calibration import BINS, measure_calibration, measure_position_bias
 from evaluation.metrics.intervals import wilson_interval
-from evaluation.reporting.tables import calibration_table, parsing_table, position_table
 
 
 def test_one_who_is_sure_and_right_is_calibrated():
@@ -93,19 +92,3 @@ def test_a_fair_chooser_is_seldom_called_biased():
     right = list("ABCD" * 100)
     ps = [measure_position_bias(list(rng.choice(list("ABCD"), 400)), right).p for _ in range(400)]
     assert 0.02 < np.mean(np.array(ps) < 0.05) < 0.09
-
-
-def test_tables_show_what_was_found():
-    found = {
-        "record": measure_position_bias([*"AAB", None], [*"ABCD"]),
-        "constrained": measure_position_bias([None] * 4, [*"ABCD"]),
-    }
-    cells = [line.split() for line in str(position_table(found)).splitlines()]
-    assert ["record:", "chosen", "66.7", "33.3", "0.0", "0.0", "3"] in cells
-    assert ["constrained:", "chosen", "-", "-", "-", "-", "0"] in cells
-    assert sum(line[:1] == ["chi-square"] for line in cells) == 1
-    told = str(calibration_table("record", measure_calibration([0.81, 0.85], [1, 0])))
-    assert "0.8 to 0.9 83.0 50.0 9-91 2" in " ".join(told.split())
-    assert "Expected calibration error 0.330, Brier score 0.379" in told
-    read = parsing_table({"record": {"with a letter": 3, "x": 1}, "answer": {"with a letter": 4}})
-    assert [line.split()[-2:] for line in str(read).splitlines()[2:4]] == [["3", "4"], ["1", "-"]]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sentence_transformers.util.similarity import maxsim
 
-from evaluation.embedders.cache import EmbeddingCache, filled_up
+from evaluation.embedders.cache import EmbeddingCache, pad_rows
 from evaluation.metrics.ranking import count_ranks
 from evaluation.retrieval import late_interaction
 from evaluation.retrieval.late_interaction import late_ranks, pair_scores
@@ -24,7 +24,7 @@ def vectors(rows: int, most: int, seed: int) -> list[np.ndarray]:
 
 def rows_of(found: list[np.ndarray], more: int = 0) -> np.ndarray:
     """Filled up with zeros, `more` than has to be."""
-    rows = filled_up([v.reshape(1, -1) for v in found])
+    rows = pad_rows([v.reshape(1, -1) for v in found])
     return np.pad(rows, ((0, 0), (0, more * WIDTH)))
 
 
@@ -113,9 +113,9 @@ def test_sums_of_as_many_vectors_as_there_may_be_are_exact() -> None:
         assert score[0] == np.float32(exact / 2**40)
 
 
-def test_rows_of_several_lengths_come_back_from_disk_filled_up(tmp_path, asked) -> None:
+def test_rows_of_several_lengths_come_back_from_disk_pad_rows(tmp_path, asked) -> None:
     things = {f"q{k}": v.reshape(1, -1) for k, v in enumerate(asked)}
     kept = EmbeddingCache(tmp_path, "query", {"made by": "hand"})
-    kept.complete(dict(list(things.items())[:7]), filled_up, 3)
-    kept.complete(things, filled_up, 3)
+    kept.complete(dict(list(things.items())[:7]), pad_rows, 3)
+    kept.complete(things, pad_rows, 3)
     assert np.array_equal(kept.rows(list(things)), rows_of(asked))

@@ -29,11 +29,12 @@ from conf.schema import (
 from data.render.frame_cache import FrameReader
 from data.store import open_store
 from evaluation import retrieve
-from evaluation.embedders import base
-from evaluation.embedders.embed import EMBEDDINGS, embed_frames, embed_queries, embedders
+from evaluation.embedders import joint_encoder
+from evaluation.embedders.base import EMBEDDINGS, embed_frames, embed_queries, open_embedders
 from evaluation.metrics.ranking import ranking_metrics
 from models.retriever import embedder
 from tests.evaluation.metrics.reference import matrix_metrics
+from tests.user_errors import raises_user_error
 
 CFG = RetrieverConfig(
     name="small", widths=[64, 32], quantization="none", lora=LoraConfig(rank=0), image_size=96,
@@ -100,7 +101,7 @@ def test_it_is_measured_once_and_read_back(world, tmp_path, micro_store) -> None
     first = world()
     queries, database = micro_store.standard_test(), micro_store.database()
     frames, names = FrameReader(micro_store, 96), [f.name for f in database]
-    (trained, _) = embedders(tmp_path / "run", CFG, "bf16", micro_store, tmp_path)
+    (trained, _) = open_embedders(tmp_path / "run", CFG, "bf16", micro_store, tmp_path)
     store = open_store(tmp_path / "store" / "micro")
     asked = embed_queries(trained, queries, store, frames, 16).rows([q.query_id for q in queries])
     shown = embed_frames(trained, database, store, frames, 16).rows(names)
@@ -178,7 +179,7 @@ def test_one_of_many_vectors_is_measured_by_late_interaction(
     (tmp_path / "run" / "retriever" / "config.json").unlink()
     (tmp_path / "run" / "untrained" / "config.json").unlink()
     assert world("two") == first
-    with pytest.raises(UserError, match=r"index=faiss holds one vector a frame"):
+    with raises_user_error("unsupported-index", contains="index=faiss"):
         world("three", index="faiss")
 
 
@@ -212,7 +213,7 @@ def test_a_batch_that_does_not_fit_is_told(world, monkeypatch) -> None:
     def full(*_: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
-    monkeypatch.setattr("evaluation.embedders.base.JointEncoder.frames", full)
+    monkeypatch.setattr("evaluation.embedders.joint_encoder.JointEncoder.frames", full)
     with pytest.raises(
         UserError, match=r"out of memory where \d+ are embedded at once: lower batch"
     ):
@@ -240,13 +241,13 @@ def test_broken_weights_are_told_by_a_query_that_shows_them(world, tmp_path, mic
     weights[name][3] = float("nan")
     save_file(weights, path, metadata={"format": "pt"})
     others = len(micro_store.standard_test()) - 1
-    with pytest.raises(UserError, match=rf"of query \S+, and of {others} more is not finite"):
+    with raises_user_error("non-finite-embedding", contains=f"and {others} more"):
         world()
 
 
 def test_a_kept_embedding_depends_on_what_is_shown(micro_store, saved, tmp_path) -> None:
     store = open_store(micro_store.folder)
-    (embedder, untrained) = embedders(saved, CFG, "fp32", store, tmp_path)
+    (embedder, untrained) = open_embedders(saved, CFG, "fp32", store, tmp_path)
     changes = [
         {},
         {"image_size": 64},
@@ -282,8 +283,8 @@ def test_one_with_an_edited_processor_is_another(
     micro_store, saved, tmp_path, name, another
 ) -> None:
     def keys() -> list[str]:
-        pair = embedders(tmp_path / "run", CFG, "fp32", micro_store, tmp_path)
-        return [json.dumps(embedder.about(micro_store)) for embedder in pair]
+        pair = open_embedders(tmp_path / "run", CFG, "fp32", micro_store, tmp_path)
+        return [json.dumps(embedder.settings(micro_store)) for embedder in pair]
 
     shutil.copytree(saved, tmp_path / "run")
     before = keys()
@@ -297,14 +298,14 @@ def test_one_with_an_edited_processor_is_another(
 @pytest.mark.slow
 def test_long_texts_pass_a_few_at_a_time_and_come_to_the_same(saved, micro_store, monkeypatch):
     texts = ["The red cube rests.", *("It moves on. " * k for k in (40, 3, 1, 20, 2))]
-    (trained, _) = embedders(saved, CFG, "fp32", micro_store, saved)
+    (trained, _) = open_embedders(saved, CFG, "fp32", micro_store, saved)
     encoder = trained.load()
     whole, passed = encoder.texts(texts), []
-    plain = encoder._embedded
-    monkeypatch.setattr(encoder, "_embedded", lambda *a: passed.append(a[0]) or plain(*a))
+    plain = encoder._encode
+    monkeypatch.setattr(encoder, "_encode", lambda *a: passed.append(a[0]) or plain(*a))
     longest = max(map(len, encoder._model.tokenizer(texts)["input_ids"]))
     for pairs, parts in ((3 * longest**2, [3, 3]), (1, [1] * 6), (6 * longest**2, [6])):
-        monkeypatch.setattr(base, "PAIRS", pairs)
+        monkeypatch.setattr(joint_encoder, "MAX_TOKEN_PAIRS", pairs)
         passed.clear()
         np.testing.assert_allclose(encoder.texts(texts), whole, atol=1e-5)
         assert [len(some) for some in passed] == parts

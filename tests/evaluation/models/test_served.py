@@ -14,12 +14,16 @@ import pytest
 from PIL import Image
 
 from conf.entry import Run
-from conf.errors import UserError
 from conf.schema import SelectCommand, ServerConfig, StudentConfig
 from data.render.frame_cache import FrameReader
 from evaluation import select
-from evaluation.generators.model_source import model_served, response_settings, shown
-from evaluation.generators.openai_server import revision, say, written
+from evaluation.generators.base import item_sample, response_settings
+from evaluation.generators.openai_server import (
+    ServedModel,
+    generate_responses,
+    restore_thought,
+    served_origin,
+)
 from evaluation.generators.response_log import ResponseLog, collect_responses, score_response
 from evaluation.generators.response_schema import instruction, schema
 from teacher.servers.responses import TRUNCATED, Response
@@ -50,8 +54,10 @@ def opened(tmp_path, items, **known) -> ResponseLog:
 
 
 def asker(server, frames, cfg=STUDENT, mode="record", control=None, seed=0):
-    sample_of = partial(shown, "cot", frames, cfg, control, mode)
-    return lambda things, keep: asyncio.run(say(server, cfg, seed, mode, sample_of, things, keep))
+    sample_of = partial(item_sample, "cot", frames, cfg, control, mode)
+    return lambda things, keep: asyncio.run(
+        generate_responses(server, cfg, seed, mode, sample_of, things, keep)
+    )
 
 
 def test_the_same_frames_and_times_are_sent(items, frames, talking, tmp_path) -> None:
@@ -62,7 +68,7 @@ def test_the_same_frames_and_times_are_sent(items, frames, talking, tmp_path) ->
     assert [a.right for a in given] == [i.letter == "C" for i in items]
     assert {a.valid for a in given} == {True}
     for item, asked in zip(items, server.asked, strict=True):
-        sample = shown("cot", frames, STUDENT, None, "record", item)
+        sample = item_sample("cot", frames, STUDENT, None, "record", item)
         parts = asked["messages"][0]["content"]
         video = parts[0]["video_url"]["url"].removeprefix("data:video/jpeg;base64,")
         assert np.array_equal(np.stack([*map(pixels, video.split(","))]), sample.clip.pixels)
@@ -131,7 +137,7 @@ def test_a_control_hides_the_clip(items, frames, talking) -> None:
     ],
 )
 def test_a_thought_is_no_answer(reply, thinking, text, items) -> None:
-    found = written(reply, thinking)
+    found = restore_thought(reply, thinking)
     assert found.text == text
     assert found.cut == (reply.flaw == TRUNCATED)
     letter = score_response(items[0], "answer", found).letter
@@ -200,32 +206,30 @@ def test_an_item_that_alone_has_no_answer_is_told(items, frames, talking) -> Non
         return {"status": 400, "message": "prompt is too long"} if long else "Hello."
 
     server = talking(refuse)
-    with pytest.raises(UserError, match=r"no answer about .*prompt is too long.*goes on with"):
+    with raises_user_error("no-response", contains="prompt is too long"):
         asker(at(server, concurrency=1), frames)(items, lambda _: None)
 
 
 def test_what_is_served_is_told_apart(talking) -> None:
     server = talking(lambda _: FULL)
-    assert revision(at(server)) == {"root": "weights", "parent": None}
+    assert served_origin(at(server)) == {"root": "weights", "parent": None}
     adapter = replace(at(server), model="adapter")
-    assert revision(adapter) == {"root": "lora", "parent": "weights"}
-    with pytest.raises(
-        UserError, match=r"does not serve server\.model=other; it has served, adapter"
-    ):
-        revision(replace(at(server), model="other"))
+    assert served_origin(adapter) == {"root": "lora", "parent": "weights"}
+    with raises_user_error("unknown-model", contains=("server.model=other", "served, adapter")):
+        served_origin(replace(at(server), model="other"))
     server.stop()
-    with pytest.raises(UserError, match=r"no server of server\.url can be asked \(http://127"):
-        revision(at(server))
+    with raises_user_error("no-server", contains="http://127"):
+        served_origin(at(server))
 
 
 def test_what_a_server_cannot_tell_of_its_weights_the_user_can(talking, caplog) -> None:
     caplog.set_level("INFO")
     cfg = SelectCommand(student=STUDENT, server=at(talking(lambda _: FULL)))
     plain, committed = (
-        model_served(cfg, None, replace(STUDENT, revision=rev)).revision for rev in (None, "c0ffee")
+        ServedModel(cfg, None, replace(STUDENT, revision=rev)).revision for rev in (None, "c0ffee")
     )
     assert plain != committed
-    assert "of served the server tells its name alone (weights)" in caplog.text
+    assert "student.revision=COMMIT" in caplog.text
 
 
 def test_a_server_is_given_its_key(items, frames, talking, tmp_path, monkeypatch) -> None:
@@ -234,13 +238,13 @@ def test_a_server_is_given_its_key(items, frames, talking, tmp_path, monkeypatch
     log = opened(tmp_path, items)
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
     for ask in (
-        lambda: revision(at(server)),
+        lambda: served_origin(at(server)),
         lambda: collect_responses(items, "record", asker(at(server), frames), log),
     ):
-        with pytest.raises(UserError, match=f"{server.url} .*no such key.*OPENAI_API_KEY"):
+        with raises_user_error("invalid-api-key", contains=(server.url, "OPENAI_API_KEY")):
             ask()
     monkeypatch.setenv("OPENAI_API_KEY", "secret")
-    assert revision(at(server))["root"] == "weights"
+    assert served_origin(at(server))["root"] == "weights"
     given = collect_responses(items, "record", asker(at(server), frames), log)
     assert [a.letter for a in given] == ["C"] * 8
 
@@ -248,26 +252,26 @@ def test_a_server_is_given_its_key(items, frames, talking, tmp_path, monkeypatch
 def test_a_student_is_not_measured_by_its_base(talking, tmp_path) -> None:
     server = talking(lambda _: FULL)
     cfg = SelectCommand(server=replace(at(server), model=None), student=STUDENT)
-    with pytest.raises(UserError, match=r"give server\.model=NAME"):
-        model_served(cfg, tmp_path, STUDENT)
+    with raises_user_error("missing-server-model", contains="server.model=NAME"):
+        ServedModel(cfg, tmp_path, STUDENT)
     # Nor is what it answers taken for a base's.
     adapter = replace(cfg, server=replace(at(server), model="adapter"))
-    with pytest.raises(UserError, match="is an adapter over weights there: give model=RUN"):
-        model_served(adapter, None, STUDENT)
+    with raises_user_error("adapter-without-run", contains="model=RUN"):
+        ServedModel(adapter, None, STUDENT)
 
 
 def test_adapters_over_another_rounding_are_told(talking, tmp_path, caplog) -> None:
     cfg = SelectCommand(server=replace(at(talking(lambda _: FULL)), model="adapter"))
-    model_served(cfg, tmp_path, replace(STUDENT, quantization="none"))
+    ServedModel(cfg, tmp_path, replace(STUDENT, quantization="none"))
     assert not caplog.text
-    model_served(cfg, tmp_path, STUDENT)
-    assert "over a base that is not rounded to NF4" in caplog.text
+    ServedModel(cfg, tmp_path, STUDENT)
+    assert "NF4" in caplog.text
 
 
 def test_answers_to_other_questions_stay_and_do_not_count(items, tmp_path) -> None:
     path, [item, *_] = tmp_path / "answers.jsonl", items
     first = ResponseLog(path, {"record": {"seed": 0}}, items)
-    first.append([score_response(item, "record", written(Response(FULL), False))])
+    first.append([score_response(item, "record", restore_thought(Response(FULL), False))])
     assert ResponseLog(path, {"record": {"seed": 0}}, items).answers == first.answers
     assert not ResponseLog(path, {"record": {"seed": 1}}, items).answers
     assert not ResponseLog(path, {"answer": {"seed": 0}}, items).answers
@@ -280,10 +284,10 @@ def test_answers_to_other_questions_stay_and_do_not_count(items, tmp_path) -> No
 def test_servers_of_two_models_by_one_name_are_told(talking) -> None:
     one, same, other = (talking(lambda _: FULL) for _ in range(3))
     given = replace(at(one), url=[one.url, same.url])
-    assert revision(given) == revision(at(one))
+    assert served_origin(given) == served_origin(at(one))
     other.root = "others"
-    with pytest.raises(UserError, match=r"has weights and http\S+ others: give servers of one"):
-        revision(replace(given, url=[one.url, same.url, other.url]))
+    with raises_user_error("different-models", contains=("is weights at", "others at")):
+        served_origin(replace(given, url=[one.url, same.url, other.url]))
 
 
 def test_what_an_answer_depends_on_is_its_key() -> None:
@@ -325,8 +329,6 @@ def test_the_command_measures_a_served_model(micro, micro_store, talking, tmp_pa
     }  # fmt: skip
     assert report["calibration"]["constrained"]["n"] == 6
     assert report["positions"]["constrained"]["chosen"]["C"] == 6
-    text = (tmp_path / "report.txt").read_text()
-    assert "Confidence reported (constrained)" in text
     # All is answered: the same command asks nothing.
     server.asked.clear()
     assert select.main.__wrapped__(cfg, Run("x", tmp_path)) == metrics

@@ -16,7 +16,6 @@ from PIL import Image
 from transformers import CLIPVisionModel
 
 from conf.entry import Run
-from conf.errors import UserError
 from conf.schema import (
     ArchitectureConfig,
     ImageServerConfig,
@@ -33,12 +32,12 @@ from conf.schema import (
 from data.render.frame_cache import FrameReader
 from data.store import Store, open_store
 from evaluation import two_stage
-from evaluation.embedders.base import released_encoder
-from evaluation.embedders.embed import embed_queries, embedders, untrained_embedder
+from evaluation.embedders.base import embed_queries, open_embedders, untrained_embedder
+from evaluation.embedders.joint_encoder import released_encoder
 from evaluation.metrics.breakdown import retrieval_rows
 from evaluation.metrics.ranking import query_metrics
 from evaluation.retrieval import text_matching
-from evaluation.retrieval.predicted_texts import ROUTES, foreseen
+from evaluation.retrieval.predicted_texts import ROUTES, future_text
 from evaluation.retrieval.standard_test import load_standard_test, rank_targets
 from models import loading
 from tests.evaluation.metrics.reference import matrix_metrics
@@ -89,7 +88,9 @@ def ranks(store, clip, tmp_path) -> Callable[..., text_matching.Ranks]:
         texts = {ROUTES[route].mode: dict(zip((q.name for q in queries), said, strict=True))}
         texts["caption"] = dict(zip((f.name for f in database), captions, strict=False))
         cfg = TwoStageCommand(images=ImageServerConfig(model="painter", **images))
-        return text_matching.ranks(cfg, ROUTES[route], matcher, texts, queries, database, store)
+        return text_matching.rank_by_text(
+            cfg, ROUTES[route], matcher, texts, queries, database, store
+        )
 
     return rank
 
@@ -108,7 +109,7 @@ def ranks(store, clip, tmp_path) -> Callable[..., text_matching.Ranks]:
     ],
 )
 def test_the_foreseen_state_is_matched(text, state) -> None:
-    assert foreseen(text) == state
+    assert future_text(text) == state
 
 
 def test_texts_rank_by_their_scores_and_a_missing_one_is_a_miss(ranks, store, clip) -> None:
@@ -130,16 +131,16 @@ def test_texts_rank_by_their_scores_and_a_missing_one_is_a_miss(ranks, store, cl
     assert (less.queries, less.frames) == (len(queries), len(database))
     lost = query_metrics(found.greater[0], found.tied[0], found.found[0], len(database), [1])
     assert less.mrr.value == pytest.approx(lost["mrr"][1:-1].sum() / len(queries))
-    with pytest.raises(UserError, match=r"predict -> image: nothing was written"):
+    with raises_user_error("no-texts", contains="predict -> image"):
         ranks("predict_image", [""] * len(queries))
 
 
 def test_repeating_the_question_ranks_as_seeing_no_prefix(ranks, store, clip, tmp_path) -> None:
     queries, database = load_standard_test(store)
     frames, names = FrameReader(store, clip.image_size), [f.name for f in database]
-    [embedder] = embedders(None, clip, "fp32", store, tmp_path)
+    [embedder] = open_embedders(None, clip, "fp32", store, tmp_path)
     encoder = embedder.load()
-    encoder.watch = lambda clips: np.zeros((len(clips), 24), np.float32)
+    encoder.embed_clips = lambda clips: np.zeros((len(clips), 24), np.float32)
     blind = replace(embedder, weights="blind")
     asked = embed_queries(blind, queries, store, frames, 16).rows([q.name for q in queries])
     shown = encoder.frames(database, frames)
@@ -186,16 +187,16 @@ def test_a_drawn_target_is_found_first_and_drawn_once(ranks, store, talking) -> 
     server = talking(paint)
     drawn = {"url": server.url, "size": "192x128", "seed": 3, "concurrency": 1}
     said = [q.target.name for q in queries]
-    found = ranks("predict_drawn", said, **drawn)
+    found = ranks("predict_generated_image", said, **drawn)
     assert not found.greater.any()
     assert len(server.asked) == len(set(said))
     server.asked.clear()
-    assert np.array_equal(ranks("predict_drawn", said, **drawn).tied, found.tied)
+    assert np.array_equal(ranks("predict_generated_image", said, **drawn).tied, found.tied)
     assert not server.asked
     # A damaged file is drawn again, and another seed draws all.
-    damaged = min((store.folder / "drawn").rglob("*.png"))
+    damaged = min((store.folder / "generated_images").rglob("*.png"))
     damaged.write_bytes(damaged.read_bytes()[:-40])
-    ranks("predict_drawn", said, **drawn)
+    ranks("predict_generated_image", said, **drawn)
     assert len(server.asked) == 1
 
 
@@ -209,25 +210,25 @@ def test_what_is_drawn_is_kept_when_the_server_fails(ranks, store, talking) -> N
 
     server = talking(lambda r: b"no image" if r["prompt"] == bad else image)
     drawn = {"concurrency": 1, "patience": 0.2, "timeout": 10.0}
-    with pytest.raises(UserError, match=rf"painter has no image of '{bad}' .*no image that can be"):
-        ranks("predict_drawn", said, url=server.url, **drawn)
-    assert len([*(store.folder / "drawn").rglob("*.png")]) == 3
+    with raises_user_error("no-response", contains=("painter", bad)):
+        ranks("predict_generated_image", said, url=server.url, **drawn)
+    assert len([*(store.folder / "generated_images").rglob("*.png")]) == 3
     dying = talking(lambda _: image if len(dying.asked) < 3 else 500)
     with raises_user_error("no-server", contains="images.url"):
-        ranks("predict_drawn", said, url=dying.url, **drawn)
-    assert len([*(store.folder / "drawn").rglob("*.png")]) == 5
+        ranks("predict_generated_image", said, url=dying.url, **drawn)
+    assert len([*(store.folder / "generated_images").rglob("*.png")]) == 5
     whole = talking(lambda _: image)
-    assert ranks("predict_drawn", said, url=whole.url, **drawn).found.all()
+    assert ranks("predict_generated_image", said, url=whole.url, **drawn).found.all()
     assert len(whole.asked) == len(said) - 5
     chatting = talking(lambda _: 404)
-    with pytest.raises(UserError, match=r"draws nothing as images\.model=painter"):
-        ranks("predict_drawn", said, url=chatting.url, seed=1, **drawn)
+    with raises_user_error("unknown-model", contains="images.model=painter"):
+        ranks("predict_generated_image", said, url=chatting.url, seed=1, **drawn)
 
 
 def test_a_matcher_without_a_text_tower_is_refused(ranks, clip, store, tmp_path) -> None:
     CLIPVisionModel.from_pretrained(clip.model).save_pretrained(tmp_path / "vision")
     blind = replace(clip, model=str(tmp_path / "vision"))
-    with pytest.raises(UserError, match=r"clip_vision_model\) is no CLIP and no SigLIP"):
+    with raises_user_error("wrong-model-type", contains="clip_vision_model"):
         released_encoder(blind, "fp32", tmp_path)
 
 
@@ -314,7 +315,7 @@ def test_texts_are_kept_when_the_server_dies(world, store, talking) -> None:
         )
 
     dying = talking(lambda r: say(r) if len(dying.asked) < 6 else 500)
-    with pytest.raises(UserError, match=r"no server of server\.url .*goes on with"):
+    with raises_user_error("no-server", contains="server.url"):
         world(server=at(dying), routes=["cot_text", "predict_image"])
     kept = log_of(store).read_text()
     server = talking(say)
@@ -335,7 +336,7 @@ def test_texts_are_kept_when_the_server_dies(world, store, talking) -> None:
 
 def test_a_matcher_that_reads_no_text_is_refused(world) -> None:
     late = RetrieverConfig(name="late", model="unused", late=LateConfig(width=24))
-    with pytest.raises(UserError, match=r"by late interaction .* cannot match a text"):
+    with raises_user_error("unsupported-matcher", contains="retriever.late"):
         world(matcher=MatcherConfig(retriever=late))
 
 
@@ -345,5 +346,5 @@ def test_a_student_without_rationales_is_told(world, micro, tmp_path) -> None:
     settings.train.regime = "answer_only"
     OmegaConf.save(OmegaConf.structured(settings), tmp_path / "sft" / "config.yaml")
     (tmp_path / "sft" / "metrics.json").write_text("{}")
-    with pytest.raises(UserError, match=r"writes no rationale .*: leave cot_text out of routes"):
+    with raises_user_error("unsupported-route", contains="cot_text"):
         world(model=str(tmp_path / "sft"))

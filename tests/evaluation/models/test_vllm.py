@@ -16,8 +16,8 @@ from conf.entry import Run
 from conf.schema import ArchitectureConfig, LoraConfig, SelectCommand, ServerConfig, StudentConfig
 from data.render.frame_cache import FrameReader
 from evaluation import select
-from evaluation.generators.model_source import shown
-from evaluation.generators.openai_server import chat_of, request_of
+from evaluation.generators.base import item_sample
+from evaluation.generators.openai_server import build_messages, request_fields
 from evaluation.generators.response_schema import schema
 from models import loading
 from models.student.answer_parser import Reason, parse_choice
@@ -107,10 +107,12 @@ def test_the_server_is_asked_with_the_ids_that_a_model_here_reads(
     loading.pin_sizes(processor, cfg.image_size, cfg.frames)
     client = openai.OpenAI(base_url=server.url, api_key="none")
     for mode, item in zip(("record", "answer"), micro_store.selection("test"), strict=False):
-        sample = shown("cot", frames, cfg, control, mode, item)
-        request = request_of(cfg, mode, sample.clip) | {"max_tokens": 1}
+        sample = item_sample("cot", frames, cfg, control, mode, item)
+        request = request_fields(cfg, mode, sample.clip) | {"max_tokens": 1}
         request["extra_body"]["return_token_ids"] = True
-        told = client.chat.completions.create(model="tiny", messages=chat_of(sample), **request)
+        told = client.chat.completions.create(
+            model="tiny", messages=build_messages(sample), **request
+        )
         assert told.model_extra["prompt_token_ids"] == encode(sample, processor, 1500).input_ids
 
 
@@ -177,12 +179,12 @@ def test_a_server_answers_as_the_student_that_was_merged(
 
 def likeliest_served(server, model, cfg, store, item) -> tuple[list[int], list[float]]:
     """The likeliest first tokens of an answer, and their log-probabilities."""
-    sample = shown("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
-    request = request_of(cfg, "answer", sample.clip)
+    sample = item_sample("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
+    request = request_fields(cfg, "answer", sample.clip)
     request |= {"max_tokens": 1, "logprobs": True, "top_logprobs": 10}
     request["extra_body"]["return_tokens_as_token_ids"] = True
     client = openai.OpenAI(base_url=server.url, api_key="none")
-    reply = client.chat.completions.create(model=model, messages=chat_of(sample), **request)
+    reply = client.chat.completions.create(model=model, messages=build_messages(sample), **request)
     likeliest = reply.choices[0].logprobs.content[0].top_logprobs
     tokens = [int(top.token.removeprefix("token_id:")) for top in likeliest]
     return tokens, [top.logprob for top in likeliest]
@@ -190,7 +192,7 @@ def likeliest_served(server, model, cfg, store, item) -> tuple[list[int], list[f
 
 def scored_here(folder, cfg, store, item) -> np.ndarray:
     """The log-probability of every token there, by the standard classes."""
-    sample = shown("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
+    sample = item_sample("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
     processor = AutoProcessor.from_pretrained(folder)
     loading.pin_sizes(processor, cfg.image_size, cfg.frames)
     model = AutoModelForImageTextToText.from_pretrained(folder, dtype="auto").eval()

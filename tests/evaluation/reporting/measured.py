@@ -138,12 +138,12 @@ def similarity_run(
         scores = {model: np.eye(4, dtype=np.float32)[answers], **scores}
     rows, told, lines = [], {}, []
     for title, of in scores.items():
-        credits = nearest_candidate.credits(of, answers)
+        credits = nearest_candidate.credit_choices(of, answers)
         accuracy = accuracy_by_family([i.family for i in items], credits)
         rows.append(SelectionResult.of(store.name, title, SIMILARITY, accuracy, None))
         cells = accuracy_by_group([f"{i.family}/{i.subtype}" for i in items], credits)
         told[title] = {cell: vars(found) for cell, found in cells.items()}
-        lines += nearest_candidate.told(title, items, of)
+        lines += nearest_candidate.format_scores(title, items, of)
     report = {"build": store.identity, "rows": [r.to_dict() for r in rows], "subtypes": told}
     folder = root / "similarity" / (model or name)
     finish(folder, settings, report)

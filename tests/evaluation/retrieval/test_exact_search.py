@@ -8,10 +8,10 @@ import pytest
 from evaluation.metrics.ranking import count_ranks
 from evaluation.retrieval import exact_search
 from evaluation.retrieval.exact_search import (
-    Cut,
+    GridEmbeddings,
     block_scores,
     exact_ranks,
-    least_of_top,
+    kth_scores,
     pair_scores,
     row_sums,
 )
@@ -50,7 +50,9 @@ def same(one: exact_search.Ranks, two: exact_search.Ranks) -> bool:
 
 def test_scores_are_cosines_to_fp32() -> None:
     asked, shown = embeddings(30), embeddings(50, 1)
-    for k, scores in enumerate(block_scores(Cut(asked, WIDTHS), Cut(shown, WIDTHS))):
+    for k, scores in enumerate(
+        block_scores(GridEmbeddings(asked, WIDTHS), GridEmbeddings(shown, WIDTHS))
+    ):
         assert scores.dtype == np.float32
         np.testing.assert_allclose(scores, cosines(asked, shown, WIDTHS[::-1][k]), atol=6e-8)
 
@@ -110,7 +112,7 @@ def test_a_pairs_score_is_its_blocks_to_the_last_bit() -> None:
     rng = np.random.default_rng(0)
     asked = rng.standard_normal((70, 1024), np.float32)
     shown = rng.standard_normal((70, 1024), np.float32)
-    queries, frames = Cut(asked, [1024, 256]), Cut(shown, [1024, 256])
+    queries, frames = GridEmbeddings(asked, [1024, 256]), GridEmbeddings(shown, [1024, 256])
     blocks = list(block_scores(queries, frames))
     for pairs, block in zip(pair_scores(queries, frames), blocks, strict=True):
         assert np.array_equal(pairs, np.diagonal(block))
@@ -126,7 +128,7 @@ def test_products_of_pieces_are_exact() -> None:
     rows = rng.standard_normal((4, 4096))
     rows[1], rows[2] = 1.0, np.abs(rows[2])
     rows[3, 1:] = 0
-    (piece,) = Cut(rows.astype(np.float32), [4096]).pieces
+    (piece,) = GridEmbeddings(rows.astype(np.float32), [4096]).pieces
     products = piece @ piece.T
     whole = [[int(x) for x in row] for row in piece.tolist()]
     for i, a in enumerate(whole):
@@ -155,7 +157,7 @@ def test_an_embedding_of_zeros_is_as_near_to_all() -> None:
 def test_the_least_of_the_first_k_is_the_kth_highest(monkeypatch) -> None:
     asked, shown = embeddings(9), embeddings(120, 1)
     monkeypatch.setattr(exact_search, "FRAMES", 11)
-    least = least_of_top(asked, split(shown, 50), WIDTHS, (1, 10, 200))
+    least = kth_scores(asked, split(shown, 50), WIDTHS, (1, 10, 200))
     for k, width in enumerate(WIDTHS):
         falling = -np.sort(-cosines(asked, shown, width), axis=1)
         np.testing.assert_allclose(least[k, 0], falling[:, 0], atol=6e-8)

@@ -5,19 +5,16 @@ Needs faiss, which the extra `test` brings.
 
 from __future__ import annotations
 
-import json
-import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from conf.errors import UserError
 from evaluation.embedders.cache import EmbeddingCache
 from evaluation.retrieval import faiss_index
 from evaluation.retrieval.exact_search import exact_ranks
-from evaluation.retrieval.faiss_index import IndexResult, approximate_ranks, ranks_of_found
+from evaluation.retrieval.faiss_index import IndexResult, approximate_ranks, ranks_of_results
+from tests.user_errors import raises_user_error
 
 WIDTHS = [32, 8]
 NAMES = [f"scene/{k}" for k in range(900)]
@@ -62,33 +59,24 @@ def test_an_index_is_kept(tmp_path, monkeypatch) -> None:
     assert without_time[0] == without_time[1]
 
 
-def test_an_index_of_another_model_is_refused(tmp_path) -> None:
+def test_indexes_of_other_models_and_faiss_versions_are_separate(tmp_path, monkeypatch) -> None:
+    def indexes() -> set[str]:
+        return {path.name for path in tmp_path.rglob("*.faiss")}
+
     ranks(tmp_path, 4)
-    here, there = embeddings(tmp_path).folder, embeddings(tmp_path, "another").folder
-    shutil.copytree(here / "index", there / "index")
-    with pytest.raises(
-        UserError, match=r"was built for another model or database \(weights is one"
-    ):
-        ranks(tmp_path, 4, "another")
-
-
-def test_an_index_of_an_earlier_faiss_is_built_anew(tmp_path) -> None:
+    first = indexes()
+    ranks(tmp_path, 4, "another")
+    second = indexes() - first
+    monkeypatch.setattr(faiss_index.import_faiss(), "__version__", "1.0")
     ranks(tmp_path, 4)
-    notes = sorted((embeddings(tmp_path).folder / "index").glob("*.json"))
-    before = [note.read_text() for note in notes]
-    for note in notes:
-        note.write_text(json.dumps(json.loads(note.read_text()) | {"faiss": "1.0"}))
-    ranks(tmp_path, 4)
-    assert [note.read_text() for note in notes] == before
+    assert len(first) == len(second) == len(indexes() - first - second) == len(WIDTHS)
 
 
-def test_what_a_kill_left_of_an_index_is_built_again(tmp_path) -> None:
+def test_a_killed_build_is_repeated(tmp_path) -> None:
     _, first = ranks(tmp_path, 4)
-    for path in (embeddings(tmp_path).folder / "index").iterdir():
-        if path.suffix == ".json":
-            path.unlink()
-        else:
-            path.write_bytes(b"torn")
+    for path in (embeddings(tmp_path).folder / "index").glob("*.faiss"):
+        path.with_suffix(".partial").write_bytes(b"torn")
+        path.unlink()
     _, again = ranks(tmp_path, 4)
     assert [t["recall@10"] for t in again] == [t["recall@10"] for t in first]
 
@@ -97,14 +85,14 @@ def test_a_damaged_index_is_named(tmp_path) -> None:
     ranks(tmp_path, 4)
     for path in (embeddings(tmp_path).folder / "index").glob("*.faiss"):
         path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(UserError, match=r"\.faiss is damaged .* delete it"):
+    with raises_user_error("damaged-file", contains=".faiss"):
         ranks(tmp_path, 4)
 
 
 def test_ranks_are_counted_among_what_was_found() -> None:
     frames = np.array([[7, 3, 5, -1], [7, 3, 5, 2], [7, 3, -1, -1]])
     scores = np.array([[0.9, 0.8, 0.8, -9], [0.9, 0.8, 0.8, 0.1], [0.9, 0.8, -9, -9]])
-    found = ranks_of_found([IndexResult(frames, scores, 0, 0)], np.array([5, 7, 4]), [8], 900)
+    found = ranks_of_results([IndexResult(frames, scores, 0, 0)], np.array([5, 7, 4]), [8], 900)
     assert found.greater.tolist() == [[1, 0, 0]]
     assert found.tied.tolist() == [[1, 0, 0]]
     assert found.found.tolist() == [[True, True, False]]
@@ -112,5 +100,5 @@ def test_ranks_are_counted_among_what_was_found() -> None:
 
 def test_without_faiss_it_says_what_to_install(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "faiss", None)
-    with pytest.raises(UserError, match=r"pip install -e '\.\[index\]'"):
+    with raises_user_error("missing-package", contains="[index]"):
         faiss_index.import_faiss()

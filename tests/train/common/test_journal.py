@@ -23,7 +23,7 @@ from conf import trackers
 from conf.entry import Run
 from conf.schema import SftCommand
 from evaluation.generators import local
-from evaluation.generators.model_source import shown
+from evaluation.generators.base import item_sample
 from evaluation.generators.response_log import ResponseLog, collect_responses
 from models import compat, loading
 from models.student.prompts import conversation
@@ -90,9 +90,17 @@ def test_what_is_written_is_what_the_evaluation_reads(
         assert len(written) == 2
         asked = [items[item_id] for item_id in written]
         log = ResponseLog(tmp_path / f"{mode}.jsonl", {mode: {}}, asked)
-        sample_of = partial(shown, "cot", frames, settings.student, None, mode)
+        sample_of = partial(item_sample, "cot", frames, settings.student, None, mode)
         answer = partial(
-            local.say, model, processor, settings.student, "fp32", 2, 0, mode, sample_of
+            local.generate_responses,
+            model,
+            processor,
+            settings.student,
+            "fp32",
+            2,
+            0,
+            mode,
+            sample_of,
         )
         given = collect_responses(asked, mode, answer, log)
         for answer in given:

@@ -1,0 +1,86 @@
+"""Encoders that read a prefix and its question as one input, and the loading of any encoder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from conf.schema import RetrieverConfig
+from data.records import FrameRef
+from data.render.frame_cache import FrameReader
+from evaluation.embedders.base import Encoder, Query
+from evaluation.retrieval.late_interaction import embed_rows
+from models.compat import keep_freed_memory
+from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
+
+if TYPE_CHECKING:
+    from models.retriever.embedder import Retriever
+
+MAX_TOKEN_PAIRS = 64 * 512**2
+"""Maximum entries of a text batch's attention mask: 64 texts of 512 tokens, the default length of a
+response. A tokenizer splits unknown text into many more tokens, and then 64 texts need many GB."""
+
+
+class JointEncoder:
+    """An encoder of sentence-transformers with separate instructions for queries and frames."""
+
+    def __init__(self, model: Retriever, preset: RetrieverConfig) -> None:
+        self._model, self._preset = model, preset
+
+    def queries(self, queries: list[Query], frames: FrameReader) -> np.ndarray:
+        inputs = [query_input(query, frames, self._preset) for query in queries]
+        return self._encode(inputs, self._preset.query_instruction, "query")
+
+    def frames(self, refs: list[FrameRef], frames: FrameReader) -> np.ndarray:
+        inputs = [frame_input(ref, frames) for ref in refs]
+        return self._encode(inputs, self._preset.frame_instruction, "frame")
+
+    def images(self, images: list[np.ndarray]) -> np.ndarray:
+        inputs = [Image.fromarray(pixels) for pixels in images]
+        return self._encode(inputs, self._preset.frame_instruction, "frame")
+
+    def texts(self, texts: list[str]) -> np.ndarray:
+        longest = max(map(len, self._model.tokenizer(texts)["input_ids"]))
+        size = max(1, MAX_TOKEN_PAIRS // max(1, longest) ** 2)
+        instruction = self._preset.query_instruction
+        batches = [texts[k : k + size] for k in range(0, len(texts), size)]
+        return np.concatenate([self._encode(batch, instruction, "query") for batch in batches])
+
+    def _encode(self, inputs: list[Any], prompt: str, kind: str) -> np.ndarray:
+        if self._preset.late is not None:
+            return embed_rows(self._model, inputs, prompt, kind)
+        embeddings = self._model.encode(
+            inputs, prompt=prompt, batch_size=len(inputs), show_progress_bar=False
+        )
+        return np.asarray(embeddings, dtype=np.float32)
+
+
+def trained_encoder(preset: RetrieverConfig, precision: str, saved: Path) -> Encoder:
+    """Load a retriever that `train.contrastive` saved. Errors are those of `load_trained`."""
+    keep_freed_memory()
+    return JointEncoder(load_trained(preset, precision, saved), preset)
+
+
+def released_encoder(preset: RetrieverConfig, precision: str, folder: Path) -> Encoder:
+    """Load a preset's model as it was released; `folder` holds a base that was built from a seed.
+
+    Raises:
+        UserError: The model cannot be loaded, is incomplete, or is not of the preset's encoder.
+    """
+    keep_freed_memory()
+    if preset.encoder == "vlm2vec":
+        from evaluation.embedders.vlm2vec import load_vlm2vec
+
+        return JointEncoder(load_vlm2vec(preset, precision), preset)
+    if preset.encoder == "dual":
+        from evaluation.embedders.dual_encoder import load_dual
+
+        return load_dual(preset, precision)
+    if preset.encoder == "languagebind":
+        from evaluation.embedders.languagebind import load_languagebind
+
+        return load_languagebind(preset, precision)
+    return JointEncoder(load_retriever(preset, precision, [], folder), preset)

@@ -1,0 +1,114 @@
+"""The interface of generators, and the settings that identify their responses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+from conf.schema import SelectCommand, SftCommand, StudentConfig, TwoStageCommand
+from data.records import SelectionItem
+from data.render.frame_cache import FrameReader
+from evaluation.generators.response_log import RECORD_MODES, SaveResponses, Subject
+from evaluation.generators.response_schema import instruction as record_instruction
+from evaluation.generators.response_schema import schema
+from models.precision import resolve_precision
+from models.student.generation import response_token_limit
+from models.student.prompts import Sample, instructed_sample, instruction
+
+INPUTS = 1
+"""Version of the prompts' layout; raise it when the layout changes, so that earlier responses are
+not reused."""
+
+
+class Generator(Protocol):
+    """A model that responds to selection items, queries or frames.
+
+    Attributes:
+        name: Its name in tables.
+        revision: What identifies its weights; responses are reused only for the same revision.
+    """
+
+    name: str
+    revision: dict[str, Any]
+
+    def respond(
+        self,
+        mode: str,
+        sample_of: Callable[[Subject], Sample],
+        subjects: list[Subject],
+        save: SaveResponses,
+    ) -> None:
+        """Respond to each subject, prompted by its sample, and save responses as they finish."""
+
+
+def open_generator(
+    cfg: SelectCommand | TwoStageCommand,
+    folder: Path | None,
+    trained: SftCommand | SelectCommand | TwoStageCommand,
+) -> Generator:
+    """Return the model that `cfg` selects: on servers if `server.url` is set, else local.
+
+    Args:
+        folder: The run or export of a trained student; None for a base.
+        trained: The settings of that run, or the command's own.
+
+    Raises:
+        UserError: The model cannot be loaded, no server responds, or its base is not the one that
+            the student was trained on.
+    """
+    if cfg.server.url is not None:
+        from evaluation.generators.openai_server import ServedModel
+
+        return ServedModel(cfg, folder, trained.student)
+    from evaluation.generators.local import LocalModel
+
+    return LocalModel(cfg, folder, trained.student, resolve_precision(trained.train.precision))
+
+
+def item_instruction(mode: str, regime: str) -> str:
+    """Return the instruction of a selection item in a mode; `regime` is that of the training."""
+    return record_instruction() if mode in RECORD_MODES else instruction(mode, regime)
+
+
+def item_sample(
+    regime: str,
+    frames: FrameReader,
+    cfg: StudentConfig,
+    control: str | None,
+    mode: str,
+    item: SelectionItem,
+) -> Sample:
+    """Return a selection item's prompt in a mode for a student of a regime."""
+    return instructed_sample(
+        item, mode, item_instruction(mode, regime), frames, cfg.frames, control=control
+    )
+
+
+def response_settings(
+    mode: str,
+    regime: str,
+    student: StudentConfig,
+    seed: int,
+    revision: dict[str, Any],
+    benchmark: str,
+    control: str | None,
+) -> dict[str, Any]:
+    """Return everything that a response in a mode depends on, except its subject."""
+    sampling: dict[str, Any] = {
+        "max_new_tokens": response_token_limit(mode, student.max_new_tokens, student.thinking)
+    }
+    sampling |= {"thinking": student.thinking, "temperature": student.temperature}
+    if student.temperature:
+        sampling |= {"top_p": student.top_p, "top_k": student.top_k, "seed": seed}
+    return {
+        "model": revision,
+        "benchmark": benchmark,
+        "control": control,
+        "prompt": item_instruction(mode, regime),
+        "inputs": INPUTS,
+        "frames": student.frames,
+        "image_size": student.image_size,
+        "schema": schema() if mode == "constrained" else None,
+        "sampling": sampling,
+    }
