@@ -80,8 +80,8 @@ _NAMED_LETTER = re.compile(
 )
 _REFUSAL = re.compile(
     r"^(?:none|null|n/?a|nil|no|neither|unknown|unsure|abstain|refused?|declined?|pass)$"
-    r"|(?:can\s?not|can'?t|unable to|impossible to|hard to|not able to|do(?: not|n'?t)|could not)\s+"
-    r"(?:be\s+)?(?:reliably\s+)?(?:determine|tell|answer|decide|choose|select|pick|identify|say|"
+    r"|(?:can\s?not|can'?t|unable to|impossible to|hard to|not able to|do(?: not|n'?t)|could not)"
+    r"\s+(?:be\s+)?(?:reliably\s+)?(?:determine|tell|answer|decide|choose|select|pick|identify|say|"
     r"know|see\b|view|assist|help|provide|comply)"
     r"|\bsorry\b|refuse to|(?:not enough|insufficient) (?:information|evidence|data)|\bnone of\b"
     r"|\bor none\b|\bno (?:correct|valid|suitable|clear|single) "
