@@ -202,6 +202,8 @@ def _settings_error(command: str, schema: type, error: Exception) -> SettingsErr
 def _unknown_key(command: str, schema: type, key: str) -> str:
     if key in REMOVED_KEYS:
         return f"{key} was removed: {REMOVED_KEYS[key]}"
+    if key.startswith("hydra."):
+        return f"Hydra has no key {key}"
     defaults = OmegaConf.to_container(hydra_compose(config_name(command)))
     guess = nearest(key, [*keys(schema), *flatten(defaults), *OVERLAYS])
     hint = f"; did you mean {'+' if guess in OVERLAYS else ''}{guess}?" if guess else ""

@@ -52,6 +52,7 @@ def test_removed_key_names_its_replacement(monkeypatch):
         ("student.name=???", "missing-setting", "student.name"),
         ("student.architecture.layers=2", "invalid-setting", "student.architecture.layers"),
         ("train.lr=${nope}", "invalid-setting", ("train.lr", "nope")),
+        ("hydra.launcher.nope=1", "unknown-key", "hydra.launcher.nope"),
         ("hydra/launcher=nope", "invalid-setting", ("hydra/launcher/nope", "process")),
         ("benchmark.selection.event.new.train=3", "unknown-key", "benchmark.selection.event.new"),
         ("+benchmark.selection.event={new: {trian: 3}}", "unknown-key", "event.new.trian"),
