@@ -1,20 +1,16 @@
-"""The student's trainer beside TRL's SFTTrainer on a CPU, over the tiny base. Needs the extra
-`bench`.
+"""The student's trainer beside TRL's SFTTrainer on a CPU, over the tiny base (extra `bench`).
 
     python -m benchmarks.speed.sft speed
     python -m benchmarks.speed.sft loss
-    python -m benchmarks.speed.sft start
 
-`speed` trains the tiny benchmark's samples in every variant, each in a process of its own, in
-turns: medians over the rounds of samples a second and of the process's peak memory, and of each
-round's ratio to ours. TRL is measured as it comes, with each setting that could help it, with the
-MALLOC_* variables set, by which its user has what our trainer asks of glibc itself, and on what its
-own collator can show, frames as images. The loss is the last step's, by each one's own convention.
+`speed` trains the tiny benchmark's samples with every variant, each in its own process, in turns.
+It prints medians over the rounds of samples per second and peak memory, and of their ratios to
+ours. TRL runs with its default settings, with each setting that could help it, and with the
+MALLOC_* variables that replace our trainer's call of mallopt. Each loss follows its trainer's own
+convention.
 
-`loss` trains over the unquantised base in fp32 and holds the losses of all steps against TRL's,
-ours in its convention: the mean over a micro-batch's tokens, and then over micro-batches.
-
-`start` times from the command to the end of its first step, with caches warm.
+`loss` trains over the unquantised base in fp32 and compares the losses of all steps with TRL's; our
+trainer then uses TRL's convention, the mean over a micro-batch's tokens and over micro-batches.
 """
 
 from __future__ import annotations
@@ -26,9 +22,6 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -46,202 +39,87 @@ MALLOC = {
     "MALLOC_TRIM_THRESHOLD_": str((1 << 31) - 1),
     "MALLOC_TOP_PAD_": str(64 << 20),
 }
-"""What `models.compat.keep_freed_memory` sets, as a user can before a process starts."""
-OURS, DEFAULT = "ours", "TRL as it comes"
-PLAIN = {"trainer": "trl"}
+"""The environment variables for what `models.compat.keep_freed_memory` sets in the process."""
+OURS, DEFAULT = "ours", "TRL, default settings"
+TRL = {"trainer": "trl"}
 VARIANTS: dict[str, dict[str, Any]] = {
     OURS: {"micro_batch": 4},
-    "ours, micro-batch 8": {},
-    "ours, recomputing": {"micro_batch": 4, "recompute": True},
-    DEFAULT: PLAIN | {"recompute": True},
-    "TRL, activations kept": PLAIN,
-    "TRL, kept, eager attention": PLAIN | {"attention": "eager"},
-    "TRL, kept, micro-batch 4": PLAIN | {"micro_batch": 4},
-    "TRL, kept, micro-batch 16": PLAIN | {"micro_batch": 16},
-    "TRL, kept, a worker": PLAIN | {"workers": 1},
-    "TRL, kept, MALLOC_*": PLAIN | {"environment": MALLOC},
-    "TRL, kept, eager, MALLOC_*": PLAIN | {"attention": "eager", "environment": MALLOC},
-    "TRL, kept, eager, 4, MALLOC_*": PLAIN
-    | {"attention": "eager", "micro_batch": 4, "environment": MALLOC},
-}
-IMAGES: dict[str, dict[str, Any]] = {
-    OURS: {"micro_batch": 4},
-    DEFAULT: PLAIN | {"recompute": True, "collator": "own"},
-    "TRL, activations kept": PLAIN | {"collator": "own"},
-    "TRL, kept, eager, MALLOC_*": PLAIN
-    | {"collator": "own", "attention": "eager", "environment": MALLOC},
+    "ours, activations recomputed": {"micro_batch": 4, "recompute": True},
+    DEFAULT: {**TRL, "recompute": True},
+    "TRL, activations kept": TRL,
+    "TRL, kept, micro-batch 4": {**TRL, "micro_batch": 4},
+    "TRL, kept, a worker": {**TRL, "workers": 1},
+    "TRL, kept, MALLOC_*": {**TRL, "environment": MALLOC},
+    "TRL, kept, 4, MALLOC_*": {**TRL, "micro_batch": 4, "environment": MALLOC},
 }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(required=True)
-    for name, steps, measure in (
-        ("speed", 8, measure_speed),
-        ("loss", 6, measure_loss),
-        ("start", 1, measure_start),
-    ):
+    for name, steps, measure in (("speed", 8, measure_speed), ("loss", 6, measure_loss)):
         command = commands.add_parser(name)
-        command.add_argument("--steps", type=int, default=steps, help="steps that count")
+        command.add_argument("--steps", type=int, default=steps, help="steps after the first")
         command.add_argument("--rounds", type=int, default=3)
-        command.add_argument("--store", default="store", help="where the tiny benchmark is")
+        command.add_argument("--store", default="store", help="folder of the built benchmarks")
         command.set_defaults(measure=measure)
-    single = commands.add_parser("one", help="one variant, for the others")
+    single = commands.add_parser("one", help="one variant; used by the others")
     single.add_argument("variant", type=json.loads)
-    single.set_defaults(measure=print_one)
+    single.set_defaults(measure=lambda args: print(json.dumps(train_one(**args.variant))))
     args = parser.parse_args()
     args.measure(args)
 
 
 def measure_speed(args: argparse.Namespace) -> None:
-    for title, variants, images in (
-        ("Clips as videos, TRL by our collator", VARIANTS, False),
-        ("Their frames as images, TRL by its own collator", IMAGES, True),
-    ):
-        rounds = [
-            {
-                name: in_process(args, name, switches, images=images)
-                for name, switches in variants.items()
-            }
-            for _ in range(args.rounds)
-        ]
-        print(f"\n{title}: {args.steps} steps of {rounds[0][OURS]['batch']} samples", flush=True)
-        print(f"{'':<34}{'samples/s':>10}{'of ours':>9}{'peak GiB':>10}{'of ours':>9}{'loss':>9}")
-        for name in variants:
-            print_line(name, rounds)
-        peers = [name for name in variants if "trainer" in variants[name]]
-        bare = [name for name in peers if "environment" not in variants[name]]
-        for what, name in (
-            ("as it comes", peers[0]),
-            ("at its best without MALLOC_*", max(bare, key=partial(rate, rounds))),
-            ("at its best", max(peers, key=partial(rate, rounds))),
-        ):
-            times = statistics.median(r[OURS]["rate"] / r[name]["rate"] for r in rounds)
-            print(f"{times:.2f} times TRL {what} ({name})", flush=True)
-
-
-def rate(rounds: list[dict[str, Any]], name: str) -> float:
-    return statistics.median(r[name]["rate"] for r in rounds)
-
-
-def print_line(name: str, rounds: list[dict[str, Any]]) -> None:
-    """A variant's medians, and those of its share of ours in each round."""
-    line = f"{name:<34}"
-    for key, width in (("rate", 10), ("peak", 10)):
-        line += f"{statistics.median(r[name][key] for r in rounds):>{width}.2f}"
-        line += f"{statistics.median(r[name][key] / r[OURS][key] for r in rounds):>9.2f}"
-    print(f"{line}{rounds[0][name]['losses'][-1]:>9.4f}", flush=True)
+    rounds = [
+        {name: train_in_process(args, name, **variant) for name, variant in VARIANTS.items()}
+        for _ in range(args.rounds)
+    ]
+    print(f"{args.steps} steps of {rounds[0][OURS]['batch']} samples")
+    print(f"{'':<34}{'samples/s':>10}{'of ours':>9}{'peak GiB':>10}{'of ours':>9}{'loss':>9}")
+    for name in VARIANTS:
+        line = f"{name:<34}"
+        for key in ("rate", "peak"):
+            line += f"{statistics.median(r[name][key] for r in rounds):>10.2f}"
+            line += f"{statistics.median(r[name][key] / r[OURS][key] for r in rounds):>9.2f}"
+        print(f"{line}{rounds[0][name]['losses'][-1]:>9.4f}", flush=True)
+    peers = [name for name, variant in VARIANTS.items() if "trainer" in variant]
+    best = max(peers, key=lambda name: statistics.median(r[name]["rate"] for r in rounds))
+    for name in (DEFAULT, best):
+        ratio = statistics.median(r[OURS]["rate"] / r[name]["rate"] for r in rounds)
+        print(f"{ratio:.2f} times {name}", flush=True)
 
 
 def measure_loss(args: argparse.Namespace) -> None:
     exact = {"precision": "fp32", "quantization": "none"}
-    mine = in_process(args, OURS, {}, convention="trl", **exact)["losses"]
-    theirs = in_process(args, DEFAULT, VARIANTS[DEFAULT], **exact)["losses"]
-    print(f"{'step':>4}{'ours':>12}{'TRL':>12}{'apart':>12}")
-    for step, (loss, other) in enumerate(zip(mine, theirs, strict=True), 1):
+    ours = train_in_process(args, OURS, trl_loss=True, **exact)["losses"]
+    theirs = train_in_process(args, DEFAULT, **VARIANTS[DEFAULT], **exact)["losses"]
+    print(f"{'step':>4}{'ours':>12}{'TRL':>12}{'difference':>12}")
+    for step, (loss, other) in enumerate(zip(ours, theirs, strict=True), 1):
         print(f"{step:>4}{loss:>12.6f}{other:>12.6f}{abs(loss - other):>12.1e}")
 
 
-def measure_start(args: argparse.Namespace) -> None:
-    ways = {
-        "ours, which first measures 64 items a mode": partial(start_ours, args.store, 64),
-        "ours, measuring one item a mode": partial(start_ours, args.store, 1),
-        DEFAULT: partial(start_trls, args.store),
-    }
-    times: dict[str, list[float]] = {name: [] for name in ways}
-    # The first round warms the caches.
-    for _ in range(args.rounds + 1):
-        for name, way in ways.items():
-            times[name].append(way())
-    print("from the command to the end of its first step, s")
-    for name, found in times.items():
-        print(f"{name:<46}{statistics.median(found[1:]):>8.1f}")
-
-
-def start_ours(store: str, measured: int) -> float:
-    """Seconds until `train.sft` has its first step in its journal."""
-    with tempfile.TemporaryDirectory() as folder:
-        settings = [*OVERRIDES, f"store={store}", f"checkpoints={folder}", "run=first"]
-        settings += ["train.max_steps=1", "train.evaluations=1"]
-        settings += [f"train.validation_items={measured}"]
-        journal = Path(folder) / "sft" / "first" / "metrics.jsonl"
-        with started([sys.executable, "-m", "train.sft", *settings]) as (process, since):
-            while not (journal.exists() and '"loss"' in journal.read_text()):
-                if process.poll():
-                    raise RuntimeError("train.sft has failed")
-                time.sleep(0.01)
-            return time.perf_counter() - since
-
-
-def start_trls(store: str) -> float:
-    """Seconds until TRL, given the same samples, has trained for a step."""
-    variant = {"name": DEFAULT, "steps": 1, "store": store, **VARIANTS[DEFAULT]}
-    with started(one(variant)) as (process, since):
-        if not any(line.startswith("{") for line in process.stdout or ()):
-            raise RuntimeError("TRL has failed")
-        return time.perf_counter() - since
-
-
-@contextmanager
-def started(command: list[str]) -> Iterator[tuple[subprocess.Popen[str], float]]:
-    """A process that ends with the block, and when it was started. Nothing that it says but an
-    error is shown."""
-    with tempfile.TemporaryFile("w+") as said:
-        since = time.perf_counter()
-        process = subprocess.Popen(
-            command, env=environment({}), text=True, stdout=subprocess.PIPE, stderr=said
-        )
-        try:
-            yield process, since
-        except RuntimeError:
-            said.seek(0)
-            print(said.read(), file=sys.stderr)
-            raise
-        finally:
-            process.kill()
-            process.wait()
-
-
-def in_process(
-    args: argparse.Namespace, name: str, switches: dict[str, Any], **settings: Any
-) -> dict[str, Any]:
-    """What `train_one` gives in a process of its own."""
-    variant = {"name": name, "steps": args.steps + 1, "store": args.store, **switches, **settings}
-    done = subprocess.run(
-        one(variant),
-        env=environment(switches.get("environment", {})),
-        text=True,
-        capture_output=True,
-    )
+def train_in_process(args: argparse.Namespace, name: str, **variant: Any) -> dict[str, Any]:
+    """The result of `train_one` in a new process."""
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1", **variant.pop("environment", {})}
+    settings = {"name": name, "steps": args.steps + 1, "store": args.store, **variant}
+    command = [sys.executable, "-m", "benchmarks.speed.sft", "one", json.dumps(settings)]
+    done = subprocess.run(command, env=environment, text=True, capture_output=True)
     if done.returncode:
         print(done.stderr, file=sys.stderr)
-        raise RuntimeError(f"{name} has failed")
+        raise RuntimeError(f"{name} failed")
     return json.loads(done.stdout.splitlines()[-1])
-
-
-def one(variant: dict[str, Any]) -> list[str]:
-    """The command that trains a variant in a process of its own."""
-    return [sys.executable, "-m", "benchmarks.speed.sft", "one", json.dumps(variant)]
-
-
-def environment(own: dict[str, str]) -> dict[str, str]:
-    return {**os.environ, "HF_HUB_OFFLINE": "1", **own}
-
-
-def print_one(args: argparse.Namespace) -> None:
-    print(json.dumps(train_one(**args.variant)), flush=True)
 
 
 def train_one(
     store: str,
     steps: int,
-    images: bool = False,
     precision: str = "auto",
     quantization: str = "nf4",
-    convention: str = "ours",
-    **switches: Any,
+    trl_loss: bool = False,
+    **variant: Any,
 ) -> dict[str, Any]:
-    """Train a variant here: samples a second and a step, losses, and the process's peak memory."""
+    """Train one variant in this process: samples per second, losses and peak memory in GiB."""
     from torch.utils.data import Subset
     from transformers import set_seed
 
@@ -253,11 +131,11 @@ def train_one(
     from train.student.length_sampler import LengthSampler
     from train.student.run import load_datasets
 
-    variant = sft_runs.Variant(**switches)
     cfg = compose("train.sft", SftCommand, OVERRIDES)
     cfg.train.precision, cfg.student.quantization = resolve_precision(precision), quantization
     built = ensure_benchmark(cfg.benchmark, Path(store), cfg.workers)
     rationales = ensure_rationales(built, cfg.teacher)
+    variant = sft_runs.Variant(**variant)
     if variant.trainer == "ours":
         compat.keep_freed_memory()
     set_seed(sft_runs.SEED)
@@ -265,15 +143,14 @@ def train_one(
     training, _ = load_datasets(cfg, built, rationales)
     lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
     order = islice(LengthSampler(lengths, cfg.train.batch, cfg.seed), steps * cfg.train.batch)
-    shown = sft_runs.AsImages(training) if images else training
-    work = sft_runs.Work(
-        model, processor, Subset(shown, list(order)), cfg.train, cfg.student.max_length
+    student = sft_runs.Student(
+        model, processor, Subset(training, list(order)), cfg.train, cfg.student.max_length
     )
-    settings = {}
-    if convention == "trl":
-        settings["loss"] = partial(mean_of_means, cfg.train.batch // variant.micro_batch)
+    options = {}
+    if trl_loss:
+        options["loss"] = partial(mean_of_means, cfg.train.batch // variant.micro_batch)
     with tempfile.TemporaryDirectory() as folder:
-        figures = sft_runs.run(variant, work, steps, Path(folder), **settings)
+        figures = sft_runs.train(variant, student, steps, Path(folder), **options)
     return {
         "batch": cfg.train.batch,
         "rate": cfg.train.batch * len(figures.seconds) / (sum(figures.seconds) or 1),
@@ -285,8 +162,7 @@ def train_one(
 def mean_of_means(
     micro_batches: int, outputs: Any, labels: torch.Tensor, num_items_in_batch: Any = None
 ) -> torch.Tensor:
-    """TRL's loss for this model: the mean over a micro-batch's supervised tokens, and over the
-    micro-batches of a step."""
+    """TRL's loss for this model: the mean over a micro-batch's tokens, then over micro-batches."""
     from train.student.trainer import token_mean
 
     return token_mean(outputs, labels) / micro_batches

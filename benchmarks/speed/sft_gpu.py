@@ -1,17 +1,15 @@
-"""The student's trainer beside TRL's SFTTrainer at the released sizes, with each switch on and off:
-samples a second, peak memory and the share of the card's bf16 peak, in one run.
+"""The student's trainer beside TRL's SFTTrainer at the released sizes, setting by setting: samples
+per second, peak memory and the share of the card's bf16 peak.
 
     python -m benchmarks.speed.sft_gpu qwen3_vl_8b --base nf4
-    python -m benchmarks.speed.sft_gpu tiny       # the same in small, on any machine
+    python -m benchmarks.speed.sft_gpu tiny       # a small version for any machine
 
-Weights are random, of the released model's shape, and made on the card, so nothing is fetched;
-4-bit ones are quantised there. Everything else is the preset's: adapters, frames, a step of 16
-samples, half of them rationales of 80 to 250 words, half answers. The peak is what the machine's
-own matrix products reach in the same run; of a step only the passes that it needs count, none that
-padding, recomputed activations or unsupervised rows of the head add. Where TRL is not installed,
-ours is measured alone; PYTHONPATH may name a folder that holds it (pip install --no-deps --target).
-The rate of what the trainer itself chooses is kept for benchmarks.speed.hours, where a card
-measured it.
+Weights have the released model's shape and random values, so nothing is downloaded. All other
+settings are the preset's: adapters, frames, a step of 16 samples, half of them rationales of 80 to
+250 words, half answers. The peak is the rate of the machine's own matrix products in the same run.
+Only necessary passes count as work: no padding, no recomputation, no unsupervised rows of the head.
+Without TRL only our trainer is measured; PYTHONPATH may name a folder that contains it. The rate of
+the preset's own settings is recorded for benchmarks.speed.hours if a GPU measured it.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from transformers import ProcessorMixin, Qwen3VLConfig, Qwen3VLForConditionalGeneration, set_seed
 
 from benchmarks.speed import hours
-from benchmarks.speed.sft_runs import SEED, Figures, Variant, Work, device_name, run
+from benchmarks.speed.sft_runs import SEED, Figures, Student, Variant, device_name, train
 from conf.compose import compose
 from conf.errors import UserError
 from conf.schema import SftCommand, StudentConfig
@@ -56,44 +54,35 @@ CONFIGS = {
     "qwen3_vl_2b": ROOT / "tests/models/configs/qwen3_vl_2b.json",
     "qwen3_vl_8b": ROOT / "tests/models/configs/qwen3_vl_8b.json",
 }
-SAID = "the blue metal cube near the top moves quickly toward the west and will be very close"
+WORDS = "the blue metal cube near the top moves quickly toward the west and will be very close"
 SHORTEST, LONGEST = 80, 250
-"""Words of a rationale."""
+"""The range of a rationale's length in words."""
 
 
 def variants() -> list[Variant]:
-    """Ours with one switch moved a line, and TRL as it comes and with all that could help it."""
+    """Ours with one setting changed at a time, and TRL with the settings that could help it."""
     ours = [
         Variant("ours, activations kept", micro_batch=1),
         Variant("  micro-batch 4", micro_batch=4, packing="false"),
         Variant("  micro-batch 4, packed", micro_batch=4, packing="true"),
-        Variant("  micro-batch 8", micro_batch=8, packing="false"),
         Variant("  the library's attention (sdpa)", micro_batch=1, attention="sdpa"),
-        Variant("  every row passes the head", micro_batch=1, collator="every row"),
-        Variant("  the frozen tower's features reused", micro_batch=1, reuse=True),
+        Variant("  every row passes through the head", micro_batch=1, every_row=True),
+        Variant("  vision features reused", micro_batch=1, reuse=True),
         Variant("  4 workers", micro_batch=1, workers=4),
         Variant("  micro-batch 4, 4 workers", micro_batch=4, packing="false", workers=4),
     ]
     trl = [
         Variant("TRL, activations kept", "trl", micro_batch=1),
-        Variant("  4 workers", "trl", micro_batch=1, workers=4),
         Variant("  micro-batch 4", "trl", micro_batch=4),
         Variant("  micro-batch 4, 4 workers", "trl", micro_batch=4, workers=4),
         Variant("  micro-batch 8, 4 workers", "trl", micro_batch=8, workers=4),
     ]
     if (flash := flash_attention("bf16")) is not None:
-        trl += [
-            Variant(
-                f"  micro-batch {size}, 4 workers, {flash}", "trl", size, False, 4, attention=flash
-            )
-            for size in (1, 4)
-        ]
-    # What recomputing hooks into the embeddings stays there, so those lines come last.
-    ours_last = [Variant("ours, recomputed", micro_batch=1, recompute=True)]
-    trl_last = [
-        Variant("TRL as it comes (micro-batch 8, recomputed)", "trl", recompute=True),
-        Variant("TRL, micro-batch 1, recomputed", "trl", micro_batch=1, recompute=True),
-    ]
+        name = f"  micro-batch 4, 4 workers, {flash}"
+        trl.append(Variant(name, "trl", micro_batch=4, workers=4, attention=flash))
+    # Recomputation leaves hooks in the embeddings, so these variants come last.
+    ours_last = [Variant("ours, activations recomputed", micro_batch=1, recompute=True)]
+    trl_last = [Variant("TRL, default (micro-batch 8, recomputed)", "trl", recompute=True)]
     if importlib.util.find_spec("trl") is None:
         return ours + ours_last
     return ours + trl + ours_last + trl_last
@@ -102,15 +91,13 @@ def variants() -> list[Variant]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("student", choices=list(CONFIGS))
-    parser.add_argument(
-        "--base", choices=["nf4", "bf16"], action="append", help="both, if not given"
-    )
-    parser.add_argument("--steps", type=int, default=4, help="timed steps a line, after one")
+    parser.add_argument("--base", choices=["nf4", "bf16"], action="append", help="default: both")
+    parser.add_argument("--steps", type=int, default=4, help="timed steps after a first one")
     args = parser.parse_args()
     warnings.simplefilter("ignore", FutureWarning)
     logging.disable(logging.WARNING)
     if torch.cuda.device_count() > 1:
-        parser.error("one card is measured: set CUDA_VISIBLE_DEVICES=0")
+        parser.error("this measures one GPU: set CUDA_VISIBLE_DEVICES=0")
     compat.keep_freed_memory()
     for base in args.base or ["nf4", "bf16"]:
         measure(args.student, base, args.steps)
@@ -121,80 +108,86 @@ def measure(name: str, base: str, steps: int) -> None:
     student, device = settings.student, torch.device("cuda" if torch.cuda.is_available() else "cpu")
     student.quantization = "nf4" if base == "nf4" else "none"
     set_seed(SEED)
-    model, processor = built(name, student, device)
-    shown = noise(student, settings.train.batch)
-    places = list(range(len(shown))) * (steps + 1)
-    work = Work(model, processor, Subset(shown, places), settings.train, student.max_length)
-    bench = Bench(work, student, step_flops(model, processor, shown, student), product_rate(device))
-    print(f"\n{name} over {base} on {device_name()}, {bench.limit / 1e12:.1f} TFLOP/s of products")
+    model, processor = build_student(name, student, device)
+    samples = noise_samples(student, settings.train.batch)
+    order = list(range(len(samples))) * (steps + 1)
+    subject = Student(model, processor, Subset(samples, order), settings.train, student.max_length)
+    flops = step_flops(model, processor, samples, student)
+    bench = Bench(subject, student, flops, product_rate(device))
+    print(f"\n{name} over {base} on {device_name()}, {bench.limit / 1e12:.1f} TFLOP/s")
     print(parameter_counts.format_towers(parameter_counts.count_towers(model)))
-    print(f"{len(shown)} samples a step, {bench.flops / 1e12:.1f} TFLOP")
+    print(f"{len(samples)} samples a step, {bench.flops / 1e12:.1f} TFLOP")
     print(f"{'':<48}{'s/step':>9}{'samples/s':>11}{'of peak':>9}{'peak GiB':>10}", flush=True)
-    found = [(variant.trainer, bench.line(variant, steps)) for variant in variants()]
+    times = [(variant.trainer, bench.measure(variant, steps)) for variant in variants()]
     preset = Variant(
-        "ours, as in the preset",
+        "ours, the preset's settings",
         micro_batch=settings.train.micro_batch,
         recompute=settings.train.gradient_checkpointing,
     )
-    chosen = bench.line(preset, steps)
-    if chosen is not None and device.type == "cuda":
-        hours.add("sft_gpu", name, base, settings.train.batch / chosen, device_name())
-    found.append(("ours", chosen))
+    own = bench.measure(preset, steps)
+    if own is not None and device.type == "cuda":
+        hours.add("sft_gpu", name, base, settings.train.batch / own, device_name())
+    times.append(("ours", own))
     fastest = {
-        trainer: min((s for by, s in found if by == trainer and s is not None), default=None)
+        trainer: min((s for by, s in times if by == trainer and s is not None), default=None)
         for trainer in ("ours", "trl")
     }
     if None in fastest.values():
-        lacking = [trainer for trainer, seconds in fastest.items() if seconds is None]
-        print(f"no line of {' or '.join(lacking)} was run, so there is no ratio")
+        missing = [trainer for trainer, seconds in fastest.items() if seconds is None]
+        print(f"no ratio: no variant of {' or '.join(missing)} ran")
     else:
-        print(f"at its best {fastest['trl'] / fastest['ours']:.2f} times TRL's best")
+        print(f"ours at best {fastest['trl'] / fastest['ours']:.2f} times TRL at best")
 
 
 @dataclass
 class Bench:
-    """A student, what a step of it takes (FLOP), and what the machine's products reach (FLOP/s)."""
+    """Measures variants of a student's training.
 
-    work: Work
+    Attributes:
+        flops: The FLOP of a step's necessary passes.
+        limit: The FLOP/s of the machine's own matrix products.
+    """
+
+    subject: Student
     student: StudentConfig
     flops: float
     limit: float
 
     def __post_init__(self) -> None:
-        trained = dict(self.work.model.named_parameters())
+        trained = dict(self.subject.model.named_parameters())
         self._adapters = {n: p.detach().clone() for n, p in trained.items() if p.requires_grad}
 
-    def line(self, variant: Variant, steps: int) -> float | None:
-        """Train some steps and print what they took; gives the median step's seconds."""
-        self.renew()
-        figures = self.trained(variant, steps)
+    def measure(self, variant: Variant, steps: int) -> float | None:
+        """Train some steps, print the measurements and return the median seconds of a step."""
+        self.reset()
+        figures = self.train(variant, steps)
         if isinstance(figures, str):
             print(f"{variant.name:<48}{figures}", flush=True)
             return None
         seconds = statistics.median(figures.seconds)
         print(
-            f"{variant.name:<48}{seconds:>9.3f}{self.work.train.batch / seconds:>11.2f}"
+            f"{variant.name:<48}{seconds:>9.3f}{self.subject.train.batch / seconds:>11.2f}"
             f"{self.flops / seconds / self.limit:>9.1%}{figures.peak:>10.2f}",
             flush=True,
         )
         return seconds
 
-    def trained(self, variant: Variant, steps: int) -> Figures | str:
-        """Figures, or what kept it from training."""
+    def train(self, variant: Variant, steps: int) -> Figures | str:
+        """The measurements, or the reason why the variant cannot train."""
         try:
             with tempfile.TemporaryDirectory() as folder:
-                return run(variant, self.work, steps + 1, Path(folder))
+                return train(variant, self.subject, steps + 1, Path(folder))
         except torch.OutOfMemoryError:
             return "out of memory"
         except UserError as error:
             return str(error)
 
-    def renew(self) -> None:
-        """The student as it was: TRL gives it bf16 adapters and a forward of its own."""
+    def reset(self) -> None:
+        """Restore the student: TRL casts its adapters to bf16 and replaces its forward."""
         gc.collect()
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
-        model = self.work.model
+        model = self.subject.model
         base = model.get_base_model()
         for name, parameter in model.named_parameters():
             parameter.grad = None
@@ -204,7 +197,9 @@ class Bench:
         choose_attention(base, "bf16", self.student.max_length)
 
 
-def built(name: str, cfg: StudentConfig, device: torch.device) -> tuple[nn.Module, ProcessorMixin]:
+def build_student(
+    name: str, cfg: StudentConfig, device: torch.device
+) -> tuple[nn.Module, ProcessorMixin]:
     """A student of a released shape with random bf16 or 4-bit weights, and adapters."""
     model = random_model(name, cfg.quantization, device)
     model.config.use_cache = False
@@ -213,8 +208,8 @@ def built(name: str, cfg: StudentConfig, device: torch.device) -> tuple[nn.Modul
     parameter_counts.check_towers(
         parameter_counts.count_towers(student), cfg.name, cfg.quantization, cfg.lora.rank
     )
-    said = [instruction("reasoning", "cot"), *(answer_line(x) for x in LETTERS), SAID]
-    processor = build_processor(said * 20, 512, cfg.image_size)
+    corpus = [instruction("reasoning", "cot"), *(answer_line(x) for x in LETTERS), WORDS]
+    processor = build_processor(corpus * 20, 512, cfg.image_size)
     loading.pin_sizes(processor, cfg.image_size, cfg.frames)
     return student, processor
 
@@ -222,8 +217,8 @@ def built(name: str, cfg: StudentConfig, device: torch.device) -> tuple[nn.Modul
 def random_model(
     name: str, quantization: str, device: torch.device
 ) -> Qwen3VLForConditionalGeneration:
-    """A model of a released shape with random bf16 or 4-bit weights, that knows the tiny
-    tokenizer's special tokens."""
+    """A model of a released shape with random bf16 or 4-bit weights and the tiny tokenizer's
+    special tokens."""
     config = Qwen3VLConfig.from_dict(json.loads(CONFIGS[name].read_text()))
     for key, token in (
         ("image_token_id", "<|image_pad|>"),
@@ -245,7 +240,7 @@ def random_model(
 
 
 def quantise(model: nn.Module) -> None:
-    """Make the language tower's linear layers NF4 where they are."""
+    """Quantise the language tower's linear layers to NF4 in place."""
     for name, linear in list(model.named_modules()):
         if not isinstance(linear, nn.Linear) or not name.startswith("model.language_model.layers."):
             continue
@@ -257,42 +252,42 @@ def quantise(model: nn.Module) -> None:
             linear.weight.data, requires_grad=False, quant_type="nf4", module=four
         )
         model.set_submodule(name, four.to(linear.weight.device))
-    # What the library's own loading says to peft and TRL.
+    # peft and TRL read this flag, which the library's own loading sets.
     model.is_loaded_in_4bit = True
 
 
-def noise(cfg: StudentConfig, count: int) -> list[Sample]:
-    """Conversations whose frames are noise, longest first: half end in a rationale, half in an
-    answer alone."""
+def noise_samples(cfg: StudentConfig, count: int) -> list[Sample]:
+    """Conversations with frames of noise, longest first: half with a rationale, half with an answer
+    only."""
     rng = np.random.default_rng(SEED)
     words = np.linspace(LONGEST, SHORTEST, count // 2).astype(int)
     size = (cfg.frames + len(LETTERS), cfg.image_size, cfg.image_size, 3)
-    made = []
+    samples = []
     for length in [*words, *[0] * (count - len(words))]:
         pixels = rng.integers(0, 256, size, dtype=np.uint8)
         mode = "reasoning" if length else "answer"
         parts: list[str | np.ndarray] = []
         for letter, candidate in zip(LETTERS, pixels[cfg.frames :], strict=True):
             parts += [f"\nCandidate {letter}: ", candidate]
-        said = " ".join((SAID.split() * LONGEST)[:length])
-        made.append(
+        text = " ".join((WORDS.split() * LONGEST)[:length])
+        samples.append(
             conversation(
-                f"noise {len(made)}",
+                f"noise {len(samples)}",
                 [*parts, f"\n{instruction(mode, 'cot')}"],
-                f"{said}\n{answer_line(LETTERS[0])}".strip(),
+                f"{text}\n{answer_line(LETTERS[0])}".strip(),
                 Clip(pixels[: cfg.frames], list(range(cfg.frames))),
             )
         )
-    return made
+    return samples
 
 
 def step_flops(
     model: nn.Module, processor: ProcessorMixin, samples: list[Sample], cfg: StudentConfig
 ) -> int:
-    """FLOP of the passes over a step's samples, each alone and with activations kept."""
+    """FLOP of the passes over a step's samples, one by one and with activations kept."""
     collator = Collator(processor, cfg.max_length)
     device = next(model.parameters()).device
-    # Flash attention's own kernels are not counted.
+    # The counter does not see the kernels of flash attention.
     model.get_base_model().set_attn_implementation("sdpa")
     model.train()
     with FlopCounterMode(display=False) as counter, torch.autocast(device.type, torch.bfloat16):
@@ -311,7 +306,7 @@ def product_rate(device: torch.device) -> float:
 
 
 def median_time(product: Callable[[], object], device: torch.device) -> float:
-    """Median seconds of ten calls, after two that warm up."""
+    """Median seconds of ten calls, after two warm-up calls."""
     times = []
     for k in range(12):
         started = time.perf_counter()

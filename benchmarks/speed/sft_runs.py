@@ -1,26 +1,25 @@
-"""Short trainings of one student by `train.sft`'s trainer and by TRL's SFTTrainer, on the same
-samples in the same order with the same hyperparameters, and what they took.
+"""Short trainings of one student by `train.sft`'s trainer and by TRL's SFTTrainer.
 
-TRL gets what its user can give it: the base in the same precision, the same adapters, the library's
-own attention, and our prompts by a collator of the user's, since its own shows no videos. Samples
-sorted by length within a step and adapters over the language tower alone it gets as a gift. It
-packs no vision samples, nor pads none, and turns adapters over 4-bit weights into bf16.
+Both train on the same samples in the same order with the same hyperparameters. TRL gets the base in
+the same precision, the same adapters, its default attention, and a collator for our prompts, since
+its own does not support videos. It also gets samples sorted by length and adapters on the language
+tower only. It does not pack or pad samples with images, and casts adapters over 4-bit weights to
+bf16.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import torch
-from PIL import Image
 from torch import nn
-from torch.utils.data import Dataset, SequentialSampler, Subset
+from torch.utils.data import SequentialSampler, Subset
 from transformers import (
     PrinterCallback,
     ProcessorMixin,
@@ -48,11 +47,13 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Variant:
-    """A trainer and its switches.
+    """A trainer and its settings.
 
-    `attention` is one of transformers' implementations, None what the trainer's user gets without
-    asking. `collator` is ours; of our trainer's "every row", which lets unsupervised rows pass the
-    head too; of TRL's its "own", for samples that show images alone.
+    Attributes:
+        trainer: ours or trl.
+        recompute: Whether activations are recomputed in the backward pass.
+        attention: An implementation of transformers, or None for the trainer's default.
+        every_row: Whether unsupervised positions pass through the head too (ours only).
     """
 
     name: str
@@ -63,13 +64,12 @@ class Variant:
     packing: str = "auto"
     reuse: bool = False
     attention: str | None = None
-    collator: str = "ours"
-    environment: dict[str, str] = field(default_factory=dict)
+    every_row: bool = False
 
 
 @dataclass(frozen=True)
-class Work:
-    """A student on its device, and the samples of all steps in their order."""
+class Student:
+    """A student on its device, the samples of all steps in order, and its settings."""
 
     model: nn.Module
     processor: ProcessorMixin
@@ -80,18 +80,23 @@ class Work:
 
 @dataclass(frozen=True)
 class Figures:
-    """Seconds of each step after the first, with the making of its samples; the loss that each step
-    logged; the most memory that was held meanwhile, on a CPU by the process (GiB)."""
+    """Measurements of a training.
+
+    Attributes:
+        seconds: Of each step after the first, with the loading of its samples.
+        losses: Of each step.
+        peak: GiB of tensors on the GPU, or of the process on a CPU.
+    """
 
     seconds: list[float]
     losses: list[float]
     peak: float
 
 
-def run(variant: Variant, work: Work, steps: int, folder: Path, **settings: Any) -> Figures:
+def train(variant: Variant, student: Student, steps: int, folder: Path, **options: Any) -> Figures:
     """Train `steps` steps in `folder`."""
-    train = replace(
-        work.train,
+    settings = replace(
+        student.train,
         max_steps=steps,
         micro_batch=variant.micro_batch,
         gradient_checkpointing=variant.recompute,
@@ -99,38 +104,38 @@ def run(variant: Variant, work: Work, steps: int, folder: Path, **settings: Any)
         packing=variant.packing,
         reuse_features=variant.reuse,
     )
-    clock = Clock(next(work.model.parameters()).device)
-    build = {"ours": ours, "trl": trls}[variant.trainer]
-    trainer = build(variant, replace(work, train=train), clock, folder, **settings)
+    clock = Clock(next(student.model.parameters()).device)
+    build = {"ours": own_trainer, "trl": trl_trainer}[variant.trainer]
+    trainer = build(variant, replace(student, train=settings), clock, folder, **options)
     trainer.remove_callback(PrinterCallback)
     trainer.train()
     return Figures(clock.seconds(), clock.losses, clock.peak)
 
 
-def ours(
+def own_trainer(
     variant: Variant,
-    work: Work,
+    student: Student,
     clock: Clock,
     folder: Path,
     loss: Callable[..., torch.Tensor] = token_mean,
 ) -> Trainer:
-    """The trainer as `train.sft` makes it, without evaluations and checkpoints."""
-    train = work.train
-    fuse(work.model)
+    """The trainer as `train.sft` builds it, without evaluations and checkpoints."""
+    train = student.train
+    fuse(student.model)
     if variant.attention is not None:
-        work.model.get_base_model().set_attn_implementation(variant.attention)
-    kind = EveryRow if variant.collator == "every row" else Collator
-    collator = kind(work.processor, work.max_length)
-    rope = packing_rope(work.model, train.packing)
-    packs = rope and PackingCollator(work.processor, work.max_length, rope)
+        student.model.get_base_model().set_attn_implementation(variant.attention)
+    kind = EveryRow if variant.every_row else Collator
+    collator = kind(student.processor, student.max_length)
+    rope = packing_rope(student.model, train.packing)
+    packs = rope and PackingCollator(student.processor, student.max_length, rope)
     cache = None
     if train.reuse_features:
-        cache = VisionCache(work.model, train.precision, available_cpu_bytes() // 2)
+        cache = VisionCache(student.model, train.precision, available_cpu_bytes() // 2)
     accumulation = train.batch // train.micro_batch
     common = common_arguments(train, Run("benchmark", folder), SEED, None)
     never = {"eval_strategy": "no", "eval_on_start": False, "save_strategy": "no"}
     return StudentTrainer(
-        model=work.model,
+        model=student.model,
         args=TrainingArguments(
             **{**common, **never, "disable_tqdm": True},
             per_device_train_batch_size=train.micro_batch,
@@ -140,30 +145,28 @@ def ours(
         ),
         data_collator=TrainerCollator(collator, cache is not None),
         training_collator=TrainerCollator(packs or collator, cache is not None),
-        train_dataset=work.samples,
+        train_dataset=student.samples,
         compute_loss_func=loss,
         callbacks=[clock],
-        sampler=SequentialSampler(work.samples),
-        accuracy=LetterAccuracy(letter_ids(work.processor)),
+        sampler=SequentialSampler(student.samples),
+        accuracy=LetterAccuracy(letter_ids(student.processor)),
         vision_cache=cache,
     )
 
 
-def trls(variant: Variant, work: Work, clock: Clock, folder: Path) -> Trainer:
-    """TRL's trainer, as SFTConfig comes in all that a variant and the hyperparameters leave open.
-    It takes rows of `datasets` only, so a row is the place of its sample."""
+def trl_trainer(variant: Variant, student: Student, clock: Clock, folder: Path) -> Trainer:
+    """TRL's trainer with SFTConfig's defaults for every setting that neither the variant nor the
+    hyperparameters determine. It accepts rows of `datasets` only, so a row is a sample's index."""
     import datasets
     from trl import SFTConfig, SFTTrainer
 
-    train, own = work.train, variant.collator == "own"
-    unfuse(work.model)
-    work.model.get_base_model().set_attn_implementation(variant.attention or "sdpa")
-    rows = datasets.Dataset.from_dict({"row": range(len(work.samples))})
-    collator = EveryRow(work.processor, work.max_length)
-    if own:
-        rows = rows.with_transform(partial(shown, work.samples))
+    train = student.train
+    unfuse(student.model)
+    student.model.get_base_model().set_attn_implementation(variant.attention or "sdpa")
+    rows = datasets.Dataset.from_dict({"row": range(len(student.samples))})
+    collator = EveryRow(student.processor, student.max_length)
     return SFTTrainer(
-        model=work.model,
+        model=student.model,
         args=SFTConfig(
             output_dir=str(folder),
             seed=SEED,
@@ -182,8 +185,8 @@ def trls(variant: Variant, work: Work, clock: Clock, folder: Path) -> Trainer:
             dataloader_num_workers=train.workers,
             dataloader_pin_memory=torch.cuda.is_available(),
             train_sampling_strategy="sequential",
-            # Its default of 1,024 tokens would cut into images.
-            max_length=work.max_length,
+            # The default of 1,024 tokens would truncate within an image.
+            max_length=student.max_length,
             dataset_kwargs={"skip_prepare_dataset": True},
             remove_unused_columns=False,
             logging_steps=1,
@@ -191,52 +194,27 @@ def trls(variant: Variant, work: Work, clock: Clock, folder: Path) -> Trainer:
             report_to="none",
             disable_tqdm=True,
         ),
-        data_collator=None if own else partial(collator.rows, work.samples),
+        data_collator=partial(collator.rows, student.samples),
         train_dataset=rows,
-        processing_class=work.processor,
+        processing_class=student.processor,
         callbacks=[clock],
     )
 
 
 class EveryRow(Collator):
-    """Makes batches in which every position has a label and passes the head."""
+    """Makes batches in which every position has a label and passes through the head."""
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
         encoded = [encode(s, self._processor, self._max_length) for s in samples]
         return pad(encoded, self._processor.tokenizer.pad_token_id)
 
     def rows(self, samples: Subset, rows: Sequence[dict[str, int]]) -> dict[str, Any]:
-        """A batch of the samples at `rows`. TRL's head takes those positions that are supervised
-        by itself."""
+        """Collate the samples at `rows`. TRL selects the supervised positions itself."""
         return self([samples[row["row"]] for row in rows])
 
 
-def shown(samples: Subset, rows: dict[str, list[int]]) -> dict[str, list[Any]]:
-    """Rows in the form that TRL's own collator reads: a prompt, a completion and their images."""
-    told = [samples[row] for row in rows["row"]]
-    return {
-        "images": [[Image.fromarray(image) for image in sample.images] for sample in told],
-        "prompt": [[{"role": "user", "content": sample.content}] for sample in told],
-        "completion": [[{"role": "assistant", "content": sample.response}] for sample in told],
-    }
-
-
-class AsImages(Dataset):
-    """Samples that show their clips' frames as images: without times, in twice the tokens."""
-
-    def __init__(self, samples: Dataset) -> None:
-        self._samples = samples
-
-    def __getitem__(self, index: int) -> Sample:
-        sample = self._samples[index]
-        assert sample.clip is not None
-        frames = list(sample.clip.pixels)
-        content = [{"type": "image"}] * len(frames) + sample.content[1:]
-        return replace(sample, content=content, clip=None, images=[*frames, *sample.images])
-
-
 class Clock(TrainerCallback):
-    """When each step ended, what it logged, and the memory of all."""
+    """Records the end and the loss of each step, and the peak of memory."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
