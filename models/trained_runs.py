@@ -1,4 +1,4 @@
-"""Find what a training run wrote, and the settings it was trained with."""
+"""Find a training run's product (student or retriever) and its settings."""
 
 from __future__ import annotations
 
@@ -16,22 +16,21 @@ from conf.schema import BenchmarkConfig
 from models.resolved import pin_base, resolved_precision
 
 EXPORT = "export.json"
-"""Stands in a folder that `train.export` wrote, and there only."""
+"""A file that only folders of `train.export` have."""
 
 MEASURED_BY = {
     "student": ("temperature", "top_p", "top_k", "max_new_tokens", "max_length"),
     "retriever": ("widths", "max_length"),
     "train": ("precision",),
 }
-"""The settings of a run that a measurement may give otherwise, by their group: they change neither
-what was trained nor what it is shown."""
+"""Settings of a run that an evaluation may override, by group: they change neither the trained
+weights nor the model's input."""
 
 Command = TypeVar("Command")
 
 
 def run_title(folder: Path) -> str:
-    """A run's name for a table; a sweep's job goes by the sweep and its number, an export by its
-    run and format."""
+    """Return a run's name for a table: SWEEP/NUMBER for a sweep's job, RUN FORMAT for an export."""
     if (folder / EXPORT).exists():
         record = export_record(folder)
         return f"{record['run']} {record['format']}"
@@ -39,59 +38,69 @@ def run_title(folder: Path) -> str:
 
 
 def export_record(folder: Path) -> dict[str, Any]:
-    """What `train.export` noted of an export: its `run`, its `format`, the SHA-256 of the
-    adapters that it is of as `weights`, and what was `measured` of it.
+    """Return the record of an export: its `run` and `format`, the SHA-256 of the exported adapters
+    as `weights`, and the differences that were `measured`.
 
     Raises:
-        UserError: the note is not whole.
+        UserError: the file is missing or damaged.
     """
     try:
         record = json.loads((folder / EXPORT).read_text())
         return {name: record[name] for name in ("run", "format", "weights", "measured")}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
-            f"{folder / EXPORT} is missing or damaged: delete {folder} and export again"
+            f"{folder / EXPORT} is missing or damaged: delete {folder} and export again",
+            code="damaged-file",
         ) from error
 
 
 def product_folder(folder: Path, product: str) -> Path:
-    """Where the weights and the processor of a run's `product` (student, retriever) are; an export
-    is that folder itself."""
+    """Return the folder of the weights and the processor; an export is that folder itself."""
     return folder if (folder / EXPORT).exists() else folder / product
 
 
 def trained_settings(
     folder: Path, schema: type[Command], product: str, key: str = "model"
 ) -> Command:
-    """The settings of a finished training run or of an export's, as its command's dataclass.
+    """Return the settings of a finished training run or of an export, with the precision and the
+    base's commit that the run resolved.
 
-    `key` is the one by which the user named the folder.
+    Args:
+        product: student or retriever.
+        key: The setting by which the user named the folder.
 
     Raises:
-        UserError: `folder` is no run folder, holds no finished `product` (student, retriever), or
-            settings that cannot be read.
+        UserError: `folder` is not a run's folder, has no finished product, or has damaged settings.
     """
     config = folder / "config.yaml"
     try:
         there = OmegaConf.load(config)
         if (folder / product / EXPORT).exists():
-            raise UserError(f"{key}={folder} holds an export: give {key}={folder / product}")
+            raise UserError(
+                f"{key}={folder} contains an export: give {key}={folder / product}",
+                code="missing-run",
+            )
         if not OmegaConf.is_dict(there) or product not in there:
-            raise UserError(f"{key}={folder} trained no {product}: it is another command's")
+            raise UserError(
+                f"{key}={folder} is not a run that trained a {product}", code="missing-run"
+            )
         if not (folder / EXPORT).exists() and not _finished(folder, product):
             raise UserError(
-                f"{key}={folder} is not finished: run its command again to go on with it"
+                f"{key}={folder} is not finished: run its command again to resume it",
+                code="unfinished-run",
             )
         settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), there))
     except FileNotFoundError as error:
         raise UserError(
-            f"{key}={folder} is no run folder of a trained {product}: {config} is missing; give "
-            "the folder that the training command named, below checkpoints/"
+            f"{key}={folder} is not the folder of a trained {product}: {config} is missing; give "
+            "the folder that the training command printed, below checkpoints/",
+            code="missing-run",
         ) from error
     except (YAMLError, OmegaConfBaseException) as error:
         first = str(error).partition("\n")[0]
         raise UserError(
-            f"{config} is damaged or of another version of DynaPix ({first}); train again"
+            f"{config} is damaged or of another version of DynaPix ({first}); train again",
+            code="damaged-file",
         ) from error
     setattr(settings, product, pin_base(folder, getattr(settings, product)))
     settings.train.precision = resolved_precision(folder, settings.train.precision)
@@ -106,24 +115,29 @@ def resolve_model(
     overrides: Sequence[str] = (),
     key: str = "model",
 ) -> tuple[Path | None, Any]:
-    """The folder that `cfg.model` names and the settings of what was trained there, to be measured
-    on a benchmark; None and `cfg` itself, which has a preset's, where it names none. Of what the
-    user typed as `overrides`, the settings in `MEASURED_BY` hold instead of the run's.
+    """Return the folder that `cfg.model` names and the settings of its run; None and `cfg`, which
+    has those of a preset, if it names none.
+
+    Args:
+        benchmark: What the model is to be evaluated on.
+        overrides: What the user typed. Settings of `MEASURED_BY` replace those of the run.
 
     Raises:
-        UserError: what `settings_of` and `check_unseen` raise; other settings of the model are
-            given beside the run, whose own they are.
+        UserError: as `trained_settings` and `check_unseen`; or the overrides have other settings of
+            the model, which the run determines.
     """
     if cfg.model is None:
         return None, cfg
     folder = Path(cfg.model)
     settings = trained_settings(folder, schema, product, key)
     check_unseen(f"{key}={folder}", settings.benchmark, benchmark)
-    _lay_over(settings, cfg, product, overrides, key)
+    _apply_overrides(settings, cfg, product, overrides, key)
     return folder, settings
 
 
-def _lay_over(settings: Any, cfg: Any, product: str, overrides: Sequence[str], key: str) -> None:
+def _apply_overrides(
+    settings: Any, cfg: Any, product: str, overrides: Sequence[str], key: str
+) -> None:
     above = key.removesuffix("model")
     for override in overrides:
         typed = override.lstrip("+~").partition("=")[0]
@@ -134,19 +148,24 @@ def _lay_over(settings: Any, cfg: Any, product: str, overrides: Sequence[str], k
         if preset or setting not in MEASURED_BY[group]:
             free = [f"{above}{g}.{name}" for g in (product, "train") for name in MEASURED_BY[g]]
             raise UserError(
-                f"{typed} does nothing beside {key}={cfg.model}, which is measured as it was "
-                f"trained: leave it out; what may be given is {', '.join(free)}"
+                f"{typed} does nothing beside {key}={cfg.model}, which is evaluated as it was "
+                f"trained: leave it out; the options are {', '.join(free)}",
+                code="unused-setting",
             )
         setattr(getattr(settings, group), setting, getattr(getattr(cfg, group), setting))
 
 
-def check_unseen(model: str, trained: BenchmarkConfig, asked: BenchmarkConfig) -> None:
-    """Hold a benchmark to the one that `model`, as it is called, was trained on. What both simulate
-    by one seed are the same scenes, as are what they read of one release; a split by one seed tests
-    the same of them, and more where it tests a greater share.
+def check_unseen(model: str, trained: BenchmarkConfig, tested: BenchmarkConfig) -> None:
+    """Check that no training scene is tested.
+
+    Two benchmarks have the same scenes if they simulate with one seed or read one release. A split
+    with one seed tests the same scenes, and more of them with a greater share.
+
+    Args:
+        model: How the error names the model.
 
     Raises:
-        UserError: scenes of training may be among those that are tested.
+        UserError: training scenes may be among the tested ones.
     """
     scenes = (
         "simulator",
@@ -154,36 +173,39 @@ def check_unseen(model: str, trained: BenchmarkConfig, asked: BenchmarkConfig) -
         "folder",
         *(("seed",) if trained.simulator == "bullet" else ()),
     )
-    if any(getattr(trained, key) != getattr(asked, key) for key in scenes):
+    if any(getattr(trained, key) != getattr(tested, key) for key in scenes):
         return
-    if trained.seed != asked.seed or asked.test_share > trained.test_share:
+    if trained.seed != tested.seed or tested.test_share > trained.test_share:
         raise UserError(
             f"{model} was trained with benchmark.seed={trained.seed} and "
             f"benchmark.test_share={trained.test_share}, and may have seen scenes that a split by "
-            f"benchmark.seed={asked.seed} and benchmark.test_share={asked.test_share} tests: give "
-            "those of the training"
+            f"benchmark.seed={tested.seed} and benchmark.test_share={tested.test_share} tests: set "
+            "both as in training",
+            code="training-scenes-tested",
         )
 
 
 def modes_of(regime: str) -> list[str]:
-    """The modes in which students of a regime are trained to answer."""
+    """Return the modes in which a regime trains students to answer."""
     return {"describe": [], "answer_only": ["answer"]}.get(regime, ["reasoning", "answer"])
 
 
 def check_modes(folder: Path, regime: str, modes: Sequence[str]) -> None:
-    """Raises UserError where a student is asked in a mode that it was not trained in."""
+    """Raise UserError if a student is evaluated in a mode that it was not trained in."""
     trained = modes_of(regime)
     if set(modes) <= set(trained):
         return
     if not trained:
         raise UserError(
-            f"model={folder} was trained to describe, as a base is, and never to choose: ask it as "
-            f"a base with student.model={product_folder(folder, 'student')}"
+            f"model={folder} was trained to describe, not to choose: evaluate it as a base with "
+            f"student.model={product_folder(folder, 'student')}",
+            code="untrained-mode",
         )
     raise UserError(
-        f"model={folder} was trained in {' and '.join(trained)} mode alone "
-        f"(train.regime={regime}), and is asked in {' and '.join(modes)} mode: give "
-        f"modes=[{','.join(trained)}]"
+        f"model={folder} was trained in {' and '.join(trained)} mode only "
+        f"(train.regime={regime}), not in {' and '.join(modes)} mode: set "
+        f"modes=[{','.join(trained)}]",
+        code="untrained-mode",
     )
 
 

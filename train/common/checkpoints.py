@@ -26,14 +26,16 @@ NEEDED = {
     "random state": ("rng_state*.pth",),
     "trainer's state": (STATE,),
 }
-"""Parts of a checkpoint, each with the patterns of its files. Without some of them the trainer would
-resume without an error, with a new optimizer or other random numbers. If several ranks write a part
-each, the list of the parts (.metadata) is written last."""
+"""Parts of a checkpoint, each with the patterns of its files. Without some of them the trainer
+would resume without an error, with a new optimizer or other random numbers. If several ranks write
+a part each, the list of the parts (.metadata) is written last."""
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """Return the newest complete checkpoint in a run's folder, or None. A warning names those that
-    a kill, a crash or a full disk left incomplete."""
+    """Return the newest complete checkpoint in a run's folder, or None.
+
+    A warning names those that a kill, a crash or a full disk left incomplete.
+    """
     named = [(re.fullmatch(r"checkpoint-(\d+)", p.name), p) for p in folder.glob("checkpoint-*")]
     numbered = sorted(((int(m[1]), p) for m, p in named if m), reverse=True)
     for k, (_, path) in enumerate(numbered):
@@ -45,13 +47,15 @@ def newest_checkpoint(folder: Path) -> Path | None:
 
 
 def check_best(checkpoint: Path) -> None:
-    """Raise UserError if the best checkpoint up to `checkpoint` is missing or incomplete: the library
-    would silently keep the last weights instead, or fail at the end."""
+    """Raise UserError if the best checkpoint up to `checkpoint` is missing or incomplete.
+
+    The library would silently keep the last weights instead, or fail at the end.
+    """
     best = json.loads((checkpoint / STATE).read_text())["best_global_step"]
     if best and (problem := find_damage(kept := checkpoint.with_name(f"checkpoint-{best}"))):
         raise UserError(
-            f"{kept}, the best checkpoint so far, is missing or incomplete ({problem}): restore it, "
-            f"or delete {checkpoint.parent} and train again",
+            f"{kept}, the best checkpoint so far, is missing or incomplete ({problem}): restore "
+            f"it, or delete {checkpoint.parent} and train again",
             code="damaged-file",
         )
 

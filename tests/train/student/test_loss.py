@@ -116,10 +116,12 @@ def test_lengths_rank_samples_without_making_them(
     made = StudentDataset([LazySample(text, 10, refuse) for text in texts])
     guessed = made.lengths(processor.tokenizer, 96)
     real = [
-        len(encode(selection_sample(i, "answer", "cot", frames, student_cfg.frames, t), processor, 1500)
-            .input_ids)
-        for i, t in zip(items, texts, strict=True)
-    ]  # fmt: skip
+        len(encode(lines, processor, 1500).input_ids)
+        for lines in (
+            selection_sample(i, "answer", "cot", frames, student_cfg.frames, t)
+            for i, t in zip(items, texts, strict=True)
+        )
+    ]
     assert np.argsort(guessed).tolist() == np.argsort(real).tolist()
 
 

@@ -1,0 +1,135 @@
+"""One test per hook of models.compat: each fails with a sentence if a library has changed it."""
+
+from __future__ import annotations
+
+import inspect
+from types import SimpleNamespace
+
+import bitsandbytes as bnb
+import peft
+import pytest
+import torch
+from peft.tuners.lora import LoraLayer
+from peft.tuners.lora.bnb import Linear4bit
+from peft.tuners.lora.layer import Linear, LoraVariant
+from sentence_transformers import MultiVectorEncoder
+from torch import nn
+from transformers import AttentionInterface, AttentionMaskInterface, Trainer, TrainingArguments
+from transformers.models.qwen3_vl import modeling_qwen3_vl
+
+from models import attention, compat
+from models.lora_kernels import fuse
+
+CHANGED = "a library changed this hook; correct models/compat.py or the version bounds:"
+
+
+def test_checkpointing_arguments_recompute_activations(tmp_path) -> None:
+    assert compat.checkpointing_arguments(False) == {}
+    arguments = TrainingArguments(
+        output_dir=str(tmp_path), use_cpu=True, **compat.checkpointing_arguments(True)
+    )
+    enabled = [
+        getattr(arguments, name, None)
+        for name in ("activation_checkpointing", "gradient_checkpointing")
+    ]
+    assert any(enabled), f"{CHANGED} TrainingArguments takes no argument to recompute activations"
+
+
+def test_the_attention_implementation_is_readable(model) -> None:
+    model.set_attn_implementation({"text_config": "eager"})
+    assert compat.attention_implementation(model) == "eager", (
+        f"{CHANGED} config._attn_implementation is not the attention of the language tower"
+    )
+
+
+def test_a_trainer_loads_weights_of_a_checkpoint(tmp_path) -> None:
+    assert "resume_from_checkpoint" in inspect.signature(Trainer._load_from_checkpoint).parameters, (
+        f"{CHANGED} Trainer._load_from_checkpoint takes another argument"
+    )
+    loaded = []
+    compat.load_checkpoint(SimpleNamespace(_load_from_checkpoint=loaded.append), tmp_path)
+    assert loaded == [str(tmp_path)]
+
+
+def test_4_bit_weights_are_not_repacked() -> None:
+    layer = bnb.nn.Linear4bit(8, 8)
+    assert hasattr(layer, "support_avx512bf16_for_cpu"), (
+        f"{CHANGED} bitsandbytes repacks 4-bit weights on a CPU under another name"
+    )
+    layer.support_avx512bf16_for_cpu = True
+    compat.keep_differentiable(nn.Sequential(layer))
+    assert not layer.support_avx512bf16_for_cpu
+
+
+def test_4_bit_weights_count_as_the_entries_that_they_stand_for() -> None:
+    layer = bnb.nn.Linear4bit(64, 64, bias=False).to("cpu")
+    assert layer.weight.numel() < 64 * 64
+    assert compat.four_bit_entries(layer.weight) == 64 * 64, (
+        f"{CHANGED} Params4bit.quant_state does not hold the shape"
+    )
+    assert compat.four_bit_entries(nn.Linear(4, 4).weight) is None
+
+
+def test_a_vision_tower_passes_all_frames_to_a_function_named_flash(model) -> None:
+    assert attention.BY_FRAME in AttentionInterface().valid_keys()
+    assert attention.PRODUCTS in AttentionMaskInterface().valid_keys()
+    model.set_attn_implementation({"vision_config": attention.BY_FRAME})
+    calls = []
+
+    def record(module, query, key, value, attention_mask, **settings):
+        calls.append(settings)
+        return attention.attend_by_frame(module, query, key, value, attention_mask, **settings)
+
+    AttentionInterface.register(attention.BY_FRAME, record)
+    try:
+        grid = torch.tensor([[3, 4, 4]])
+        model.model.visual(torch.zeros(48, 3 * 2 * 16 * 16), grid_thw=grid)
+    finally:
+        AttentionInterface.register(attention.BY_FRAME, attention.attend_by_frame)
+    bounds = {tuple(settings["cu_seq_lens_q"].tolist()) for settings in calls}
+    assert bounds == {(0, 16, 32, 48)}, (
+        f"{CHANGED} Qwen3-VL's vision tower does not pass all frames at once"
+    )
+
+
+def test_peft_layers_use_a_lora_variant(model) -> None:
+    assert issubclass(Linear, LoraLayer)
+    assert issubclass(Linear4bit, LoraLayer)
+    assert hasattr(LoraVariant, "forward"), f"{CHANGED} peft's LoraVariant has no forward"
+    adapted = peft.get_peft_model(model, peft.LoraConfig(target_modules=["q_proj"], r=2))
+    fuse(adapted)
+    layers = [m for m in adapted.modules() if isinstance(m, LoraLayer)]
+    assert layers
+    assert all(m.lora_variant for m in layers), f"{CHANGED} peft's layers have no lora_variant"
+    assert "lora_variant" in inspect.getsource(Linear.forward), (
+        f"{CHANGED} the forward of peft's Linear does not use lora_variant"
+    )
+
+
+@pytest.mark.parametrize("name", ["mm_encoder_outputs", "position_ids", "logits_to_keep"])
+def test_qwen3_vl_takes_the_inputs_of_caching_and_packing(model, name) -> None:
+    parameters = inspect.signature(type(model).forward).parameters
+    inner = inspect.signature(type(model.model).forward).parameters
+    assert name in {*parameters, *inner}, f"{CHANGED} Qwen3-VL's forward takes no {name}"
+
+
+def test_qwen3_vl_gives_positions_and_image_features(model) -> None:
+    rope = inspect.signature(model.model.get_rope_index).parameters
+    assert {"input_ids", "mm_token_type_ids", "image_grid_thw", "video_grid_thw"} <= set(rope), (
+        f"{CHANGED} get_rope_index takes other arguments"
+    )
+    fields = modeling_qwen3_vl.BaseModelOutputWithDeepstackFeatures.__dataclass_fields__
+    assert {"pooler_output", "deepstack_features"} <= set(fields), (
+        f"{CHANGED} the outputs of Qwen3-VL's vision tower have other names"
+    )
+
+
+def test_a_multi_vector_encoder_loads_with_named_module_classes() -> None:
+    assert hasattr(MultiVectorEncoder, "_load_with_module_classes"), (
+        f"{CHANGED} MultiVectorEncoder._load_with_module_classes is gone"
+    )
+
+
+def test_freed_memory_is_kept() -> None:
+    """The hook has no effect that can be observed portably; it must not fail."""
+    compat.keep_freed_memory()
