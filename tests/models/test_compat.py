@@ -43,9 +43,9 @@ def test_the_attention_implementation_is_readable(model) -> None:
 
 
 def test_a_trainer_loads_weights_of_a_checkpoint(tmp_path) -> None:
-    assert "resume_from_checkpoint" in inspect.signature(Trainer._load_from_checkpoint).parameters, (
-        f"{CHANGED} Trainer._load_from_checkpoint takes another argument"
-    )
+    assert (
+        "resume_from_checkpoint" in inspect.signature(Trainer._load_from_checkpoint).parameters
+    ), f"{CHANGED} Trainer._load_from_checkpoint takes another argument"
     loaded = []
     compat.load_checkpoint(SimpleNamespace(_load_from_checkpoint=loaded.append), tmp_path)
     assert loaded == [str(tmp_path)]

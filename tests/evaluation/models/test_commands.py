@@ -30,6 +30,7 @@ from evaluation.generators.response_log import ResponseLog
 from models import loading
 from models.retriever import embedder
 from models.trained_runs import check_unseen, resolve_model, trained_settings
+from tests.user_errors import raises_user_error
 from train.student import dataset
 
 SMALL = ArchitectureConfig(
@@ -175,24 +176,24 @@ def test_students_and_retrievers_are_measured_and_reported(runs, micro, micro_st
 
 
 def test_a_model_that_is_no_run_is_named(tmp_path) -> None:
-    with pytest.raises(UserError, match="is no run folder of a trained student"):
+    with raises_user_error("missing-run"):
         trained_settings(tmp_path / "nowhere", SftCommand, "student")
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "code"),
     [
-        (lambda run: (run / "metrics.json").unlink(), "is not finished"),
-        (lambda run: (run / "config.yaml").write_text("student: [1"), "is damaged or of another"),
-        (lambda run: (run / "config.yaml").write_text(""), "trained no student"),
-        (lambda run: (run / "config.yaml").write_text("student: {rank: 1}"), "is damaged or of"),
-        (lambda run: (run / "config.yaml").write_text("retriever: {}"), "trained no student"),
+        (lambda run: (run / "metrics.json").unlink(), "unfinished-run"),
+        (lambda run: (run / "config.yaml").write_text("student: [1"), "damaged-file"),
+        (lambda run: (run / "config.yaml").write_text(""), "missing-run"),
+        (lambda run: (run / "config.yaml").write_text("student: {rank: 1}"), "damaged-file"),
+        (lambda run: (run / "config.yaml").write_text("retriever: {}"), "missing-run"),
     ],
 )
-def test_a_run_that_cannot_be_measured_is_told(runs, tmp_path, damage, said) -> None:
+def test_a_run_that_cannot_be_measured_is_refused(runs, tmp_path, damage, code) -> None:
     shutil.copytree(runs / "sft" / "run", tmp_path / "run")
     damage(tmp_path / "run")
-    with pytest.raises(UserError, match=said):
+    with raises_user_error(code):
         trained_settings(tmp_path / "run", SftCommand, "student")
 
 
@@ -202,12 +203,12 @@ def test_a_model_is_not_tested_on_scenes_that_it_may_have_seen(runs, micro) -> N
     for same in ({}, unseen, {"scenes": 99}, {"test_share": 0.01}):
         benchmark = replace(micro, **same)
         assert resolve_model(cfg, benchmark, SftCommand, "student")[0] == runs / "sft" / "run"
-    with pytest.raises(UserError, match=r"may have seen scenes that .*test_share=0\.9 tests"):
+    with raises_user_error("training-scenes-tested", contains="test_share=0.9"):
         resolve_model(cfg, replace(micro, test_share=0.9), SftCommand, "student")
     # Another seed splits the same release anew.
     release = replace(micro, simulator="clevrer", folder="/release")
     check_unseen("model", release, replace(release, folder="/other", seed=1))
-    with pytest.raises(UserError, match=r"may have seen scenes that .*seed=1 "):
+    with raises_user_error("training-scenes-tested", contains="seed=1"):
         check_unseen("model", release, replace(release, seed=1))
 
 
@@ -226,13 +227,13 @@ def test_what_a_run_is_asked_otherwise_is_taken_or_refused(runs, micro) -> None:
         != 2
     )
     for refused in ("student=qwen3_vl_8b", "student.lora.rank=8", "++train.regime=cot"):
-        with pytest.raises(UserError, match=r"does nothing beside model=.*student\.temperature"):
+        with raises_user_error("unused-setting", contains="student.temperature"):
             resolve_model(cfg, micro, SftCommand, "student", (*typed, refused))
     matcher = MatcherConfig(model=str(runs / "contrastive" / "run"))
     given = (matcher, micro, ContrastiveCommand, "retriever")
     resolve_model(*given, ("student.frames=2", "matcher.model=RUN"), "matcher.model")
     for refused in ("matcher=clip", "matcher.retriever.image_size=64"):
-        with pytest.raises(UserError, match=r"does nothing beside matcher\.model=.*matcher\.train"):
+        with raises_user_error("unused-setting", contains="matcher.train"):
             resolve_model(*given, (refused,), "matcher.model")
 
 

@@ -203,9 +203,7 @@ def test_an_index_gives_its_recall_against_exact(world, tmp_path) -> None:
 
 def test_a_width_that_the_model_lacks_is_refused(world, tmp_path) -> None:
     edit_config(tmp_path / "run", retriever__widths=[4096, 64, 32])
-    with pytest.raises(
-        UserError, match=r"asks for 4096, .* 64 entries.*retriever\.widths=\[64,32\]"
-    ):
+    with raises_user_error("too-wide", contains="retriever.widths=[64,32]"):
         world()
 
 
@@ -223,11 +221,11 @@ def test_a_batch_that_does_not_fit_is_told(world, monkeypatch) -> None:
 def test_another_pooling_is_refused(world, tmp_path) -> None:
     config = tmp_path / "run" / "retriever" / "1_Pooling" / "config.json"
     config.write_text(json.dumps({**json.loads(config.read_text()), "pooling_mode": "mean"}))
-    with pytest.raises(UserError, match="was saved with mean pooling"):
+    with raises_user_error("unsupported-model", contains="mean pooling"):
         world()
     modules = tmp_path / "run" / "retriever" / "modules.json"
     modules.write_text(json.dumps(json.loads(modules.read_text())[:1]))
-    with pytest.raises(UserError, match="was saved without pooling"):
+    with raises_user_error("unsupported-model", contains="without pooling"):
         world()
     modules.write_text("[")
     with pytest.raises(UserError, match="retriever is damaged"):

@@ -212,7 +212,7 @@ def test_rationales_of_another_benchmark_are_refused(settings, micro_store, tmp_
 @pytest.mark.slow
 def test_a_mode_that_was_not_trained_is_told(trained, micro, tmp_path) -> None:
     cfg = SelectCommand(model=str(trained), benchmark=micro, modes=["reasoning"])
-    with pytest.raises(UserError, match=r"answer mode alone .* give modes=\[answer\]"):
+    with raises_user_error("untrained-mode", contains="modes=[answer]"):
         select.main.__wrapped__(cfg, Run("run", tmp_path))
     assert OmegaConf.load(trained / "config.yaml").train.regime == "answer_only"
 

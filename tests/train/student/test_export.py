@@ -338,10 +338,10 @@ def test_a_damaged_export_is_refused(settings, forms, tmp_path) -> None:
         loading.load_trained(trained.student, "fp32", tmp_path / "export")
     (tmp_path / "config.yaml").write_text("format: bf16")
     (tmp_path / "export").rename(tmp_path / "student")
-    with pytest.raises(UserError, match=r"holds an export: give model=.*/student"):
+    with raises_user_error("missing-run", contains="student"):
         trained_settings(tmp_path, SftCommand, "student")
     (tmp_path / "student" / "export.json").write_text("{")
-    with pytest.raises(UserError, match="is missing or damaged"):
+    with raises_user_error("damaged-file"):
         run_title(tmp_path / "student")
 
 
