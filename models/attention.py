@@ -1,10 +1,10 @@
-"""How a model attends: the implementation that is fastest where it runs, with the same numbers.
+"""Attention implementations: the fastest one for the machine, with the same results.
 
-The vision tower attends within each frame. Without flash attention transformers calls it once a
-frame, but all frames here have one size, so that one call over all of them gives the same numbers.
+The vision tower attends within each frame. Without flash attention, transformers calls it once per
+frame; since all frames have one size, one call over all of them gives the same result.
 
-On a CPU in bf16, torch's fused attention takes three to six times as long in its backward pass as
-the matrix products that it stands for, as long as their scores fit in memory.
+On a CPU in bf16, the backward pass of torch's fused attention takes three to six times as long as
+plain matrix products, provided that their scores fit into memory.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from transformers.utils import is_flash_attn_2_available, is_flash_attn_3_availa
 
 PRODUCTS = "dynapix_products"
 BY_FRAME = "dynapix_frames_flash"
-"""Its name must have "flash" in it: only then is a function given all frames at once, with their
-bounds, by a Qwen3-VL's vision tower."""
+"""The name must contain "flash": only then does Qwen3-VL's vision tower pass all frames at once,
+with their bounds."""
 SHORT = 2048
-"""Tokens up to which the scores of all pairs are kept for the backward pass."""
+"""Most tokens for which the scores of all pairs are kept for the backward pass."""
 
 
 def choose_attention(model: PreTrainedModel, precision: str, max_length: int) -> None:
@@ -42,7 +42,7 @@ def choose_attention(model: PreTrainedModel, precision: str, max_length: int) ->
 
 
 def flash_attention(precision: str) -> str | None:
-    """The flash attention that is installed and runs here in `precision`, by transformers' name."""
+    """Return transformers' name of the installed flash attention for `precision`, or None."""
     if not torch.cuda.is_available() or precision != "bf16":
         return None
     if is_flash_attn_3_available():
@@ -60,10 +60,10 @@ def attend_by_products(
     dropout: float = 0.0,
     **_: Any,
 ) -> tuple[torch.Tensor, None]:
-    """Attention of (B, H, Q, D) queries to (B, G, K, D) keys and values, as (B, Q, H, D).
+    """Attend from (B, H, Q, D) queries to (B, G, K, D) keys and values; return (B, Q, H, D).
 
-    What transformers calls eager, but of the scores only the softmax is kept, in the precision of
-    the products: a third of the memory.
+    Unlike transformers' eager attention, only the softmax of the scores is kept, in the precision
+    of the products: a third of the memory.
     """
     groups = query.shape[1] // key.shape[1]
     key, value = repeat_kv(key, groups), repeat_kv(value, groups)
@@ -75,8 +75,8 @@ def attend_by_products(
 
 
 def products_mask(*args: Any, dtype: torch.dtype, **settings: Any) -> torch.Tensor | None:
-    """The mask that is added to scores, in bf16 even where the embeddings are fp32: the least fp32
-    number is no finite one in bf16, and rows of padding alone would have no softmax."""
+    """Return the mask to add to the scores, in bf16 even if the embeddings are fp32: the smallest
+    fp32 number is infinite in bf16, and the softmax of rows of padding would be NaN."""
     return eager_mask(*args, dtype=torch.bfloat16, **settings)
 
 
@@ -92,8 +92,12 @@ def attend_by_frame(
     dropout: float = 0.0,
     **_: Any,
 ) -> tuple[torch.Tensor, None]:
-    """Attention of the (1, H, N, D) patches of several frames, each within its own, as
-    (1, N, H, D); `cu_seq_lens_q` are the frames' bounds among the N, `max_length_q` is the longest.
+    """Attend among the (1, H, N, D) patches of several frames, each within its frame; return
+    (1, N, H, D).
+
+    Args:
+        cu_seq_lens_q: Bounds of the frames among the N patches.
+        max_length_q: Patches of the largest frame.
     """
     reduced = torch.is_autocast_enabled(query.device.type) or query.dtype != torch.float32
     attend = attend_by_products if reduced and not query.is_cuda else sdpa_attention_forward
@@ -102,8 +106,8 @@ def attend_by_frame(
     frames = len(cu_seq_lens_q) - 1
     if frames * max_length_q == query.shape[2]:
         folded = (p[0].unflatten(1, (frames, max_length_q)).transpose(0, 1) for p in parts)
-        found, _weights = attend(module, *folded, None, **settings)
-        return found.flatten(0, 1)[None], None
+        attended, _weights = attend(module, *folded, None, **settings)
+        return attended.flatten(0, 1)[None], None
     lengths = (cu_seq_lens_q[1:] - cu_seq_lens_q[:-1]).tolist()
     split = zip(*(p.split(lengths, dim=2) for p in parts), strict=True)
     return torch.cat([attend(module, *one, None, **settings)[0] for one in split], dim=1), None

@@ -1,10 +1,9 @@
-"""The same passes in fewer and faster operations, for a model that is trained.
+"""Faster operations with the same results, for a model in training.
 
-Patches do not overlap: the convolution over them is one matrix product, which is several times as
-fast, the more so backwards. And what an adapter gives is scaled while it is as narrow as its rank,
-and added in place to what it is laid over, within the product that widens it. peft scales and adds
-in passes over the whole width and keeps what lies between; what a layer in 4 bits gives it copies
-first, for adapters that change a view of it.
+Patches do not overlap, so the convolution over them is one matrix product, which is several times
+as fast. The output of an adapter is scaled while it is as narrow as its rank, and added in place to
+the base's output by the product that widens it. peft scales and adds over the whole width, keeps
+the intermediate results, and copies the output of a 4-bit layer first.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ from torch.nn.functional import linear
 
 
 def fuse(model: nn.Module) -> None:
-    """Let a Qwen3-VL with or without adapters compute so, in place. Its parameters, their names and
-    what is saved of them stay as they are."""
+    """Switch a Qwen3-VL, with or without adapters, to these operations in place. Parameters, their
+    names and saved files do not change."""
     for module in list(model.modules()):
-        # Released checkpoints name what embeds patches so, in every Qwen-VL since the second.
+        # The name of the patch embedding in every Qwen-VL since the second.
         embeds = getattr(module, "patch_embed", None)
         if isinstance(getattr(embeds, "proj", None), nn.Conv3d):
             embeds.proj.__class__ = PatchProduct
@@ -34,7 +33,7 @@ def fuse(model: nn.Module) -> None:
 
 
 def unfuse(model: nn.Module) -> None:
-    """Let a model compute as it did before `fuse`, in place."""
+    """Undo `fuse` in place."""
     for module in list(model.modules()):
         if isinstance(module, PatchProduct):
             module.__class__ = nn.Conv3d
@@ -46,20 +45,19 @@ def unfuse(model: nn.Module) -> None:
 
 
 class PatchProduct(nn.Conv3d):
-    """A convolution that is given patches of the size of its kernel: (N, C, T, H, W) become
+    """A convolution over patches of the size of its kernel: (N, C, T, H, W) to
     (N, channels, 1, 1, 1)."""
 
     def forward(self, patches: torch.Tensor) -> torch.Tensor:
-        # A model of one's own may give it whole clips.
+        # Another model may pass whole clips.
         if patches.shape[2:] != self.kernel_size:
             return super().forward(patches)
-        found = linear(patches.flatten(1), self.weight.flatten(1), self.bias)
-        return found[..., None, None, None]
+        embedded = linear(patches.flatten(1), self.weight.flatten(1), self.bias)
+        return embedded[..., None, None, None]
 
 
 class AddedInPlace(LoraVariant):
-    """Plain LoRA over rows, for `peft`'s forward alone: merging is left to models that are loaded
-    for it."""
+    """Plain LoRA over rows. It has only a forward: models are loaded without it for merging."""
 
     @staticmethod
     def forward(
@@ -73,8 +71,8 @@ class AddedInPlace(LoraVariant):
 
 
 class RowsLinear(Linear):
-    """Adapters over a layer that is given rows: what it gives is then no view, and autograd lets it
-    be changed in place at no cost."""
+    """Adapters over a layer whose input is flattened to rows: its output is then no view, and
+    autograd lets it be changed in place at no cost."""
 
     def forward(self, x: torch.Tensor, *args: Any, **settings: Any) -> torch.Tensor:
         rows = super().forward(x.flatten(0, -2), *args, **settings)
@@ -82,14 +80,14 @@ class RowsLinear(Linear):
 
 
 class RowsLinear4bit(Linear4bit):
-    """The same over a layer in 4 bits, by the forward of any other layer, which copies nothing."""
+    """The same for a 4-bit layer, with the forward of other layers, which copies nothing."""
 
     def forward(self, x: torch.Tensor, *args: Any, **settings: Any) -> torch.Tensor:
         rows = Linear.forward(self, x.flatten(0, -2), *args, **settings)
         return rows.unflatten(0, x.shape[:-1])
 
     def _cast_input_dtype(self, x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-        # Autocast would only cast it back.
+        # Autocast would cast it back.
         enabled = torch.is_autocast_enabled(x.device.type)
         return x if enabled else super()._cast_input_dtype(x, dtype)
 

@@ -1,7 +1,7 @@
-"""A small, real Qwen3-VL built offline from sizes and a seed, with its tokenizer and processor.
+"""Build a small Qwen3-VL with its tokenizer and processor, offline, from sizes and a seed.
 
-Everything is the standard classes of transformers, so that what works here works on the released
-models: the same module names, chat format, timestamps and vision tokens.
+All classes are the standard ones of transformers. Module names, chat format, timestamps and vision
+tokens are those of the released models.
 """
 
 from __future__ import annotations
@@ -50,9 +50,10 @@ PATCH, MERGE, TEMPORAL = 16, 2, 2
 
 
 def build_model(sizes: ArchitectureConfig, vocabulary: int) -> Qwen3VLForConditionalGeneration:
-    """A Qwen3-VL with random weights drawn from `sizes.seed`, in fp32.
+    """Return a Qwen3-VL in fp32 with random weights from `sizes.seed`.
 
-    `vocabulary` is the tokenizer's size; ids of special tokens are those of `build_processor`.
+    Args:
+        vocabulary: Size of the tokenizer of `build_processor`, which also has the special tokens.
     """
     half = sizes.head // 2
     height = width = half // 3
@@ -104,8 +105,10 @@ def build_model(sizes: ArchitectureConfig, vocabulary: int) -> Qwen3VLForConditi
 
 
 def build_processor(corpus: Iterable[str], vocabulary: int, image_size: int) -> Qwen3VLProcessor:
-    """A processor whose byte-level BPE tokenizer was trained on `corpus`; the same texts in the
-    same order give the same tokenizer."""
+    """Return a processor with a byte-level BPE tokenizer that is trained on `corpus`.
+
+    The same texts in the same order give the same tokenizer.
+    """
     tokenizer = Tokenizer(models.BPE())
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     tokenizer.decoder = decoders.ByteLevel()

@@ -1,4 +1,4 @@
-"""What was loaded and what will be seen, printed and checked before a run's first step."""
+"""Print and check the loaded model and its longest input before a run's first step."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def audit(
     sample: Sample,
     collator: Collator,
 ) -> str:
-    """Parameter counts by tower, the grids that frames become, and the longest sample, decoded,
-    its supervised part between >>> and <<<.
+    """Return the parameter counts by tower, the grids of the frames, and the longest sample,
+    decoded, with its supervised part between >>> and <<<.
 
     Raises:
-        UserError: the counts are not what the preset says, or the sample is too long.
+        UserError: the counts differ from the preset, or the sample is too long.
     """
     towers = count_towers(model)
     check_towers(towers, cfg.name, cfg.quantization, cfg.lora.rank)
@@ -118,7 +118,7 @@ def embedded_at_scored(model: MultiVectorEncoder, asked: dict, shown: dict) -> l
 
 
 def grids(batch: dict, processor: ProcessorMixin) -> str:
-    """The vision tokens of a batch in words, frames x rows x columns."""
+    """Describe the vision tokens of a batch as frames x rows x columns."""
     merge = processor.image_processor.merge_size
     told = []
     for name, what in (("video_grid_thw", "a video"), ("image_grid_thw", "an image")):
@@ -130,5 +130,5 @@ def grids(batch: dict, processor: ProcessorMixin) -> str:
 
 
 def squeeze(text: str) -> str:
-    """A decoded text with each run of vision tokens as one."""
+    """Shorten each run of vision tokens in a decoded text to one."""
     return re.sub(r"(<\|(image|video)_pad\|>)+", r"\1...", text)

@@ -1,6 +1,6 @@
-"""The curves of a run, drawn from its journal.
+"""Plot the curves of a run from its journal.
 
-Figures are built without pyplot, so drawing leaves no global state and needs no display.
+Figures are built without pyplot, so plotting leaves no global state and needs no display.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 DPI = 150
 COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377")
-"""Told apart with any colour vision (Paul Tol's bright set)."""
+"""Distinguishable with any colour vision (Paul Tol's bright set)."""
 LINES = ("-", ":", "--")
 MODE = re.compile(r"eval_(answer_|reasoning_)?")
 FAMILY = re.compile(r"_letter_accuracy_(\w+)$")
 
 
 def empty_figure(width: float, height: float) -> Figure:
-    """An empty figure of width x height inches that draws with Agg."""
+    """Return an empty figure of width x height inches with the Agg backend."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -33,11 +33,11 @@ def empty_figure(width: float, height: float) -> Figure:
 
 
 def plot_curves(records: Sequence[dict[str, float]], path: Path | str) -> None:
-    """Training and evaluation losses over steps; then, where they were evaluated, the measures of
-    all items, each on axes of its own where they are many, and the letter accuracy by family.
+    """Plot losses over steps, then the measures of all items (on separate axes if they are many)
+    and the letter accuracy by family.
 
     Args:
-        records: lines of a run's journal, each with `step` and some of `loss`, `eval_loss`,
+        records: Lines of a run's journal, each with `step` and some of `loss`, `eval_loss`,
             `eval_<name>_loss` and others.
     """
     measured = sorted({k for r in records for k in r if k.startswith("eval_")})
@@ -49,13 +49,13 @@ def plot_curves(records: Sequence[dict[str, float]], path: Path | str) -> None:
     columns = 1 if len(panels) <= 3 else 2
     rows = -(-len(panels) // columns)
     figure = empty_figure(8.5 * columns, 0.6 + 2.5 * rows)
-    drawn = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
-    for axes in drawn[len(panels) :]:
+    panes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+    for axes in panes[len(panels) :]:
         axes.set_axis_off()
-    _curve(drawn[0], records, "loss", color="#999999", linewidth=1.2, label="training")
-    for axes, (label, keys) in zip(drawn, panels, strict=False):
+    _curve(panes[0], records, "loss", color="#999999", linewidth=1.2, label="training")
+    for axes, (label, keys) in zip(panes, panels, strict=False):
         for key, style in _styles(keys).items():
-            # The losses stand beside the one that is trained on.
+            # Held-out losses share the axes of the training loss.
             name = f"held out {_name(key)}" if label == "loss" else _name(key).removesuffix(label)
             _curve(axes, records, key, **style, label=name.strip() or label)
         axes.set_ylabel(label)
@@ -63,15 +63,15 @@ def plot_curves(records: Sequence[dict[str, float]], path: Path | str) -> None:
         axes.grid(axis="y", color="#eeeeee")
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
-    for axes in drawn[len(panels) - columns : len(panels)]:
+    for axes in panes[len(panels) - columns : len(panels)]:
         axes.tick_params(labelbottom=True)
         axes.set_xlabel("step")
     figure.savefig(path)
 
 
 def _by_measure(keys: Sequence[str]) -> dict[str, list[str]]:
-    """The measures by their axes' label: all together while there is a colour for each; else those
-    that share their last two words, such as the place accuracy of several kinds of samples."""
+    """Group measures by the label of their axes: all together if there are enough colours, else by
+    their last two words, such as the place accuracy of several kinds of samples."""
     if len(keys) <= len(COLORS):
         return {"held out": list(keys)}
     found: dict[str, list[str]] = {}
@@ -81,8 +81,8 @@ def _by_measure(keys: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _styles(keys: Sequence[str]) -> dict[str, dict[str, object]]:
-    """A colour for each measure, a line for each mode in which it was taken; where the colours give
-    out, the lines tell measures apart too."""
+    """Assign a colour to each measure and a line style to each mode; with too few colours, the line
+    styles distinguish measures too."""
     found = {key: MODE.match(key)[1] or "" for key in keys}
     modes = sorted(set(found.values()))
     measures = sorted({key.replace(mode, "", 1) for key, mode in found.items()})
