@@ -36,14 +36,14 @@ OVERLAYS = ("exp", "sweep")
 REMOVED_KEYS: dict[str, str] = {
     "shown": "use examples instead",
     "cards": "use gpus instead",
-    "train.batches": "remove it, batches are random",
-    "train.scene_queries": "remove it, batches are random",
+    "train.batches": "leave it out: batches are random",
+    "train.scene_queries": "leave it out: batches are random",
     "train.mini_batch_tokens": "set train.mini_batch to a number of queries or frames",
-    "train.distinct_frames": "remove it, each document is embedded once",
-    "train.shared_prefixes": "remove it, each query is embedded on its own",
-    "train.mask_identical": "remove it, identical frames are always masked",
-    "train.mask_near": "remove it, frames near the target count as negatives",
-    "train.hard_weight": "remove it, all negatives count equally",
+    "train.distinct_frames": "leave it out: each document is embedded once",
+    "train.shared_prefixes": "leave it out: each query is embedded on its own",
+    "train.mask_identical": "leave it out: identical frames are always masked",
+    "train.mask_near": "leave it out: frames near the target count as negatives",
+    "train.hard_weight": "leave it out: all negatives count equally",
 }
 """Keys that no longer exist, each with what to do instead; the error for the key ends with it."""
 

@@ -28,7 +28,7 @@ Rows = list[dict]
 
 
 def edited(folder: Path, root: Path, edit: Callable[[Rows], Rows]) -> str:
-    """A store of stores with a copy of a benchmark, sealed, whose queries are edited."""
+    """A folder with a copy of a benchmark whose queries are edited, with valid checksums."""
     copy = root / folder.name
     shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("embeddings"))
     path = copy / "retrieval.parquet"
@@ -39,90 +39,99 @@ def edited(folder: Path, root: Path, edit: Callable[[Rows], Rows]) -> str:
     return str(root)
 
 
-def refused(settings: ContrastiveCommand, folder: Path, said: str) -> None:
-    """The trainer refuses with a message that matches, and saves no retriever."""
+def assert_refused(
+    settings: ContrastiveCommand, folder: Path, *names: str, code: str | None = None
+) -> None:
+    """The trainer refuses with a code and a message that has these names, and saves no
+    retriever."""
     folder.mkdir()
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError) as caught:
         contrastive.main.__wrapped__(settings, Run("run", folder))
+    assert code in (None, caught.value.code)
+    assert all(name in str(caught.value) for name in names), caught.value
     assert {p.name for p in folder.iterdir()} <= {"untrained", "resolved.yaml"}
 
 
-def twice(rows: Rows) -> Rows:
+def duplicated(rows: Rows) -> Rows:
     return [*rows, next(r for r in rows if r["split"] == "train" and r["pool"] == "future")]
 
 
-def in_both(rows: Rows) -> Rows:
-    tested = next(r["scene_id"] for r in rows if r["split"] == "test" and r["pool"] == "future")
+def about_test_scene(rows: Rows) -> Rows:
+    test_scene = next(r["scene_id"] for r in rows if r["split"] == "test" and r["pool"] == "future")
     (row, *_) = (r for r in rows if r["split"] == "train" and r["pool"] == "future")
-    return [{**r, "scene_id": tested} if r is row else r for r in rows]
+    return [{**r, "scene_id": test_scene} if r is row else r for r in rows]
 
 
-def shown_wrong(rows: Rows) -> Rows:
-    """A scene of the test split is one of the wrong frames."""
-    tested = next(r["scene_id"] for r in rows if r["split"] == "test" and r["pool"] == "future")
+def ranking_test_frame(rows: Rows) -> Rows:
+    """A hard negative is a frame of a test scene."""
+    test_scene = next(r["scene_id"] for r in rows if r["split"] == "test" and r["pool"] == "future")
     (row, *_) = (r for r in rows if r["split"] == "train" and r["pool"] == "future")
-    wrong = [{**row["hard_negatives"][0], "scene_id": tested}, *row["hard_negatives"][1:]]
+    wrong = [{**row["hard_negatives"][0], "scene_id": test_scene}, *row["hard_negatives"][1:]]
     return [{**r, "hard_negatives": wrong} if r is row else r for r in rows]
 
 
-def poor(rows: Rows) -> Rows:
+def with_one_negative(rows: Rows) -> Rows:
     return [{**r, "hard_negatives": r["hard_negatives"][:1]} for r in rows]
 
 
 @pytest.mark.parametrize(
-    ("edit", "said"),
+    ("edit", "code", "name"),
     [
-        (twice, r"retrieval\.parquet has query \S+ more than once"),
-        (in_both, r"training query \S+ refers to scene \S+ of the test split"),
-        (shown_wrong, r"training query \S+ refers to scene \S+ of the test split"),
-        (poor, r"train\.hard_negatives=2, but query"),
+        (duplicated, "duplicate-record", "retrieval.parquet"),
+        (about_test_scene, "split-leak", "training query"),
+        (ranking_test_frame, "split-leak", "training query"),
+        (with_one_negative, "too-few-negatives", "train.hard_negatives=2"),
     ],
 )
 def test_queries_that_cannot_be_trained_on(
-    contrastive_settings, micro_store, tmp_path, edit, said
+    contrastive_settings, micro_store, tmp_path, edit, code, name
 ) -> None:
-    there = edited(micro_store.folder, tmp_path / "store", edit)
+    store_folder = edited(micro_store.folder, tmp_path / "store", edit)
     train = replace(contrastive_settings.train, hard_negatives=2)
-    settings = replace(contrastive_settings, store=there, train=train)
-    refused(settings, tmp_path / "run", said)
+    settings = replace(contrastive_settings, store=store_folder, train=train)
+    assert_refused(settings, tmp_path / "run", name, code=code)
+
+
+def test_more_queries_in_a_batch_than_there_are(contrastive_settings, tmp_path) -> None:
+    train = replace(contrastive_settings.train, batch=4096)
+    settings = replace(contrastive_settings, train=train)
+    assert_refused(settings, tmp_path / "run", "train.batch=4096", code="batch-too-large")
 
 
 def test_a_width_that_the_model_lacks(contrastive_settings, tmp_path) -> None:
     wide = replace(contrastive_settings.retriever, widths=[4096, 64, 32])
-    said = r"asks for 4096, .* small have 64 entries: give retriever\.widths=\[64,32\]"
-    refused(replace(contrastive_settings, retriever=wide), tmp_path / "run", said)
+    settings = replace(contrastive_settings, retriever=wide)
+    assert_refused(settings, tmp_path / "run", "4096", "retriever.widths=[64,32]")
 
 
-def test_a_batch_that_is_too_small_for_what_it_needs(contrastive_settings) -> None:
+def test_batch_settings_that_contradict_each_other(contrastive_settings) -> None:
     train = contrastive_settings.train
-    for change, said in (
+    for change, name in (
         ({"batch": 1, "mini_batch": 1, "hard_negatives": 0}, "train.hard_negatives=0"),
         ({"mini_batch": 5}, "train.mini_batch=5"),
         ({"mine_every": 2, "hard_negatives": 0}, "train.mine_every=2"),
     ):
         (problem,) = replace(train, **change).check()
-        assert said in problem
+        assert name in problem
     (problem,) = replace(contrastive_settings, train=replace(train, hard_negatives=3)).check()
-    assert "train.hard_negatives=3 is more than benchmark.retrieval.hard_negatives=2" in problem
+    assert "train.hard_negatives=3" in problem
 
 
 def over(settings: ContrastiveCommand, folder: Path | str) -> ContrastiveCommand:
-    """Settings of adapters over the base in a folder, or of the hub."""
+    """Settings of adapters over a base in a folder or of the hub."""
     cfg = replace(settings.retriever, architecture=None, model=str(folder), lora=LoraConfig(rank=4))
     return replace(settings, retriever=cfg)
 
 
-@pytest.mark.parametrize(("mode", "said"), [("mean", "with mean pooling"), (None, "without")])
-def test_a_base_that_was_saved_by_another_pooling(
-    contrastive_settings, saved_base, tmp_path, mode, said
-) -> None:
+@pytest.mark.parametrize(("mode", "name"), [("mean", "mean"), (None, "lasttoken")])
+def test_a_base_with_other_pooling(contrastive_settings, saved_base, tmp_path, mode, name) -> None:
     saved = tmp_path / "saved"
     whole = SentenceTransformer(modules=[Transformer(saved_base), Pooling(64, pooling_mode="mean")])
     whole.save_pretrained(str(saved), create_model_card=False)
     if mode is None:
         kinds = json.loads((saved / "modules.json").read_text())[:1]
         (saved / "modules.json").write_text(json.dumps(kinds))
-    refused(over(contrastive_settings, saved), tmp_path / "run", rf"saved {said}.* last token")
+    assert_refused(over(contrastive_settings, saved), tmp_path / "run", str(saved), name)
 
 
 def test_a_base_whose_last_modules_would_be_lost(
@@ -131,25 +140,21 @@ def test_a_base_whose_last_modules_would_be_lost(
     saved = tmp_path / "saved"
     parts = [Transformer(saved_base), Pooling(64, pooling_mode="lasttoken"), Dense(64, 8)]
     SentenceTransformer(modules=parts).save_pretrained(str(saved), create_model_card=False)
-    said = r"after its backbone .* would lose \(Dense\): give a base"
-    refused(over(contrastive_settings, saved), tmp_path / "run", said)
+    assert_refused(over(contrastive_settings, saved), tmp_path / "run", "Dense")
     late = over(contrastive_settings, saved)
     late.retriever.late = LateConfig(width=8)
-    refused(late, tmp_path / "late", said)
+    assert_refused(late, tmp_path / "late", "Dense")
 
 
 @pytest.mark.parametrize(
-    ("on", "told"),
+    ("on", "outcome"),
     [
         (["lasttoken"], nullcontext()),
-        (["mean_tokens"], pytest.raises(UserError, match="saved with mean_tokens pooling")),
-        (
-            ["cls_token", "lasttoken"],
-            pytest.raises(UserError, match="saved with cls_token and lasttoken pooling"),
-        ),
+        (["mean_tokens"], pytest.raises(UserError, match="mean_tokens")),
+        (["cls_token", "lasttoken"], pytest.raises(UserError, match="cls_token")),
     ],
 )
-def test_pooling_as_earlier_versions_saved_it(saved_base, tmp_path, on, told) -> None:
+def test_pooling_as_earlier_versions_saved_it(saved_base, tmp_path, on, outcome) -> None:
     saved = tmp_path / "saved"
     whole = SentenceTransformer(modules=[Transformer(saved_base), Pooling(64, pooling_mode="mean")])
     whole.save_pretrained(str(saved), create_model_card=False)
@@ -157,7 +162,7 @@ def test_pooling_as_earlier_versions_saved_it(saved_base, tmp_path, on, told) ->
     flags = {f"pooling_mode_{name}": name in on for name in names}
     config = {"word_embedding_dimension": 64, **flags, "include_prompt": True}
     (saved / "1_Pooling" / "config.json").write_text(json.dumps(config))
-    with told:
+    with outcome:
         check_pooling(saved)
 
 
@@ -173,15 +178,14 @@ def test_a_base_of_the_hubs_cache_with_another_pooling(
     (cached / "refs").mkdir()
     (cached / "refs" / "main").write_text(commit)
     cfg = over(contrastive_settings, "lab/embedder")
-    refused(cfg, tmp_path / "run", r"lab/embedder was saved with mean pooling.* last token")
+    assert_refused(cfg, tmp_path / "run", "lab/embedder", "mean")
 
 
 def test_a_base_of_another_family(contrastive_settings, saved_base, tmp_path) -> None:
     other = tmp_path / "other"
     shutil.copytree(saved_base, other)
     Qwen2VLConfig().save_pretrained(other)
-    said = r"other is a qwen2_vl; retriever\.encoder=qwen3_vl reads and trains Qwen3-VL"
-    refused(over(contrastive_settings, other), tmp_path / "run", said)
+    assert_refused(over(contrastive_settings, other), tmp_path / "run", "qwen2_vl")
 
 
 def test_non_finite_weights(contrastive_settings, saved_base, tmp_path) -> None:
@@ -202,4 +206,4 @@ def test_non_finite_weights(contrastive_settings, saved_base, tmp_path) -> None:
 
 def test_sharding_is_refused(contrastive_settings, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
-    refused(contrastive_settings, tmp_path / "run", "FSDP does not shard a retriever: .* leave")
+    assert_refused(contrastive_settings, tmp_path / "run", "FSDP")
