@@ -247,8 +247,8 @@ def longest_query(queries: list[RetrievalQuery], tokenizer: Any) -> RetrievalQue
 
 def query_input(query: RetrievalQuery, frames: FrameReader, cfg: RetrieverConfig) -> dict[str, Any]:
     """A query as sentence-transformers takes it: the prefix with its true times, then the text."""
-    shown = sample_prefix_frames(query.prefix_start, query.prefix_stop, cfg.frames)
-    clip = load_clip(query.scene_id, shown, frames)
+    indices = sample_prefix_frames(query.prefix_start, query.prefix_stop, cfg.frames)
+    clip = load_clip(query.scene_id, indices, frames)
     array = torch.from_numpy(clip.pixels).permute(0, 3, 1, 2)
     return {"video": {"array": array, "video_metadata": clip.metadata}, "text": query.question}
 
@@ -288,7 +288,7 @@ def embed(
     """Embed queries, or frames, loading the pixels of `batch` a rank at a time.
 
     Args:
-        progress: Label of a progress bar; without one there is no bar.
+        progress: Label of a progress bar; None shows none.
 
     Returns:
         An fp32 tensor on the CPU for each item, (width,) or (vectors, width).

@@ -23,7 +23,7 @@ class ScoredTokens(Module):
     of a question from those of the instruction and the timestamps.
 
     Args:
-        media_ids: Ids of the tokens that stand for pixels.
+        media_ids: Ids of the placeholder tokens of pixels.
         media_end: Id of the token that closes an image or a clip.
         message_end: Id of the token that closes a message.
     """

@@ -45,8 +45,8 @@ def test_a_query_is_instruction_then_video_then_text_and_a_generation_prompt(
     assert text.index("<|video_pad|>") < text.index(query.question)
     assert text.endswith("<|im_start|>assistant\n")
     assert features["video_grid_thw"].tolist() == [[6, 6, 6]]
-    shown = sample_prefix_frames(query.prefix_start, query.prefix_stop, 12)
-    assert f"<{(shown[0] + shown[1]) / 2 / FPS:.1f} seconds>" in text
+    indices = sample_prefix_frames(query.prefix_start, query.prefix_stop, 12)
+    assert f"<{(indices[0] + indices[1]) / 2 / FPS:.1f} seconds>" in text
     assert "of 6 x 3 x 3 tokens" in audit_retriever(model, retriever_cfg, query, frames)
 
 
@@ -60,8 +60,8 @@ def test_timestamps_follow_the_clips_frame_rate(
     model = load(micro_store, retriever_cfg, tmp_path)
     features = model.preprocess([query_input(query, frames, retriever_cfg)])
     text = model[0].processor.tokenizer.decode(features["input_ids"][0])
-    shown = sample_prefix_frames(query.prefix_start, query.prefix_stop, 12)
-    assert f"<{(shown[0] + shown[1]) / 2 / 12:.1f} seconds>" in text
+    indices = sample_prefix_frames(query.prefix_start, query.prefix_stop, 12)
+    assert f"<{(indices[0] + indices[1]) / 2 / 12:.1f} seconds>" in text
 
 
 def test_a_long_query_is_refused_instead_of_truncated(
@@ -151,9 +151,9 @@ def test_frames_of_the_database_look_different(micro_store) -> None:
     for target in targets:
         album.add(target)
     assert all(album.add(frame) for frame in database if frame not in targets)
-    shown = {(f.scene_id, f.frame) for f in database}
+    kept = {(f.scene_id, f.frame) for f in database}
     for scene_id in {f.scene_id for f in database}:
-        left_out = {f for f in range(0, FRAMES, FRAME_STEP) if (scene_id, f) not in shown}
+        left_out = {f for f in range(0, FRAMES, FRAME_STEP) if (scene_id, f) not in kept}
         assert not any(album.add(FrameRef(scene_id, frame)) for frame in left_out)
 
 
@@ -168,20 +168,20 @@ def test_the_evaluator_ranks_as_the_library_with_all_pixels_in_memory(
     kind = MultiVectorHeldOutEvaluator if late else HeldOutEvaluator
     evaluator = kind(queries, build_database(queries, micro_store), frames, cfg, 2)
     assert all(isinstance(one, FrameRef) for one in evaluator.corpus)
-    asked = model.encode_query([query_input(q, frames, cfg) for q in queries])
-    shown = model.encode_document([frame_input(f, frames) for f in evaluator.corpus])
-    scores = model.similarity(asked, shown).cpu().numpy()
+    queries_embedded = model.encode_query([query_input(q, frames, cfg) for q in queries])
+    frames_embedded = model.encode_document([frame_input(f, frames) for f in evaluator.corpus])
+    scores = model.similarity(queries_embedded, frames_embedded).cpu().numpy()
     gold = np.array([evaluator.corpus.index(q.target) for q in queries])
-    found = evaluator(model)
+    metrics = evaluator(model)
     own = scores[np.arange(len(queries)), gold][:, None]
-    assert found["mrr"] == pytest.approx((1 / (1 + (scores > own).sum(1))).mean(), abs=0.02)
-    assert found["recall@10"] == pytest.approx(((scores > own).sum(1) < 10).mean(), abs=0.2)
+    assert metrics["mrr"] == pytest.approx((1 / (1 + (scores > own).sum(1))).mean(), abs=0.02)
+    assert metrics["recall@10"] == pytest.approx(((scores > own).sum(1) < 10).mean(), abs=0.2)
 
     embed, first = model.encode_document, evaluator.corpus[0]
 
     def torn(*inputs, **settings):
-        made = list(embed(*inputs, **settings))
-        return [made[0] * float("nan"), *made[1:]]
+        embedded = list(embed(*inputs, **settings))
+        return [embedded[0] * float("nan"), *embedded[1:]]
 
     monkeypatch.setattr(model, "encode_document", torn)
     with raises_user_error("non-finite-embedding", f"frame {first.frame} of {first.scene_id}"):

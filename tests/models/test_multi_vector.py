@@ -56,21 +56,27 @@ def model(late_cfg, micro_store, tmp_path_factory) -> MultiVectorEncoder:
 def test_only_the_question_and_the_pixels_are_scored(model, late_cfg, queries, frames) -> None:
     """Also in padded rows, and if the question contains words of a timestamp and of the
     instruction."""
-    asked = replace(queries[0], question="<0.1 seconds> Retrieve images: user's query, 0.5 seconds")
+    similar = replace(
+        queries[0], question="<0.1 seconds> Retrieve images: user's query, 0.5 seconds"
+    )
     features = model.preprocess(
-        [query_input(q, frames, late_cfg) for q in (asked, queries[-1])],
+        [query_input(q, frames, late_cfg) for q in (similar, queries[-1])],
         prompt=late_cfg.query_instruction,
     )
     ids = features["input_ids"]
     scored = find_scored_tokens(model).scored(ids, features["attention_mask"])
     video = model.tokenizer.convert_tokens_to_ids("<|video_pad|>")
-    for query, row, kept in zip((asked, queries[-1]), ids, scored, strict=True):
+    for query, row, kept in zip((similar, queries[-1]), ids, scored, strict=True):
         assert (row[kept] == video).sum() == (row == video).sum() == 6 * FRAME_TOKENS
         assert model.tokenizer.decode(row[kept & (row != video)]) == query.question
-    shown = model.preprocess([frame_input(asked.target, frames)], prompt=late_cfg.frame_instruction)
-    kept = find_scored_tokens(model).scored(shown["input_ids"], shown["attention_mask"])[0]
+    image_inputs = model.preprocess(
+        [frame_input(similar.target, frames)], prompt=late_cfg.frame_instruction
+    )
+    kept = find_scored_tokens(model).scored(
+        image_inputs["input_ids"], image_inputs["attention_mask"]
+    )[0]
     image = model.tokenizer.convert_tokens_to_ids("<|image_pad|>")
-    assert shown["input_ids"][0][kept].tolist() == [image] * FRAME_TOKENS
+    assert image_inputs["input_ids"][0][kept].tolist() == [image] * FRAME_TOKENS
 
 
 def test_an_input_without_pixels_is_refused(model) -> None:
@@ -92,11 +98,11 @@ def test_vectors_are_the_scored_tokens_projected_and_normalised(
         ]
         with torch.no_grad():
             states = model[0](dict(features))["token_embeddings"][0]
-            made = torch.nn.functional.normalize(states[kept] @ model[1].linear.weight.T, dim=1)
-        torch.testing.assert_close(vectors, made, atol=1e-5, rtol=0)
+            outputs = torch.nn.functional.normalize(states[kept] @ model[1].linear.weight.T, dim=1)
+        torch.testing.assert_close(vectors, outputs, atol=1e-5, rtol=0)
 
-        def spoil(module, given, made, kept=kept):
-            made["token_embeddings"][:, ~kept] = 7.0
+        def spoil(module, given, outputs, kept=kept):
+            outputs["token_embeddings"][:, ~kept] = 7.0
 
         hook = model[0].register_forward_hook(spoil)
         spoilt = model.encode_query([one])[0]
@@ -135,8 +141,10 @@ def test_a_saved_retriever_encodes_the_same_without_this_project(
     assert ScoredTokens not in map(type, alone)
     inputs = [query_input(queries[0], frames, cfg), frame_input(queries[0].target, frames)]
     for one in (alone, again):
-        for vectors, there in zip(vectors_by(model, inputs), vectors_by(one, inputs), strict=True):
-            torch.testing.assert_close(vectors, there, atol=1e-6, rtol=0)
+        for vectors, expected in zip(
+            vectors_by(model, inputs), vectors_by(one, inputs), strict=True
+        ):
+            torch.testing.assert_close(vectors, expected, atol=1e-6, rtol=0)
 
 
 def vectors_by(model, inputs) -> list[torch.Tensor]:
@@ -185,22 +193,22 @@ def test_tokens_are_pooled_in_bf16_as_in_fp32(
 ) -> None:
     cfg = replace(late_cfg, late=LateConfig(width=24, pool=pool))
     model = load(cfg, micro_store, tmp_path)
-    shown = [frame_input(queries[0].target, frames)]
-    (exact,) = model.encode_document(shown)
+    images = [frame_input(queries[0].target, frames)]
+    (exact,) = model.encode_document(images)
     with torch.autocast("cpu", torch.bfloat16):
-        (vectors,) = model.encode_document(shown)
+        (vectors,) = model.encode_document(images)
     assert vectors.shape == exact.shape == (FRAME_TOKENS // pool, 24)
     assert vectors.isfinite().all()
 
 
 def test_the_audit_marks_scored_tokens(model, late_cfg, queries, frames) -> None:
-    told = audit_retriever(model, late_cfg, queries[0], frames)
+    audit = audit_retriever(model, late_cfg, queries[0], frames)
     length = len(model.tokenizer(queries[0].question, add_special_tokens=False).input_ids)
-    assert f"{6 * FRAME_TOKENS + length} of them scored" in told
-    assert f"{FRAME_TOKENS} of them scored" in told
-    assert f">>>{queries[0].question}<<<<|im_end|>" in told
-    assert told.count(">>><|video_pad|>...<<<") == 6
-    assert ">>><|image_pad|>...<<<" in told
+    assert f"{6 * FRAME_TOKENS + length} of them scored" in audit
+    assert f"{FRAME_TOKENS} of them scored" in audit
+    assert f">>>{queries[0].question}<<<<|im_end|>" in audit
+    assert audit.count(">>><|video_pad|>...<<<") == 6
+    assert ">>><|image_pad|>...<<<" in audit
 
 
 def test_width_weights_need_a_retriever_with_one_vector(contrastive_settings, late_cfg) -> None:

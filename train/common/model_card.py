@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+import yaml
 from huggingface_hub import ModelCard, ModelCardData
 
 from conf.multirun.table import AT_START_SUFFIX
@@ -21,6 +24,8 @@ FORMATS = {
     "fp32": "merged into its base; weights in fp32",
     "adapter": "the LoRA adapters, to be loaded over their base",
 }
+NO_TEACHER = ("answer_only", "describe")
+"""Regimes without rationales."""
 PIPELINES = {"student": "image-text-to-text", "retriever": "sentence-similarity"}
 TEMPLATE = """---
 {{ card_data }}
@@ -36,6 +41,11 @@ A {{ product }} of DynaPix: {{ format }}.
 | --- | --- |
 {% for label, value in training %}| {{ label }} | {{ value }} |
 {% endfor %}
+
+The settings that define it:
+
+```yaml
+{{ settings }}```
 {% if over_nf4 %}
 The adapters belong to the base in NF4, as bitsandbytes quantises it. Over the unquantised base, as
 servers load them, the model differs from the trained one; the merged weights do not
@@ -99,7 +109,8 @@ def model_card(
         name=name,
         product=product,
         format=FORMATS[format],
-        training=list(_training_rows(settings, folder)),
+        training=list(_training_rows(settings, preset, folder)),
+        settings=yaml.safe_dump({product: asdict(preset), "train": asdict(train)}, sort_keys=False),
         over_nf4=format == "adapter" and preset.quantization == "nf4",
         count=train.validation_items if student else train.validation_queries,
         items="items" if student else "queries",
@@ -125,25 +136,18 @@ def _kept_step(best: str | None, metrics: dict[str, float]) -> str:
 
 
 def _training_rows(
-    settings: SftCommand | ContrastiveCommand, folder: Path
+    settings: SftCommand | ContrastiveCommand, preset: Any, folder: Path
 ) -> Iterator[tuple[str, str]]:
-    student = isinstance(settings, SftCommand)
-    preset = settings.student if student else settings.retriever
-    train, benchmark, lora = settings.train, settings.benchmark, preset.lora
+    benchmark = settings.benchmark
     record = json.loads((folder / "run.json").read_text())
     yield "base", f"{preset.model}{f' at {preset.revision}' if preset.revision else ''}"
     if not is_hub_model(preset.model) and (resolved := read_resolved(folder)):
         yield "digest of the base's weights", resolved["base"]
-    yield "quantisation of the base", preset.quantization
-    yield "adapters", f"LoRA of rank {lora.rank}, alpha {lora.alpha}, dropout {lora.dropout}"
     scenes = f"{benchmark.scenes} scenes by " if benchmark.simulator == "bullet" else ""
     yield "benchmark", f"{benchmark.name}, {scenes}{benchmark.simulator}, seed {benchmark.seed}"
-    yield from _student_rows(settings) if student else _retriever_rows(settings)
-    yield "frames", f"{preset.frames} a prefix, {preset.image_size} x {preset.image_size} px"
-    length = f"{train.epochs:g} epochs" if train.max_steps == -1 else f"{train.max_steps} steps"
-    yield "length", f"{length} of {train.batch} {'samples' if student else 'queries'} a step"
-    yield "learning rate", f"{train.lr:g}, {train.schedule}"
-    yield "precision", train.precision
+    if isinstance(settings, SftCommand) and settings.train.regime not in NO_TEACHER:
+        teacher = settings.teacher
+        yield "teacher", f"{teacher.name}{f' ({teacher.model})' if teacher.model else ''}"
     yield "seed", str(settings.seed)
     yield "started", record["started"]
     if record["git"]:
@@ -151,23 +155,3 @@ def _training_rows(
         yield "code", f"commit {record['git']['commit']}{changed}"
     versions = record["packages"]
     yield "versions", ", ".join(f"{p} {versions[p]}" for p in PACKAGES if p in versions)
-
-
-def _student_rows(settings: SftCommand) -> Iterator[tuple[str, str]]:
-    yield "regime", settings.train.regime
-    if settings.train.regime not in ("answer_only", "describe"):
-        teacher = settings.teacher
-        yield "teacher", f"{teacher.name}{f' ({teacher.model})' if teacher.model else ''}"
-
-
-def _retriever_rows(settings: ContrastiveCommand) -> Iterator[tuple[str, str]]:
-    preset, train = settings.retriever, settings.train
-    if preset.late is None:
-        yield "widths", ", ".join(map(str, preset.widths))
-    else:
-        yield "vectors", f"one for each token, {preset.late.width} wide, for late interaction"
-    yield "instruction of queries", preset.query_instruction
-    yield "instruction of frames", preset.frame_instruction
-    mined = f", mined every {train.mine_every} steps" if train.mine_every else ""
-    yield "hard negatives", f"{train.hard_negatives} a query{mined}"
-    yield "scale of scores", f"{train.scale:g}"

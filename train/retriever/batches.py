@@ -85,16 +85,16 @@ class QueryBatchSampler(DefaultBatchSampler):
         """The next batch of the waiting queries, and the queries that still wait."""
         batch, postponed = [], []
         targets: set[FrameRef] = set()
-        shown: set[FrameRef] = set()
+        ranked: set[FrameRef] = set()
         for position, k in enumerate(waiting):
             query = self._queries[k]
             documents = {query.target, *query.hard_negatives[: self._negatives]}
-            if query.target in shown or documents & targets:
+            if query.target in ranked or documents & targets:
                 postponed.append(k)
                 continue
             batch.append(k)
             targets.add(query.target)
-            shown |= documents
+            ranked |= documents
             if len(batch) == self._batch:
                 return batch, postponed + waiting[position + 1 :]
         # Too few of the remaining queries are compatible: the loss masks identical frames.

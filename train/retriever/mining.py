@@ -83,8 +83,8 @@ class HardNegativeMiner(TrainerCallback):
                 write_negatives(self._mined, self._path(step))
 
     def _mine(self) -> HardNegatives:
-        shown = ((q.target, *q.hard_negatives[: self._count]) for q in self._queries)
-        pool = list(dict.fromkeys(frame for frames in shown for frame in frames))
+        documents = ((q.target, *q.hard_negatives[: self._count]) for q in self._queries)
+        pool = list(dict.fromkeys(frame for frames in documents for frame in frames))
         was_training = self._model.training
         queries, frames = (
             pad_sequence(self._embed(items, f"mining: {label}"), batch_first=True)

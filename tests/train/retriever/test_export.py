@@ -28,7 +28,7 @@ from conf.schema import (
     RetrieverConfig,
 )
 from evaluation import retrieve
-from models import compat, loading
+from models import loading
 from models.resolved import resolve_run
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
 from tests.user_errors import raises_user_error
@@ -122,14 +122,14 @@ import torch
 from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 
 folder, inputs, outputs, kind = sys.argv[1:]
-given = torch.load(inputs, weights_only=False)
+data = torch.load(inputs, weights_only=False)
 if kind == "one":
     model = SentenceTransformer(folder, device="cpu")
 else:
     model = MultiVectorEncoder(folder, device="cpu", trust_remote_code=True)
-made = model.encode_query(given["queries"]), model.encode_document(given["frames"])
+embedded = model.encode_query(data["queries"]), model.encode_document(data["frames"])
 assert not {"train", "conf", "data"} & set(sys.modules)
-torch.save([[torch.as_tensor(one) for one in some] for some in made], outputs)
+torch.save([[torch.as_tensor(one) for one in some] for some in embedded], outputs)
 """
 
 
@@ -139,11 +139,11 @@ def test_the_library_alone_computes_the_same_embeddings(
 ) -> None:
     """As the trained retriever, the adapters over their 4-bit base."""
     queries, preset = micro_store.standard_test()[:2], settings.retriever
-    given = {
+    data = {
         "queries": [query_input(q, frames, preset) for q in queries],
         "frames": [frame_input(q.target, frames) for q in queries],
     }
-    torch.save(given, tmp_path / "inputs.pt")
+    torch.save(data, tmp_path / "inputs.pt")
     kind = "one" if preset.late is None else "many"
     arguments = [forms["fp32"][1], tmp_path / "inputs.pt", tmp_path / "outputs.pt", kind]
     subprocess.run(
@@ -152,15 +152,15 @@ def test_the_library_alone_computes_the_same_embeddings(
     )  # fmt: skip
     model = load_trained(preset, "fp32", runs / "contrastive" / "run" / "retriever")
     compat.keep_differentiable(model)
-    wanted = model.encode_query(given["queries"]), model.encode_document(given["frames"])
-    for found, expected in zip(torch.load(tmp_path / "outputs.pt"), wanted, strict=True):
-        for one, two in zip(found, expected, strict=True):
+    wanted = model.encode_query(data["queries"]), model.encode_document(data["frames"])
+    for results, expected in zip(torch.load(tmp_path / "outputs.pt"), wanted, strict=True):
+        for one, two in zip(results, expected, strict=True):
             torch.testing.assert_close(one.cpu(), torch.as_tensor(two).cpu(), atol=1e-4, rtol=0)
 
 
 @pytest.mark.slow
 def test_every_format_evaluates_like_the_run(settings, runs, forms, tmp_path) -> None:
-    found = {}
+    results = {}
     models = {f: forms[f][1] for f in ("fp32", "adapter")} | {"run": runs / "contrastive" / "run"}
     for name, model in models.items():
         cfg = RetrieveCommand(
@@ -170,21 +170,19 @@ def test_every_format_evaluates_like_the_run(settings, runs, forms, tmp_path) ->
         (tmp_path / name).mkdir()
         retrieve.main.__wrapped__(cfg, Run(name, tmp_path / name))
         rows = json.loads((tmp_path / name / "report.json").read_text())["rows"]
-        found[name] = {r["width"]: r["mrr"]["value"] for r in reversed(rows[: len(rows) // 2])}
-    assert found["adapter"] == found["run"]
-    assert found["fp32"] == pytest.approx(found["run"], abs=0.05)
+        results[name] = {r["width"]: r["mrr"]["value"] for r in reversed(rows[: len(rows) // 2])}
+    assert results["adapter"] == results["run"]
+    assert results["fp32"] == pytest.approx(results["run"], abs=0.05)
 
 
 def test_the_card_describes_the_run(settings, forms) -> None:
     card = ModelCard.load(forms["adapter"][1] / "README.md")
     assert card.data.library_name == "peft"
     assert card.data.pipeline_tag == "sentence-similarity"
-    late = settings.retriever.late
     for row in (
         f"| base | {settings.retriever.model} |",
-        "| adapters | LoRA of rank 4, alpha 32, dropout 0.0 |",
-        "| widths | 64, 32 |" if late is None else "| vectors | one for each token, 24 wide",
-        "| hard negatives | 1 a query |",
+        "  widths:\n  - 64\n  - 32\n",
+        "  hard_negatives: 1\n",
         "| recall@10 | 0.25 | 0.5 |",
     ):
         assert row in card.text
@@ -193,7 +191,7 @@ def test_the_card_describes_the_run(settings, forms) -> None:
 
 @pytest.mark.slow
 def test_an_export_that_embeds_otherwise_is_not_kept(settings, runs, tmp_path, monkeypatch) -> None:
-    """The adapters left out stand for anything that goes wrong in merging."""
+    """Here merging leaves out the adapters."""
     monkeypatch.setattr(loading, "merged", lambda base, *_: base.dequantize(torch.float32))
     with raises_user_error("merge-difference"):
         exported(settings, runs, "fp32", tmp_path)

@@ -160,7 +160,7 @@ def test_the_loss_is_its_formula_without_identical_frames(
     assert len(queries) > len(distinct)
     value, _ = own(trained, queries, frames)
     documents = [f for q in queries for f in (q.target, *q.hard_negatives[:NEGATIVES])]
-    vectors, shown = (
+    vectors, document_vectors = (
         pad_sequence(embed(model, items, frames, cfg, 4), batch_first=True)
         for items in (queries, documents)
     )
@@ -174,9 +174,11 @@ def test_the_loss_is_its_formula_without_identical_frames(
     expected = 0.0
     for width, weight in zip(cfg.widths, WEIGHTS, strict=True):
         if cfg.late:
-            scores, weight = maxsim(vectors, shown), 1 / len(cfg.widths)
+            scores, weight = maxsim(vectors, document_vectors), 1 / len(cfg.widths)
         else:
-            rows, columns = (normalize(side[:, :width], dim=1) for side in (vectors, shown))
+            rows, columns = (
+                normalize(side[:, :width], dim=1) for side in (vectors, document_vectors)
+            )
             scores = rows @ columns.T
         expected += weight * cross_entropy(scores * scale(cfg) + masked, target).item()
     model.train()

@@ -95,10 +95,12 @@ def test_a_run_mines_the_highest_ranked_frames_and_resumes_with_them(
         shutil.copy(weights, tmp_path / "third" / weights.relative_to(whole / "checkpoint-3"))
     model = load_trained(cfg, "fp32", tmp_path / "third")
     pool = list(dict.fromkeys(f for q in queries for f in (q.target, *q.hard_negatives[:1])))
-    shown = embed(model, pool, frames, cfg, 8)
+    document_vectors = embed(model, pool, frames, cfg, 8)
     for query in queries[:5]:
         vectors = embed(model, [query], frames, cfg, 1)
-        scores = np.array([float(model.similarity([vectors[0]], [row])) for row in shown])
+        scores = np.array(
+            [float(model.similarity([vectors[0]], [row])) for row in document_vectors]
+        )
         ranked = [pool[k] for k in np.argsort(-scores, kind="stable")]
         by_frame = dict(zip(pool, scores, strict=True))
         best = select_negatives(query, ranked, micro_store, MARGIN, 1)[0]

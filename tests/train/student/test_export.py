@@ -30,7 +30,7 @@ from conf.schema import (
     TeacherConfig,
 )
 from evaluation import select
-from models import compat, loading
+from models import loading
 from models.resolved import resolve_run
 from models.student.collator import encode
 from models.student.prompts import selection_sample
@@ -137,15 +137,15 @@ from transformers import AutoModelForImageTextToText, AutoProcessor
 from transformers.video_utils import VideoMetadata
 
 folder, inputs, outputs = sys.argv[1:]
-given = torch.load(inputs, weights_only=False)
+data = torch.load(inputs, weights_only=False)
 processor = AutoProcessor.from_pretrained(folder)
 model = AutoModelForImageTextToText.from_pretrained(folder).eval()
 text = processor.apply_chat_template(
-    [{"role": "user", "content": given["content"]}], tokenize=False, add_generation_prompt=True
+    [{"role": "user", "content": data["content"]}], tokenize=False, add_generation_prompt=True
 )
 batch = processor(
-    text=[text], images=given["images"], videos=[given["video"]],
-    video_metadata=[VideoMetadata(**given["metadata"])], return_tensors="pt",
+    text=[text], images=data["images"], videos=[data["video"]],
+    video_metadata=[VideoMetadata(**data["metadata"])], return_tensors="pt",
 )
 with torch.no_grad():
     logits = model(**batch).logits
@@ -161,9 +161,9 @@ def test_transformers_alone_computes_the_same_logits(
     """As the trained student, the adapters over their 4-bit base."""
     item = micro_store.selection("test")[0]
     sample = selection_sample(item, "answer", "cot", frames, settings.student.frames)
-    given = {"content": sample.content, "images": sample.images}
-    given |= {"video": sample.clip.pixels, "metadata": sample.clip.metadata}
-    torch.save(given, tmp_path / "inputs.pt")
+    data = {"content": sample.content, "images": sample.images}
+    data |= {"video": sample.clip.pixels, "metadata": sample.clip.metadata}
+    torch.save(data, tmp_path / "inputs.pt")
     arguments = [forms["fp32"][1], tmp_path / "inputs.pt", tmp_path / "outputs.pt"]
     subprocess.run(
         [sys.executable, "-c", ELSEWHERE, *map(str, arguments)],
@@ -174,18 +174,18 @@ def test_transformers_alone_computes_the_same_logits(
     model, processor = loading.load_trained(settings.student, "fp32", student)
     # Packed for inference, some CPUs round 4-bit products another way.
     compat.keep_differentiable(model)
-    asked = encode(sample, processor, 1500)
-    assert ids[0].tolist() == asked.input_ids
-    types = torch.tensor([asked.mm_token_type_ids])
+    encoded = encode(sample, processor, 1500)
+    assert ids[0].tolist() == encoded.input_ids
+    types = torch.tensor([encoded.mm_token_type_ids])
     with torch.no_grad():
-        wanted = model(input_ids=ids, mm_token_type_ids=types, **asked.media).logits
+        wanted = model(input_ids=ids, mm_token_type_ids=types, **encoded.media).logits
     torch.testing.assert_close(logits, wanted, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.slow
 def test_every_format_evaluates_like_the_run(settings, runs, forms, tmp_path) -> None:
     unused = StudentConfig(name="unused", model="unused")
-    said = {}
+    responses = {}
     models = {f: forms[f][1] for f in ("fp32", "adapter")} | {"run": runs / "sft" / "run"}
     for name, model in models.items():
         cfg = SelectCommand(
@@ -197,9 +197,9 @@ def test_every_format_evaluates_like_the_run(settings, runs, forms, tmp_path) ->
         metrics = select.main.__wrapped__(cfg, Run(name, folder))
         assert {"reasoning_micro", "answer_micro"} <= metrics.keys()
         lines = (folder / "answers.jsonl").read_text().splitlines()
-        said[name] = sorted(line for line in lines if "item_id" in json.loads(line))
-    assert said["adapter"] == said["run"]
-    assert len(said["fp32"]) == 4
+        responses[name] = sorted(line for line in lines if "item_id" in json.loads(line))
+    assert responses["adapter"] == responses["run"]
+    assert len(responses["fp32"]) == 4
     assert run_title(models["fp32"]) == "run fp32"
 
 
@@ -263,8 +263,7 @@ def test_the_card_describes_the_run(settings, runs, forms) -> None:
     record = json.loads((runs / "sft" / "run" / "run.json").read_text())
     for row in (
         f"| base | {settings.student.model} |",
-        "| adapters | LoRA of rank 4, alpha 32, dropout 0.0 |",
-        "| quantisation of the base | nf4 |",
+        "  quantization: nf4\n  lora:\n    rank: 4\n    alpha: 32\n",
         "| benchmark | micro, 10 scenes by bullet, seed 0 |",
         "| teacher | template |",
         "| seed | 0 |",
@@ -347,14 +346,14 @@ def test_a_damaged_export_is_refused(settings, forms, tmp_path) -> None:
 
 def test_a_run_is_named_by_its_name_or_its_folder(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for given in ("exp-cot", "exp-cot/", "checkpoints/sft/exp-cot", "./checkpoints/sft/exp-cot/",
+    for name in ("exp-cot", "exp-cot/", "checkpoints/sft/exp-cot", "./checkpoints/sft/exp-cot/",
                   str(tmp_path / "checkpoints" / "sft" / "exp-cot")):  # fmt: skip
-        assert resolve_run_name(given, "checkpoints/sft") == "exp-cot"
+        assert resolve_run_name(name, "checkpoints/sft") == "exp-cot"
     assert resolve_run_name("checkpoints/sft/lrs/0", "checkpoints/sft") == resolve_run_name(
         "lrs/0", "x"
     )
     assert is_run_name("exp-cot")
     assert is_run_name("lrs/0")
-    for given in ("/elsewhere/sft/exp-cot", "../sft/exp-cot", "checkpoints/sft", "."):
-        assert not is_run_name(resolve_run_name(given, "checkpoints/sft"))
-        assert ExportModelCommand(run=given).check()
+    for name in ("/elsewhere/sft/exp-cot", "../sft/exp-cot", "checkpoints/sft", "."):
+        assert not is_run_name(resolve_run_name(name, "checkpoints/sft"))
+        assert ExportModelCommand(run=name).check()
