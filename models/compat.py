@@ -12,6 +12,10 @@ Hooks that are used through subclasses, outside of this file:
 - `models.attention` registers a function whose name contains "flash": Qwen3-VL's vision tower
   passes all frames at once, with `cu_seq_lens_q`, only to those.
 - `train.student.vision_cache` passes `mm_encoder_outputs` to Qwen3-VL's `forward`.
+- `train.retriever.inputs` does so in a forward pre-hook of the retriever's backbone.
+- `train.retriever.loss` overrides `embed_minibatch_iter` of sentence-transformers' cached losses,
+  and `train.retriever.trainer` overrides `_load_from_checkpoint` and `_load_best_model`.
+- `models.retriever.multi_vector` loads by `MultiVectorEncoder._load_with_module_classes`.
 - `train.student.packing` passes four rows of positions, the first of which isolates samples.
 """
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
-from conf.entry import Run, command
+from conf.entry import command
 from conf.gpus import restrict_to_one_gpu
-from conf.runs import finished_metrics
+from conf.runs import Run, finished_metrics, rank
 from conf.schema import ContrastiveCommand
 from conf.trackers import check_trackers
 
@@ -17,24 +18,58 @@ log = logging.getLogger(__name__)
 @command("train.contrastive", ContrastiveCommand)
 def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     if (metrics := finished_metrics(run)) is not None:
-        log.info("%s is finished: delete it, or set run=NAME, to train again", run.folder)
+        log.info("%s is finished; to train again, delete it or give run=NAME", run.folder)
         return metrics
-
-    restrict_to_one_gpu()
     check_trackers(cfg.train.report_to)
+    restrict_to_one_gpu()
+
+    from transformers import set_seed
 
     from data.build import ensure_benchmark
-    from models import distributed
+    from models.compat import keep_freed_memory
+    from models.distributed import check_unsharded, main_first, per_rank_batch
+    from models.lora_kernels import fuse
+    from models.resolved import data_digest, resolve_run
+    from models.retriever.embedder import load_retriever, tokenizer_texts
+    from train.common.checkpoints import newest_checkpoint
+    from train.common.journal import run_metrics
+    from train.common.training_loop import explain_load_errors, lower_memory, run_training
+    from train.retriever.batches import split_queries
+    from train.retriever.run import build_trainer
 
-    distributed.check_unsharded()
-    rank_batch = distributed.per_rank_batch(cfg.train.batch)
-    store = distributed.from_main(
-        lambda: ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    keep_freed_memory()
+    check_unsharded()
+    rank_batch = per_rank_batch(cfg.train.batch)
+    checkpoint = newest_checkpoint(run.folder)
+
+    # The main rank builds what is missing; then every rank reads it from the disk.
+    with main_first():
+        store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    training, validation = split_queries(
+        store, cfg.train.batch, cfg.train.hard_negatives, cfg.train.validation_queries, cfg.seed
     )
 
-    from train.retriever.run import train_retriever
+    data = data_digest(store.identity, (q.query_id for q in (*training, *validation)))
+    with main_first():
+        precision, retriever = resolve_run(run.folder, cfg.train.precision, cfg.retriever, data)
+    cfg = replace(cfg, retriever=retriever, train=replace(cfg.train, precision=precision))
 
-    return train_retriever(cfg, run, store, rank_batch)
+    log.info("loading retriever %s, to compute in %s", retriever.name, precision)
+    # Adapters are initialised before the trainer sets its seed.
+    set_seed(cfg.seed)
+    texts = tokenizer_texts(store.retrieval("train"), retriever)
+    with explain_load_errors(run.folder, "retriever"):
+        model = load_retriever(retriever, precision, texts, run.folder / "untrained")
+    fuse(model)
+
+    trainer = build_trainer(cfg, run, store, model, training, validation, rank_batch, checkpoint)
+    advice = lower_memory(cfg.train, "mini_batch", "retriever.image_size or retriever.frames")
+    best_step = run_training(trainer, run, checkpoint, advice)
+
+    if rank() == 0:
+        model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)
+    log.info("the retriever is in %s", run.folder / "retriever")
+    return run_metrics(run.folder, best_step)
 
 
 if __name__ == "__main__":

@@ -117,8 +117,6 @@ class SftTrainConfig(TrainConfig):
 
 @dataclass
 class ContrastiveTrainConfig(TrainConfig):
-    gradient_checkpointing: bool = False
-    """Recompute activations in the backward pass: less memory, about a quarter more time."""
     batch: int = 512
     """Queries per optimizer step, over all ranks; each is contrasted with every target and hard
     negative of the batch except the frame of its own target."""
