@@ -28,7 +28,7 @@ from conf.schema import (
     RetrieverConfig,
 )
 from evaluation import retrieve
-from models import loading
+from models import compat, loading
 from models.resolved import resolve_run
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
 from tests.user_errors import raises_user_error

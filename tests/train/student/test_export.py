@@ -30,7 +30,7 @@ from conf.schema import (
     TeacherConfig,
 )
 from evaluation import select
-from models import loading
+from models import compat, loading
 from models.resolved import resolve_run
 from models.student.collator import encode
 from models.student.prompts import selection_sample
@@ -172,7 +172,7 @@ def test_transformers_alone_computes_the_same_logits(
     ids, logits = torch.load(tmp_path / "outputs.pt")
     student = runs / "sft" / "run" / "student"
     model, processor = loading.load_trained(settings.student, "fp32", student)
-    # Packed for inference, some CPUs round 4-bit products another way.
+    # Some CPUs round 4-bit products differently once the weights are packed for inference.
     compat.keep_differentiable(model)
     encoded = encode(sample, processor, 1500)
     assert ids[0].tolist() == encoded.input_ids
