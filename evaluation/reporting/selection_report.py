@@ -45,11 +45,11 @@ def write_report(
         Accuracies and parse rates of each mode, under the control if there is one.
     """
     labels = {variant: variant_label(*variant) for variant in answers}
-    by_label = {labels[variant]: given for variant, given in answers.items()}
+    by_label = {labels[variant]: of_variant for variant, of_variant in answers.items()}
     rows, metrics = [], {}
-    for (mode, control), given in answers.items():
-        correct = [a.right for a in given]
-        parse_rate = sum(a.letter is not None for a in given) / len(given)
+    for (mode, control), of_variant in answers.items():
+        correct = [a.right for a in of_variant]
+        parse_rate = sum(a.letter is not None for a in of_variant) / len(of_variant)
         settings = (cfg.seed, cfg.suite, control)
         row = selection_row(benchmark, name, mode, items, correct, parse_rate, *settings)
         rows.append(row)
@@ -60,16 +60,18 @@ def write_report(
     letters = [item.letter for item in items]
     details = {
         "subtypes": {
-            label: accuracy_by_subtype(items, [a.right for a in given])
-            for label, given in by_label.items()
+            label: accuracy_by_subtype(items, [a.right for a in of_variant])
+            for label, of_variant in by_label.items()
         },
-        "readings": {label: count_readings(given) for label, given in by_label.items()},
+        "readings": {label: count_readings(of_variant) for label, of_variant in by_label.items()},
         "positions": {
-            label: measure_position_bias([a.letter for a in given], letters)
-            for label, given in by_label.items()
+            label: measure_position_bias([a.letter for a in of_variant], letters)
+            for label, of_variant in by_label.items()
         },
         "calibration": {
-            label: found for label, given in by_label.items() if (found := calibrate(given))
+            label: calibration
+            for label, of_variant in by_label.items()
+            if (calibration := calibrate(of_variant))
         },
     }
     differences = compare_variants(answers, items, cfg)
@@ -119,7 +121,8 @@ def compare_variants(
     """By label: the unchanged items less the items under the control, and in matched-anchor pairs
     the questions of the event less those of the time."""
     credits = {
-        variant: {a.item_id: float(a.right) for a in given} for variant, given in answers.items()
+        variant: {a.item_id: float(a.right) for a in of_variant}
+        for variant, of_variant in answers.items()
     }
     differences = []
     for (mode, control), own in credits.items():

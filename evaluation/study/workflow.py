@@ -128,7 +128,7 @@ def record_loaded(db: sqlite3.Connection, name: str, token: str) -> bool:
 def record_answer(
     db: sqlite3.Connection, name: str, token: str, letter: str, client_seconds: float
 ) -> bool:
-    """Store the answer to an open, loaded item. False if there is none, as for a second answer."""
+    """Store the answer to an open, loaded item. False if no such item is open."""
     with transaction(db):
         turn = db.execute(
             "SELECT shown, practice FROM turn JOIN plan USING (annotator, item_id) "
@@ -182,7 +182,7 @@ def load_medium(db: sqlite3.Connection, name: str, token: str) -> sqlite3.Row | 
 
 
 def _open_item(db: sqlite3.Connection, name: str, practice: bool) -> str:
-    """The token of the open item; if there is none, the next one is opened."""
+    """The token of the open item; without one, the next item is opened."""
     open_turn = db.execute(
         "SELECT token FROM turn JOIN item USING (item_id) "
         "WHERE annotator = ? AND practice = ? AND answered IS NULL",

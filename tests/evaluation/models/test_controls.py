@@ -64,7 +64,7 @@ def test_a_prefix_is_worth_what_its_items_lose_without_it(
     assert (whole["only_left"], whole["only_right"], whole["n"]) == (plain, control, 12)
     assert whole["difference"] == pytest.approx((plain - control) / 12)
     text = (tmp_path / "report.txt").read_text()
-    assert "answer: as they are (left) less candidate_only (right)" in text
+    assert "answer: unchanged (left) less candidate_only (right)" in text
     assert "any base (answer, candidate_only)" in text
 
     # All is answered, either way: the same command asks nothing and says the same.

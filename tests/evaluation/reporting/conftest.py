@@ -21,8 +21,8 @@ HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=al
 
 @pytest.fixture(scope="session")
 def measured(tmp_path_factory, micro, micro_store) -> Path:
-    """checkpoints/ with a base, students of three regimes, two of which say hostile things, a
-    retriever that chooses, and one that is measured directly and in two stages."""
+    """checkpoints/ with a released base, students of three regimes (two with hostile responses), a
+    similarity scorer, and a retriever that is measured directly and in two stages."""
     root = tmp_path_factory.mktemp("checkpoints")
     select_run(root, micro_store, micro, "base", always_a, mode="record")
     for regime in ("answer_only", "cot", "cot_no_candidate_analysis"):

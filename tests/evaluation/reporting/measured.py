@@ -109,9 +109,9 @@ def select_run(
         "calibration": {},
     }
     finish(folder, settings, report)
-    told = {"key": "k1", "mode": mode}
-    lines = [{**told, "asked": {"control": None, "seed": 0}}]
-    lines += [{**told, "item_id": i.item_id, "text": say(i), "cut": False} for i in items]
+    keys = {"key": "k1", "mode": mode}
+    lines = [{**keys, "asked": {"control": None, "seed": 0}}]
+    lines += [{**keys, "item_id": i.item_id, "text": say(i), "cut": False} for i in items]
     (folder / "answers.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     return folder
 
@@ -136,15 +136,15 @@ def similarity_run(
     scores = {f"untrained {name}": np.tile(np.float32(untrained), (len(items), 1))}
     if model is not None:
         scores = {model: np.eye(4, dtype=np.float32)[answers], **scores}
-    rows, told, lines = [], {}, []
+    rows, subtypes, lines = [], {}, []
     for title, of in scores.items():
         credits = nearest_candidate.credit_choices(of, answers)
         accuracy = accuracy_by_family([i.family for i in items], credits)
         rows.append(SelectionResult.of(store.name, title, SIMILARITY, accuracy, None))
         cells = accuracy_by_group([f"{i.family}/{i.subtype}" for i in items], credits)
-        told[title] = {cell: vars(found) for cell, found in cells.items()}
+        subtypes[title] = {cell: vars(found) for cell, found in cells.items()}
         lines += nearest_candidate.format_scores(title, items, of)
-    report = {"build": store.identity, "rows": [r.to_dict() for r in rows], "subtypes": told}
+    report = {"build": store.identity, "rows": [r.to_dict() for r in rows], "subtypes": subtypes}
     folder = root / "similarity" / (model or name)
     finish(folder, settings, report)
     (folder / "scores.jsonl").write_text("".join(f"{line}\n" for line in lines))
@@ -168,8 +168,8 @@ def retrieve_run(
         found[title] = ranks
         rows += retrieval_rows(store.name, title, ranks, queries, 0)
         curves += recall_curves(title, ranks, queries)
-    told = {"build": store.identity, "curves": curves, "indexes": []}
-    report = {"rows": [r.to_dict() for r in rows], **told}
+    provenance = {"build": store.identity, "curves": curves, "indexes": []}
+    report = {"rows": [r.to_dict() for r in rows], **provenance}
     if kind == "retrieve":
         report["differences"] = compare_retrievers(found, queries, 0)
     settings = RetrieveCommand(

@@ -143,7 +143,7 @@ def test_filters_select_items(chromium, page):
     label = "small base (record)"
     of_base = {i["id"]: s["verdict"] for i in items for s in i["responses"] if s["model"] == label}
     for verdict in ("correct", "wrong"):
-        wanted = [name for name, given in of_base.items() if given == verdict]
+        wanted = [name for name, of_item in of_base.items() if of_item == verdict]
         assert choose(chromium, family="any", model=label, verdict=verdict) == wanted
     assert choose(chromium, model="cot (reasoning)", verdict="wrong") == []
     assert chromium.find_element(By.ID, "count").text == "0 of 60 items"
