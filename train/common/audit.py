@@ -73,7 +73,8 @@ def audit_retriever(
     if length > cfg.max_length:
         raise UserError(
             f"query {query.query_id} has {length} tokens, more than retriever.max_length="
-            f"{cfg.max_length}: raise it, or lower retriever.image_size or retriever.frames"
+            f"{cfg.max_length}: raise it, or lower retriever.image_size or retriever.frames",
+            code="sample-too-long",
         )
     shown = model.preprocess([frame_input(query.target, frames)], prompt=cfg.frame_instruction)
     return "\n".join(

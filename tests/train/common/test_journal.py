@@ -180,12 +180,19 @@ def held_out(responses: list[str]) -> StudentDataset:
     return StudentDataset([planned(k, response) for k, response in enumerate(responses)])
 
 
-def test_shares_of_what_is_read_and_right(processor, student_cfg, tmp_path) -> None:
+def test_shares_of_parsed_and_right_answers(processor, student_cfg, tmp_path) -> None:
     samples = held_out(["Answer: A", "It falls.\nAnswer: B", "Answer: C", "Answer: D", "Answer: A"])
     texts = ["Answer: A", "It falls.\nAnswer: C", "It falls", "Answer: D"]
-    answers = HeldOutAnswers(processor, student_cfg, "fp32", 4, tmp_path)
-    figures = answers.measure(Writer(processor, texts), "answer", samples, step=7)
-    assert figures == {"generated_parse_rate": 3 / 4, "generated_accuracy": 2 / 4}
+    answers = HeldOutAnswers(
+        processor,
+        tmp_path,
+        max_length=student_cfg.max_length,
+        max_new_tokens=student_cfg.max_new_tokens,
+        precision="fp32",
+        count=4,
+    )
+    measures = answers.measure(Writer(processor, texts), "answer", samples, step=7)
+    assert measures == {"generated_parse_rate": 3 / 4, "generated_accuracy": 2 / 4}
     rows = [json.loads(line) for line in (tmp_path / "samples.jsonl").read_text().splitlines()]
     assert [r["text"] for r in rows] == texts
     assert [r["letter"] for r in rows] == ["A", "C", None, "D"]
@@ -197,7 +204,7 @@ def test_shares_of_what_is_read_and_right(processor, student_cfg, tmp_path) -> N
     assert answers.measure(Writer(processor, texts), "frame", samples, step=8) == {}
 
 
-def test_the_bar_shows_the_newest_figures() -> None:
+def test_the_bar_has_the_latest_measures() -> None:
     bar = MetricsBar()
     bar.training_bar = tqdm(total=9, file=io.StringIO())
     state, control = TrainerState(), TrainerControl()
