@@ -1,4 +1,4 @@
-"""Measure a retriever: rank the whole test database for every test query, at each width."""
+"""Measure a retriever: rank all frames of the test database for each test query and width."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
 
         if preset.late is not None:
             raise UserError(
-                "index=faiss holds one vector per frame, but retriever.late has several: set "
-                "index=exact",
+                "index=faiss stores one vector per frame, but a retriever with retriever.late has "
+                "several: set index=exact",
                 code="unsupported-index",
             )
         import_faiss()

@@ -1,4 +1,4 @@
-"""Measure a student or a base on the selection track's test items, local or on servers."""
+"""Measure a student or a base on the selection track's test items, locally or on servers."""
 
 from __future__ import annotations
 

@@ -27,9 +27,9 @@ class Quota:
     """Number of items or queries of a cell in each split."""
 
     train: int = 0
-    """Number in the training split."""
+    """Number of items or queries (for `matched`, pairs of items) in the training split."""
     test: int = 0
-    """Number in the test split."""
+    """Number of items or queries (for `matched`, pairs of items) in the test split."""
 
 
 @dataclass
@@ -70,13 +70,13 @@ class RetrievalTrackConfig:
     hard_negatives: int = 3
     """Hard negatives per query: wrong-time frames of the query's own scene."""
     standard: int = 2_002
-    """Test queries of the standard test, equally many from each builder."""
+    """Number of queries in the standard test, divided evenly among the builders."""
     database: int = 10_000
     """Frames in the database of the standard test, including every target."""
     source: int = 30_000
-    """Source frames of the builders' queries, including every target."""
+    """Frames in the source database of the builders' queries, including every target."""
     counterfactual_source: int = 26_995
-    """Source frames of the counterfactual queries, including every target."""
+    """Frames in the source database of the counterfactual queries, including every target."""
 
     def check(self) -> list[str]:
         sizes = dict.fromkeys(("standard", "database", "source", "counterfactual_source"), 0)
@@ -95,8 +95,8 @@ class BenchmarkConfig:
     """Source of the scenes: bullet simulates them; clevrer, movi_a and physion read a release."""
     standin: str | None = None
     """Transfer suite to imitate without its release: movi_a or physion. Bullet simulates scenes
-    with other shapes, colours and physics, and the items follow that suite's recipe. null simulates
-    standard scenes."""
+    with another camera, floor, light and physics, and the items follow that suite's recipe. null
+    simulates standard scenes."""
     folder: str | None = None
     """Folder of the release, when `simulator` reads one."""
     fps: float = 30.0

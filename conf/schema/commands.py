@@ -248,8 +248,8 @@ class SelectCommand(CommandConfig):
     seed: int = 0
     """Seed of the items that `limit` samples, of sampled responses and of the bootstrap."""
     suite: str | None = None
-    """matched_anchor measures the pairs of items that differ only in the question's anchor; null
-    measures the benchmark's standard items."""
+    """matched_anchor measures the pairs of items that differ only in the question's anchor (event
+    or time); null measures the benchmark's standard items."""
     control: str | None = None
     """candidate_only leaves out the prefix, shuffled_prefix shuffles its frames; each control is
     measured beside the unchanged items. null measures only the unchanged items."""
@@ -298,8 +298,8 @@ class SimilarityCommand(EmbeddingCommand):
     limit: int | None = None
     """Maximum number of test items, spread evenly over the families; null uses all."""
     suite: str | None = None
-    """matched_anchor measures the pairs of items that differ only in the question's anchor; null
-    measures the benchmark's standard items."""
+    """matched_anchor measures the pairs of items that differ only in the question's anchor (event
+    or time); null measures the benchmark's standard items."""
 
     def check(self) -> list[str]:
         return super().check() + check_minimum(self, "", {"limit": 1}) + check_suite(self)

@@ -44,7 +44,7 @@ class ArchitectureConfig:
 @dataclass
 class LoraConfig:
     rank: int = 16
-    """Rank of the adapters; 0 adds none and trains the whole model."""
+    """Rank of the adapters; 0 adds no adapters and trains the whole model."""
     alpha: int = 32
     """Scale of the adapters: their output is multiplied by alpha / rank."""
     dropout: float = 0.0
@@ -82,8 +82,8 @@ class ModelConfig:
     frames: int = 12
     """Evenly spaced frames per prefix."""
     max_length: int = 3072
-    """Maximum length of an input with its response (tokens); longer ones are refused, never
-    truncated."""
+    """Maximum length of an input with its response (tokens); a longer one raises an error and is
+    never truncated."""
 
     def check(self) -> list[str]:
         group, lora = self.GROUP, self.lora

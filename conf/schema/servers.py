@@ -21,7 +21,7 @@ class ServersConfig:
     model: str | None = None
     """Name of the model on the server."""
     concurrency: int = 128
-    """Concurrent requests over all servers; 128 saturate one vLLM server."""
+    """Concurrent requests over all servers; 128 requests saturate one vLLM server."""
     timeout: float = 120.0
     """Timeout of a request (s)."""
     patience: float = 600.0

@@ -20,8 +20,8 @@ class TeacherConfig(ServersConfig):
     name: str = MISSING
     """Name of the teacher, recorded with every rationale."""
     seed: int = 0
-    """Seed of the built-in narrator's phrasing; with a server, a label that separates
-    narrations."""
+    """Seed of the built-in narrator's phrasing. A server does not receive it, but is asked again
+    for every rationale when it changes."""
     min_words: int = 80
     """Minimum length of a rationale (words)."""
     max_words: int = 250

@@ -44,8 +44,9 @@ class TrainConfig:
     eval_answer_letter_accuracy, eval_reasoning_loss or eval_recall@10: a loss by its lowest value,
     any other metric by its highest. null selects the last step."""
     workers: int = 0
-    """Processes that prepare batches in the background; for a retriever, mini-batches that a thread
-    prepares in advance. 0 prepares each batch when it is needed."""
+    """For a student, the number of processes that prepare batches in the background. For a
+    retriever, the number of mini-batches that a thread prepares in advance. 0 prepares each batch
+    when it is needed."""
     report_to: list[str] = field(default_factory=list)
     """Experiment trackers of transformers' Trainer, such as tensorboard, wandb or trackio."""
 
@@ -70,9 +71,10 @@ class TrainConfig:
 @dataclass
 class SftTrainConfig(TrainConfig):
     regime: str = "cot"
-    """Content of the student's response: cot (rationale, match of each candidate, answer),
-    cot_no_candidate_analysis, cot_no_match_layout, answer_only, or describe (the recipe of the tiny
-    base)."""
+    """Content of the student's response: cot (rationale, one line per candidate that says
+    whether it matches, answer), cot_no_candidate_analysis (cot without the candidate analysis of
+    the rationale), cot_no_match_layout (cot without the lines per candidate), answer_only, or
+    describe (a description, for the training of the tiny base)."""
     batch: int = 16
     """Samples per optimizer step, over all micro-batches and ranks."""
     micro_batch: int = 1

@@ -20,21 +20,21 @@ from data.render.frame_cache import FrameCache, load_frames
 from data.store import Store, load_scene, scene_path, write_atomically
 
 NUMBERS = {"train": range(10_000), "test": range(10_000, 15_000)}
-"""Numbers of the annotated scenes by our splits: CLEVRER's train and validation parts."""
+"""Range of scene numbers of each split: those of CLEVRER's train and validation parts."""
 BLOCK = 1_000
 """Scenes per folder."""
 QUALITY = "6"
-"""x264's constant rate factor; the loss is not visible."""
+"""Constant rate factor of x264; at this value compression losses are not visible."""
 
 
 def export_clevrer(store: Store, folder: Path, workers: Workers) -> int:
-    """Write every scene of a benchmark with all its frames as a release of CLEVRER.
+    """Write every scene of a benchmark, with all its frames, in the layout of CLEVRER's release.
 
-    Training scenes become the train part and test scenes the validation part. Existing scenes are
-    not written again.
+    Training scenes form the train part and test scenes the validation part. Scenes that are already
+    in `folder` are not written again.
 
     Returns:
-        The number of scenes of the release.
+        The number of scenes in the release.
 
     Raises:
         UserError: CLEVRER's layout cannot hold this number of scenes, or one of the scenes.
@@ -44,8 +44,8 @@ def export_clevrer(store: Store, folder: Path, workers: Workers) -> int:
         names = store.scene_ids(split)
         if len(names) > len(numbers):
             raise UserError(
-                f"{store.name} has {len(names)} {split} scenes: CLEVRER's layout holds at most "
-                f"{len(numbers)}, export a smaller benchmark",
+                f"{store.name} has {len(names)} {split} scenes, but CLEVRER's layout holds at "
+                f"most {len(numbers)}: export a smaller benchmark",
                 code="too-many-scenes",
             )
         indices |= dict(zip(names, numbers, strict=False))
@@ -69,7 +69,7 @@ def _export_one(cache: FrameCache, scene_id: str, folder: Path, index: int) -> N
 
 
 def annotation_path(folder: Path, index: int) -> Path:
-    """Return the path of scene `index`'s annotation."""
+    """Return the path of the annotation of scene `index`."""
     part = "train" if index in NUMBERS["train"] else "validation"
     block = index // BLOCK * BLOCK
     span = f"{block:05d}-{block + BLOCK:05d}"
@@ -151,13 +151,13 @@ def _angles(quaternions: np.ndarray) -> np.ndarray:
 
     rotations = Rotation.from_quat(quaternions.reshape(-1, 4).astype(np.float64))
     with warnings.catch_warnings():
-        # At gimbal lock several angles give the same rotation; any of them is right.
+        # At gimbal lock several triples of angles describe the same rotation; any of them is valid.
         warnings.filterwarnings("ignore", "Gimbal lock")
         return rotations.as_euler(EULER).reshape(*quaternions.shape[:-1], 3)
 
 
 def _encode_video(images: list[Image.Image]) -> bytes:
-    """An mp4 of images of one size, with even sides."""
+    """Encode images of one size as an mp4. Width and height must be even."""
     import av
 
     width, height = images[0].size

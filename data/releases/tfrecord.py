@@ -1,12 +1,13 @@
-"""Examples of a TFRecord file, read without TensorFlow.
+"""Read the examples of a TFRecord file without TensorFlow.
 
 A file is a sequence of records: the length of the data (uint64), a checksum of the length (uint32),
 the data, and a checksum of the data (uint32), all little-endian. The data is a protocol buffer of
 type tf.train.Example, which maps the names of features to lists of bytes, floats or integers.
-TensorFlow Datasets flattens nested features into names such as `events/collisions/frame`, and
-arrays into one list.
+TensorFlow Datasets gives nested features names such as `events/collisions/frame`, and stores each
+array as one flat list.
 
-The checksum of the data is not verified: in Python that takes longer than everything else.
+The checksum of the data is not verified: in Python this would take longer than the rest of the
+reading.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from data.releases.validation import RecordError
 
 HEADER, FOOTER = 12, 4
-"""Bytes before and after a record's data."""
+"""Number of bytes before and after the data of a record."""
 SCHEMA = """
 name: "example.proto" package: "dynapix" syntax: "proto3"
 message_type { name: "BytesList"
@@ -42,13 +43,14 @@ message_type { name: "Features"
 message_type { name: "Example"
   field { name: "features" number: 1 type: TYPE_MESSAGE type_name: ".dynapix.Features" } }
 """
-"""tf.train.Example as a protocol buffer descriptor."""
+"""Descriptor of tf.train.Example in the text format of protocol buffers."""
 
 
 def record_offsets(path: Path) -> list[int]:
-    """Return the byte at which each record begins.
+    """Return the byte offset of each record.
 
-    A damaged or incomplete record is the last: the records after it cannot be located.
+    The list ends with the first incomplete record or damaged header, because the records after it
+    cannot be located.
     """
     size, start, offsets = path.stat().st_size, 0, []
     with open(path, "rb") as file:
@@ -63,7 +65,7 @@ def record_offsets(path: Path) -> list[int]:
 
 
 def read_example(path: Path, number: int) -> dict[str, Any]:
-    """Return the features of record `number` by name, for `feature_values`.
+    """Return the features of record `number` by name; `feature_values` converts them.
 
     Raises:
         RecordError: The record does not exist, is cut off or is damaged.
@@ -72,13 +74,13 @@ def read_example(path: Path, number: int) -> dict[str, Any]:
 
     offsets = record_offsets(path)
     if number >= len(offsets):
-        raise RecordError(f"{path} has {len(offsets)} records, expected record {number}")
+        raise RecordError(f"{path} has {len(offsets)} records: there is no record {number}")
     where = f"{path}: record {number}"
     with open(path, "rb") as file:
         file.seek(offsets[number])
         length = _read_length(file.read(HEADER))
         if length is None:
-            raise RecordError(f"{where} has no valid length and checksum", "damaged-file")
+            raise RecordError(f"{where} has an incomplete or damaged header", "damaged-file")
         data = file.read(length)
     if len(data) < length:
         raise RecordError(f"{where} ends after {len(data)} of {length} bytes", "damaged-file")
@@ -93,14 +95,14 @@ def read_example(path: Path, number: int) -> dict[str, Any]:
 def _example_class() -> type:
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, text_format
 
-    # A separate pool, so that TensorFlow can register its own tf.train.Example.
+    # A pool of our own cannot conflict with the tf.train.Example that TensorFlow registers.
     pool = descriptor_pool.DescriptorPool()
     pool.Add(text_format.Parse(SCHEMA, descriptor_pb2.FileDescriptorProto()))
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("dynapix.Example"))
 
 
 def feature_values(feature: Any) -> list[bytes] | np.ndarray:
-    """Return a feature as a list of bytes, or as a float32 or int64 array (length,)."""
+    """Return the values of a feature: a list of bytes, or a 1-D array of float32 or int64."""
     if feature.HasField("bytes_list"):
         return list(feature.bytes_list.value)
     if feature.HasField("float_list"):
@@ -109,7 +111,7 @@ def feature_values(feature: Any) -> list[bytes] | np.ndarray:
 
 
 def _read_length(header: bytes) -> int | None:
-    """The length in a record's header, or None if the header is cut off or damaged."""
+    """Return the length in a record's header, or None if the header is incomplete or damaged."""
     length, checksum = header[:8], header[8:]
     if len(header) < HEADER or masked_crc(length) != int.from_bytes(checksum, "little"):
         return None

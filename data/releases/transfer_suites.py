@@ -1,10 +1,13 @@
-"""The items of the transfer suites, which are built from scenes of MoVi-A and Physion.
+"""Selection items of the transfer suites, which are built from scenes of MoVi-A and Physion.
 
-`TRANSFER_SUITES[suite][family]` has `CELLS` and `make_item`, as the modules of
-`data.tracks.selection` do, and asks their questions. The prefix of an event item ends some frames
-before the event, which is the target. The prefix of a time item is the scene's first second, and
-its target is one or two seconds after the prefix's last frame. CLEVRER's scenes have the items of
-the dynapix suite.
+`TRANSFER_SUITES[suite][family]` has the interface of a module of `data.tracks.selection`: `CELLS`
+and `make_item`. Its questions are the same.
+
+The target of an event item is the frame of the event, and its prefix ends some frames earlier. The
+prefix of a time item is the scene's first second, and its target is one or two seconds after the
+prefix's last frame.
+
+CLEVRER needs no suite here: its scenes have the items of the dynapix suite.
 """
 
 from __future__ import annotations
@@ -22,14 +25,20 @@ from data.tracks.selection.event import EventTiming
 from data.world.events import find_motion_onsets
 
 LEAST_PREFIX = 5
-"""Least number of frames of a prefix that the start of the scene cuts short."""
+"""Minimum number of frames in a prefix. A prefix is shorter than usual where it would begin before
+the scene."""
 CROSS_SCENES = 8
-"""Other scenes sampled for cross-scene distractors."""
+"""Number of other scenes that are sampled for cross-scene distractors."""
 
 
 @dataclass(frozen=True)
 class TransferCell:
-    """A construction cell: its question, and the timings of a scene's items in order."""
+    """A construction cell.
+
+    Attributes:
+        question: The question of its items.
+        timings: Returns the timings that an item can have in a scene, in chronological order.
+    """
 
     question: str
     timings: Callable[[Scene], list[EventTiming]]
@@ -41,8 +50,8 @@ class TransferFamily:
 
     Attributes:
         same: Number of distractors from the item's own scene, at frames after the prefix. The
-            others are targets of other scenes of the same scenario.
-        later: Whether distractors of the scene must follow the target.
+            other distractors are targets from other scenes of the same scenario.
+        later: Whether distractors from the item's own scene must also come after the target.
     """
 
     suite: str
@@ -90,9 +99,11 @@ class TransferFamily:
 def cross_scene_candidates(
     cell: TransferCell, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
 ) -> Iterator[Candidate]:
-    """Yield the first target of other scenes of the scenario, those with most shared objects
-    first."""
-    # Scenes are loaded lazily, because few of them are of the scenario.
+    """Yield the first target of each of several other scenes of the same scenario.
+
+    The scenes that share the most objects with `scene` come first.
+    """
+    # Scenes are loaded only until enough of them have the same scenario.
     scenes = (picker.scene_of(str(name)) for name in rng.permutation(picker.scene_ids))
     similar = (s for s in scenes if s.scene_id != scene.scene_id and s.scenario == scene.scenario)
     targets = ((s, timings[0].target) for s in similar if (timings := cell.timings(s)))
@@ -103,8 +114,10 @@ def cross_scene_candidates(
 
 
 def event_cell(events: Callable[[Scene], list[int]], step: int, gap: int) -> TransferCell:
-    """Return a cell whose target is the frame of an event, `gap` frames after a prefix that spans
-    `step` frames."""
+    """Return a cell whose target is the frame of an event.
+
+    The prefix ends `gap` frames before the event and starts `step` frames before its end.
+    """
 
     def timings(scene: Scene) -> list[EventTiming]:
         stops = [frame - gap for frame in sorted(set(events(scene)))]
@@ -118,7 +131,7 @@ def event_cell(events: Callable[[Scene], list[int]], step: int, gap: int) -> Tra
 
 
 def time_cell(seconds: int) -> TransferCell:
-    """Return a cell whose prefix is the first second and whose target is `seconds` after it."""
+    """Return a cell whose prefix is the scene's first second. The target is `seconds` later."""
 
     def timings(scene: Scene) -> list[EventTiming]:
         second = round(scene.fps)
@@ -143,12 +156,13 @@ def landing_frames(scene: Scene) -> list[int]:
     return [landing.frame for landing in scene.landings]
 
 
-# At MoVi-A's 12 fps, nearly the times of the dynapix suite at 25 fps; a scene has two seconds.
+# At MoVi-A's 12 fps, these steps and gaps last nearly as long as those of the dynapix suite at
+# 25 fps. A scene lasts two seconds, so there is no in_2s.
 MOVI_A_CELLS = {
     "event": {"contact": event_cell(contact_frames, step=10, gap=5)},
     "time": {"in_1s": time_cell(1)},
 }
-# Physion counts frames, at any frame rate.
+# Physion's steps and gaps are numbers of frames, whatever the frame rate.
 PHYSION_CELLS = {
     "event": {
         "A1_contact": event_cell(contact_frames, step=20, gap=10),
@@ -167,7 +181,7 @@ TRANSFER_SUITES = {
         for family, cells in PHYSION_CELLS.items()
     },
 }
-# Stand-in scenes have the items of the suite under its stand-in's name.
+# The items of a stand-in are built as those of its suite, but name the stand-in as their suite.
 TRANSFER_SUITES |= {
     f"standin_{suite}": {
         name: replace(family, suite=f"standin_{suite}") for name, family in families.items()

@@ -1,9 +1,12 @@
-"""Stand-ins: Bullet scenes with the motions of MoVi-A and Physion, a different look and physics.
+"""Stand-ins: Bullet scenes that imitate the motions of MoVi-A and Physion.
 
-They try a transfer suite's recipe, or a student's transfer to unseen motions, light and camera,
-without that suite's release. They do not measure the paper's suites, which is why their names are
-`standin_movi_a` and `standin_physion`. MoVi-A's objects fall and bounce for two seconds; Physion's
-rest until another object hits them or falls on them.
+They replace a transfer suite whose release is not available. Items are built from them by the
+suite's recipe, and they measure how a student transfers to unseen motions, light and cameras.
+Results on them are not results on the paper's suites, so they have their own names,
+`standin_movi_a` and `standin_physion`.
+
+In the stand-in of MoVi-A, objects fall and bounce for two seconds. In that of Physion, objects rest
+until another object slides into them or falls on them.
 """
 
 from __future__ import annotations
@@ -22,28 +25,30 @@ from data.world.sampling import as_pair, is_on_screen, record_scene, sample_look
 from data.world.shapes import RADIUS
 
 STANDINS_VERSION = "2"
-"""Changes whenever a stand-in's scenes or look change."""
+"""Increment it whenever the scenes or the look of a stand-in change."""
 
 ROW_STEP = (0.75, 1.1)
 """Range of distances between neighbours in a row, simulator units."""
 
 Start = tuple[str, list[Body]]
-"""A scenario and its bodies."""
+"""The name of a scenario, and the initial bodies."""
 
 
 @dataclass(frozen=True)
 class Standin:
-    """A kind of scenes: length, physics, view, and a sampler of initial bodies."""
+    """How the scenes of a stand-in are simulated and viewed."""
 
     frames: int
+    """Frames per scene."""
     physics: Physics
     view: View
     start: Callable[[list[SceneObject], View, np.random.Generator], Start | None]
-    """Samples bodies with given looks; None where a position is off screen."""
+    """Samples the initial bodies of objects with the given looks, or returns None if a sampled
+    position is off screen."""
 
 
 def thrown(looks: list[SceneObject], view: View, rng: np.random.Generator) -> Start | None:
-    """Sample objects in the air that move towards the middle."""
+    """Sample objects in the air that move towards the middle of the view."""
     bodies = []
     for look in looks:
         place = rng.uniform([-1.5, -1.6], [0.9, 1.6])
@@ -57,10 +62,12 @@ def thrown(looks: list[SceneObject], view: View, rng: np.random.Generator) -> St
 
 
 def struck(looks: list[SceneObject], view: View, rng: np.random.Generator) -> Start | None:
-    """Sample a row of objects. Another one slides into the first of them along the row (scenario
-    Collide) or falls on it (Drop)."""
+    """Sample a row of resting objects, and one more that strikes the first of them.
+
+    The striking object slides along the row (scenario Collide) or falls (scenario Drop).
+    """
     last, *row = looks
-    # Across the view, because objects in a row away from the camera hide each other.
+    # The row runs across the view: in a row away from the camera, objects would hide each other.
     bearing = rng.choice([-1, 1]) * np.pi / 2 + rng.uniform(-0.7, 0.7)
     place = rng.uniform([-0.8, -1.0], [1.0, 1.0])
     first, bodies = place, []
@@ -101,24 +108,25 @@ STANDINS = {
         start=struck,
     ),
 }  # fmt: skip
-"""Stand-ins by suite, with the suite's frame rate. Gravity is weaker than on Earth, so that some
+"""Stand-ins by suite. The frame rate is the suite's. Gravity is weaker than on Earth, so that some
 objects are still in the air when a prefix ends."""
 
 
 def generator_version(standin: str | None) -> str:
-    """Version of the code that simulates a benchmark's scenes."""
+    """Return the version of the code that simulates a benchmark's scenes."""
     return GENERATOR_VERSION + (f", stand-ins {STANDINS_VERSION}" if standin else "")
 
 
 def standin_view(standin: str | None) -> View:
-    """Camera and light of a stand-in, or the standard ones."""
+    """Return the camera, floor and light of a stand-in, or the standard ones without a stand-in."""
     return STANDINS[standin].view if standin else STANDARD_VIEW
 
 
 def simulate_standin(name: str, index: int, split: str, cfg: BenchmarkConfig) -> Scene:
-    """Simulate scene `index` of the benchmark's stand-in, a pure function of index and seed.
+    """Simulate scene `index` of the benchmark's stand-in. The same index and settings give the same
+    scene.
 
-    Scenes without a collision, or with objects that touch at the start, are sampled again.
+    A scene without a collision, or with objects that touch at the start, is sampled again.
     """
     kind = STANDINS[cfg.standin]
     rng = np.random.default_rng([cfg.seed, index])

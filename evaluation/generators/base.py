@@ -17,7 +17,7 @@ from models.student.generation import response_token_limit
 from models.student.prompts import Sample, instructed_sample, instruction
 
 INPUTS = 1
-"""Version of the prompts' layout; raise it when the layout changes, so that earlier responses are
+"""Version of the prompt layout. Increment it when the layout changes, so that earlier responses are
 not reused."""
 
 
@@ -25,8 +25,8 @@ class Generator(Protocol):
     """A model that responds to selection items, queries or frames.
 
     Attributes:
-        name: Its name in tables.
-        revision: What identifies its weights; responses are reused only for the same revision.
+        name: Name of the model in tables.
+        revision: Values that identify the weights. Responses are reused only for an equal revision.
     """
 
     name: str
@@ -39,7 +39,8 @@ class Generator(Protocol):
         subjects: list[Subject],
         save: SaveResponses,
     ) -> None:
-        """Respond to each subject, prompted by its sample, and save responses as they finish."""
+        """Respond to the prompt `sample_of(subject)` of each subject, and save responses as they
+        finish."""
 
 
 def open_generator(
@@ -47,15 +48,15 @@ def open_generator(
     folder: Path | None,
     trained: SftCommand | SelectCommand | TwoStageCommand,
 ) -> Generator:
-    """Return the model that `cfg` selects: on servers if `server.url` is set, else local.
+    """Return the model that `cfg` selects, on servers if `server.url` is set and local otherwise.
 
     Args:
         folder: The run or export of a trained student; None for a base.
-        trained: The settings of that run, or the command's own.
+        trained: The settings of that run; for a base, those of the command.
 
     Raises:
-        UserError: The model cannot be loaded, no server responds, or its base is not the one that
-            the student was trained on.
+        UserError: The model cannot be loaded, no server responds, or the base is not the one on
+            which the student was trained.
     """
     if cfg.server.url is not None:
         from evaluation.generators.openai_server import ServedModel
@@ -67,7 +68,7 @@ def open_generator(
 
 
 def item_instruction(mode: str, regime: str) -> str:
-    """Return the instruction of a selection item in a mode; `regime` is that of the training."""
+    """Return the instruction of a selection item in a mode, for a training regime."""
     return record_instruction() if mode in RECORD_MODES else instruction(mode, regime)
 
 
@@ -79,7 +80,7 @@ def item_sample(
     mode: str,
     item: SelectionItem,
 ) -> Sample:
-    """Return a selection item's prompt in a mode for a student of a regime."""
+    """Return the prompt of a selection item in a mode, for a training regime."""
     return instructed_sample(
         item, mode, item_instruction(mode, regime), frames, cfg.frames, control=control
     )
@@ -94,7 +95,7 @@ def response_settings(
     benchmark: str,
     control: str | None,
 ) -> dict[str, Any]:
-    """Return everything that a response in a mode depends on, except its subject."""
+    """Return everything except the subject that a response in a mode depends on."""
     sampling: dict[str, Any] = {
         "max_new_tokens": response_token_limit(mode, student.max_new_tokens, student.thinking)
     }

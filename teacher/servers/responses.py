@@ -1,4 +1,4 @@
-"""Responses of a chat server."""
+"""Parse the responses of a chat server."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 TRUNCATED = "cut off"
-"""The flaw of a response that reached the token limit."""
+"""Value of `Response.flaw` for a response that reached the token limit."""
 
 
 @dataclass(frozen=True)
@@ -16,11 +16,13 @@ class Response:
 
     Attributes:
         text: The response without surrounding white space.
-        flaw: Why the response is unusable, whatever its text; None if it is usable.
-        prompt_tokens: Tokens of the prompt; 0 for all but the first response to one request.
-        completion_tokens: Tokens of the response, as an equal share of its request's total.
-        finished: Time of arrival, in seconds since 1970.
-        reasoning: What the server's reasoning parser removed from the text.
+        flaw: Why the response is rejected before its text is read; None if it is not.
+        prompt_tokens: Number of prompt tokens. Only the first response to a request counts them;
+            the others have 0. None if the server does not report it.
+        completion_tokens: Number of generated tokens, as an equal share of the request's total.
+            None if the server does not report it.
+        finished: Arrival time (Unix time, s).
+        reasoning: The text that the server's reasoning parser separated from the response.
     """
 
     text: str
@@ -32,7 +34,7 @@ class Response:
 
 
 def parse_completion(completion: Any, n: int) -> list[Response]:
-    """The first `n` choices of an openai chat completion.
+    """Return the first `n` choices of a chat completion of the openai library.
 
     Raises:
         ValueError: The completion has no choices.
@@ -61,7 +63,7 @@ def parse_completion(completion: Any, n: int) -> list[Response]:
 
 
 def _clean(text: str | None) -> str:
-    # A model may generate half of a surrogate pair, which UTF-8 cannot encode.
+    # A model may generate an unpaired surrogate, which UTF-8 cannot encode.
     return (text or "").encode("utf-8", "replace").decode().strip()
 
 

@@ -1,4 +1,4 @@
-"""Grades responses: validates them and records all that shaped them."""
+"""Validate the teacher's responses, and record each with its verdict and its settings."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from teacher.servers.responses import Response
 from teacher.validation.validator import VALIDATOR_VERSION, Verdict, validate_rationale
 
 MAX_CHARACTERS = 20_000
-"""Characters of a response that are validated and recorded; no valid rationale is as long."""
+"""Maximum length of a response. A longer one is rejected, and its text is recorded up to here."""
 
 
 class RationaleGrader:
-    """Turns responses into `Rationale` records under one configuration."""
+    """Converts responses to `Rationale` records, for one configuration of the teacher."""
 
     def __init__(self, cfg: TeacherConfig) -> None:
         self.cfg = cfg
@@ -32,7 +32,7 @@ class RationaleGrader:
     def grade(
         self, response: Response, predicates: Predicates, item: SelectionItem, attempt: int
     ) -> Rationale:
-        """Validate a response; it is accepted if there is no reason to reject it."""
+        """Validate a response, and return its record with the reasons for any rejection."""
         if len(response.text) > MAX_CHARACTERS:
             verdict = Verdict(("too long",))
         elif response.flaw is not None:
@@ -60,13 +60,13 @@ class RationaleGrader:
         )
 
     def is_current(self, r: Rationale) -> bool:
-        """Whether a recorded rationale is of this teacher, these versions and these settings."""
+        """Whether a rationale was recorded with the current teacher, versions and settings."""
         recorded = (r.teacher, r.prompt_version, r.validator_version, r.settings, r.seed)
         versions = (self.prompt_version, VALIDATOR_VERSION, self.settings)
         return recorded == (self.cfg.name, *versions, self.cfg.seed)
 
     def _hash_settings(self) -> str:
-        """A short hash of the settings that shape a response or its verdict."""
+        """A short hash of the settings that affect a response or its verdict."""
         cfg = self.cfg
         settings = [cfg.min_words, cfg.max_words]
         if cfg.url is not None:
@@ -77,7 +77,7 @@ class RationaleGrader:
 
 
 def count_verdicts(claims: Iterable[Claim]) -> dict[str, list[int]]:
-    """Numbers of supported, contradicted and unknown claims, by kind."""
+    """For each kind of claim, the numbers of claims by verdict, in the order of `VERDICTS`."""
     counts: dict[str, list[int]] = {}
     for claim in claims:
         counts.setdefault(claim.kind, [0] * len(VERDICTS))[VERDICTS.index(claim.verdict)] += 1

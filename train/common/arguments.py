@@ -1,4 +1,4 @@
-"""Arguments of transformers' trainers from the project's settings."""
+"""Convert the project's settings to arguments of the trainers of transformers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from models.compat import checkpointing_arguments
 from train.common.checkpoints import STATE
 
 PROJECT = "dynapix"
-"""Name under which trackers file a run."""
+"""Name of the project in experiment trackers."""
 SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
 
 
@@ -29,7 +29,7 @@ def common_arguments(
         checkpoint: The checkpoint that the run resumes from, or None.
     """
     if checkpoint is None:
-        # A share of the steps; 1 would mean every step.
+        # The trainer reads a value below 1 as a share of all steps, but 1 as every step.
         every = min(1 / train.evaluations, 0.9999)
     else:
         every = json.loads((checkpoint / STATE).read_text())["eval_steps"]
@@ -50,7 +50,7 @@ def common_arguments(
         **checkpointing_arguments(train.gradient_checkpointing),
         "eval_strategy": "steps",
         "eval_steps": every,
-        # The journal of a resumed run has the evaluation at the start already.
+        # A resumed run already has the initial evaluation in its metrics.jsonl.
         "eval_on_start": checkpoint is None,
         "save_strategy": "steps",
         "save_steps": every,
@@ -59,7 +59,7 @@ def common_arguments(
         "dataloader_num_workers": train.workers,
         "dataloader_pin_memory": torch.cuda.is_available(),
         "remove_unused_columns": False,
-        # This also keeps the best checkpoint from being deleted.
+        # This also exempts the best checkpoint from deletion under `save_total_limit`.
         "load_best_model_at_end": train.best is not None,
         "metric_for_best_model": train.best,
         "report_to": list(train.report_to) or "none",
@@ -70,6 +70,9 @@ def common_arguments(
 
 
 def prefetch_factor(workers: int, accumulation: int) -> int | None:
-    """Return the batches that each worker prepares ahead: together at least those of a step, which
-    the trainer requests at once, so that they are ready when the step before ends."""
+    """Return the number of batches that each worker prepares in advance; None without workers.
+
+    The trainer requests all micro-batches of an optimizer step at once. Together the workers
+    prepare at least that many, so that they are ready when the previous step ends.
+    """
     return max(2, math.ceil(accumulation / workers)) if workers else None

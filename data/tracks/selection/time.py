@@ -43,7 +43,10 @@ def make_item_at(
     picker: DistractorPicker,
     **axes: Any,
 ) -> SelectionItem | None:
-    """Make an item that names the time to `target`; its distractors are other later frames."""
+    """Make an item whose question gives the seconds from the prefix's end to `target`.
+
+    The distractors are other frames after the prefix. `axes` are those of `new_item`.
+    """
     horizon = target - prefix[1]
     seconds = horizon // SELECTION_SECOND
     later = rng.permutation(np.arange(prefix[1] + 1, scene.frames))
