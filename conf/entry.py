@@ -1,4 +1,4 @@
-"""Start a command: check its settings, open its run folder, call `main`, write its metrics."""
+"""Entry point of commands: check the settings, open the run folder, call `main`, write metrics."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ Main = Callable[[Any, Run], Metrics | None]
 
 
 def command(name: str, schema: type) -> Callable[[Main], Callable[[], None]]:
-    """Make `main(cfg, run)` the command of the module `name`, with its settings in `schema`.
+    """Return a decorator that turns `main(cfg, run)` into the command `python -m name`.
 
-    `main` takes an instance of `schema` and returns its metrics. They are written to metrics.json
-    in the run's folder, which marks the run as finished. `main.__wrapped__` is the plain function.
+    `main` receives its settings as an instance of `schema` and returns metrics. The metrics are
+    written to metrics.json in the run's folder, and this file marks the run as finished. If `main`
+    returns None, the run stays unfinished. `main.__wrapped__` is the undecorated function.
     """
 
     def decorate(main: Main) -> Callable[[], None]:
@@ -55,8 +56,8 @@ def _start(name: str, schema: type, main: Main) -> None:
         sweep = args.multirun or "hydra.mode=MULTIRUN" in args.overrides
         if sweep and world_size() > 1:
             raise UserError(
-                "a sweep starts its own processes: start it with python instead of a launcher of "
-                "several ranks",
+                "a sweep starts its own processes: run it with python, not with torchrun or "
+                "another launcher of several ranks",
                 code="sweep-with-ranks",
             )
         preflight(name, schema, args.overrides, sweep)
@@ -65,9 +66,9 @@ def _start(name: str, schema: type, main: Main) -> None:
         with report_failures(HydraConfig.get().run.dir):
             return _run(name, schema, main, cfg)
 
-    # Hydra derives the job's name from this module, and ProcessLauncher starts it in a child.
+    # Hydra names the job after this module, and ProcessLauncher runs the module in a child process.
     task.__module__ = name
-    # Otherwise Hydra catches exceptions and prints its own shortened traceback.
+    # Without this variable Hydra catches exceptions and prints its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     hydra.main(version_base="1.3", config_path="pkg://conf", config_name=config_name(name))(task)()
 
@@ -80,7 +81,7 @@ def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None
     folder = Path(os.path.relpath(job.runtime.output_dir))
     run = Run(run_name(settings.run, overrides), folder, tuple(overrides))
     if rank() > 0:
-        # The main rank has locked the folder for all ranks.
+        # Only the main rank locks the folder. The other ranks log errors only.
         logging.disable(logging.WARNING)
         return main(settings, run)
     busy = (
@@ -96,9 +97,9 @@ def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None
 
 
 def _print(text: str) -> None:
-    """Print to a reader that may close the pipe early, as `| head` does."""
+    """Print to standard output, and ignore a reader that closes the pipe early, such as `head`."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        # Python would flush the rest at exit and fail again.
+        # At exit Python flushes standard output again, which would fail on the closed pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""Describe a benchmark's scenes and items, and measure baselines that do not predict anything."""
+"""Report a benchmark's statistics, and the accuracy of baselines that do not predict the future."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ def main(cfg: StatisticsCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     if not store.selection():
-        raise UserError(f"{store.folder} has no selection items to describe", code="empty-split")
+        raise UserError(
+            f"{store.folder} has no selection items, so there are no statistics to report",
+            code="empty-split",
+        )
     statistics = compute_statistics(store)
     text = format_statistics(statistics)
     log.info("%s", text)

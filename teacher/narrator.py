@@ -24,12 +24,19 @@ from teacher.predicates import (
 
 NARRATOR_VERSION = "5"
 FEW_WORDS, MOST_WORDS = 110, 250
-"""Words below which a rationale is rewritten in full detail, well above the 80 that it needs, and
-above which it is rewritten briefly (paper, Rationale construction)."""
+"""A rationale of fewer words is rewritten in full detail, one of more words in brief. The lower
+bound is well above the minimum length, 80 words (paper, Rationale construction)."""
 
 
 class Detail(NamedTuple):
-    """Most objects and pairs that each part of a text names."""
+    """The highest numbers of objects and pairs that the parts of a text name.
+
+    Attributes:
+        parsed: Objects in the scene parse.
+        analysed: Moving objects in the motion analysis.
+        predicted: Objects in the prediction.
+        pairs: Pairs of objects in each part.
+    """
 
     parsed: int
     analysed: int
@@ -43,7 +50,10 @@ BRIEF, SPARSE, FULL = Detail(3, 1, 1, 1), Detail(4, 1, 2, 1), Detail(6, 4, 6, 2)
 def write_rationale(
     predicates: Predicates, item: SelectionItem, seed: int, attempt: int = 0
 ) -> str:
-    """A rationale of 80 to 250 words; the same arguments give the same text."""
+    """Return a rationale of 80 to 250 words.
+
+    The same arguments give the same text; another `attempt` gives another choice of phrasings.
+    """
     keys = (seed, item.item_id, attempt)
     text = _Writer(SPARSE, *keys).rationale(predicates)
     if len(text.split()) > MOST_WORDS:
@@ -54,9 +64,9 @@ def write_rationale(
 
 
 def write_description(scene: Scene, start: int, stop: int, target: int, seed: int) -> str | None:
-    """What happens from the prefix [start, stop] to the target frame, without candidates.
+    """Describe what happens between the prefix [start, stop] and the target frame.
 
-    Returns None if the prefix is too short.
+    The description mentions no candidates. Returns None if the prefix is too short.
     """
     facts = extract_facts(scene, start, stop, target)
     if facts is None:
@@ -65,7 +75,7 @@ def write_description(scene: Scene, start: int, stop: int, target: int, seed: in
 
 
 def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:
-    """One line per candidate: whether it matches the predicted state, and why.
+    """Return one line per candidate that says whether it matches the prediction, and why.
 
     The same arguments give the same lines.
     """
@@ -75,10 +85,10 @@ def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str,
 
 
 def most_discriminative_object(predicates: Predicates) -> ObjectFacts:
-    """The object whose place distinguishes most wrong candidates from the target.
+    """Return the object whose place distinguishes the largest number of wrong candidates.
 
-    Ties go to the object that comes first in the prediction. All candidates are compared by this
-    object, so that each is described before it is judged.
+    Of tied objects, the first in order of relevance is returned. The candidate analysis states the
+    place of this object in every candidate before it judges the candidate.
     """
     wrong = [c.differences for c in predicates.candidates if not c.agrees]
 
@@ -102,7 +112,7 @@ def _pair(objects: tuple[str, str]) -> str:
 
 
 def _rank_objects(facts: Facts) -> list[ObjectFacts]:
-    """Objects in order of relevance: first those of a meeting, then moving ones."""
+    """Return the objects in order of relevance: first those of a `Meeting`, then moving ones."""
     met = {name for m in (*facts.courses, *facts.contacts) for name in m.objects}
     return sorted(
         facts.objects,
@@ -111,7 +121,13 @@ def _rank_objects(facts: Facts) -> list[ObjectFacts]:
 
 
 class _Writer:
-    """Writes the parts of a text; `keys` determine its choices of phrasing."""
+    """Writes the parts of a text.
+
+    Args:
+        detail: How many objects and pairs each part names.
+        keys: Seed of the random choices of phrasing.
+        padded: Whether to add two general sentences that lengthen a short text.
+    """
 
     def __init__(self, detail: Detail, *keys: int | str, padded: bool = False) -> None:
         digest = hashlib.sha256(repr(keys).encode()).digest()
@@ -139,7 +155,7 @@ class _Writer:
         )
 
     def opening(self, facts: Facts, key: ObjectFacts | None = None) -> list[str]:
-        """The sections before the candidate analysis; the prediction begins with `key`."""
+        """Return the sections before the candidate analysis. The prediction begins with `key`."""
         ranked = _rank_objects(facts)
         predicted = sorted(ranked, key=lambda o: o is not key) if key else ranked
         return [
@@ -257,7 +273,7 @@ class _Writer:
     def candidate(
         self, candidate: CandidateFacts, key: ObjectFacts, expected: dict[str, str]
     ) -> str:
-        """The place of the `key` object in a candidate, and then whether the candidate agrees."""
+        """Say where the `key` object is in a candidate, and then whether the candidate agrees."""
         name, shows = f"candidate {candidate.letter}", f"shows the {key.object}"
         if candidate.agrees:
             end = self.pick("", " with the prediction")

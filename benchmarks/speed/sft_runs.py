@@ -1,10 +1,10 @@
-"""Short trainings of one student by `train.sft`'s trainer and by TRL's SFTTrainer.
+"""Train a student for a few steps with the trainer of `train.sft` or with TRL's SFTTrainer.
 
-Both train on the same samples in the same order with the same hyperparameters. TRL gets the base in
-the same precision, the same adapters, its default attention, and a collator for our prompts, since
-its own does not support videos. It also gets samples sorted by length and adapters on the language
-tower only. It does not pack or pad samples with images, and casts adapters over 4-bit weights to
-bf16.
+Both trainers use the same base in the same precision, the same adapters, samples, order of samples
+and hyperparameters. The adapters are on the language tower only, and the order of `train.sft`
+groups samples of similar length. TRL uses its default attention, and our collator because its own
+does not support videos. TRL does not pack samples with images, and casts adapters over 4-bit
+weights to bf16.
 """
 
 from __future__ import annotations
@@ -50,10 +50,14 @@ class Variant:
     """A trainer and its settings.
 
     Attributes:
-        trainer: ours or trl.
+        trainer: "ours" or "trl".
+        micro_batch: Samples per forward pass.
         recompute: Whether activations are recomputed in the backward pass.
-        attention: An implementation of transformers, or None for the trainer's default.
-        every_row: Whether unsupervised positions pass through the head too (ours only).
+        workers: Worker processes of the data loader.
+        packing: As `train.packing` (ours only).
+        reuse: Whether the frozen vision tower's features are cached (ours only).
+        attention: An attention implementation of transformers, or None for the trainer's default.
+        every_row: Whether logits are computed at unsupervised positions too (ours only).
     """
 
     name: str
@@ -69,7 +73,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class Student:
-    """A student on its device, the samples of all steps in order, and its settings."""
+    """A student on its device, its training samples in order over all steps, and its settings."""
 
     model: nn.Module
     processor: ProcessorMixin
@@ -80,12 +84,12 @@ class Student:
 
 @dataclass(frozen=True)
 class Figures:
-    """Measurements of a training.
+    """Measurements of one training.
 
     Attributes:
-        seconds: Of each step after the first, with the loading of its samples.
-        losses: Of each step.
-        peak: GiB of tensors on the GPU, or of the process on a CPU.
+        seconds: Duration of each step after the first, including the loading of its samples.
+        losses: Loss of each step.
+        peak: Peak memory in GiB, of tensors on the GPU or of the process on a CPU.
     """
 
     seconds: list[float]
@@ -94,7 +98,7 @@ class Figures:
 
 
 def train(variant: Variant, student: Student, steps: int, folder: Path, **options: Any) -> Figures:
-    """Train `steps` steps in `folder`."""
+    """Train for `steps` steps and measure them; `options` are passed to the trainer's builder."""
     settings = replace(
         student.train,
         max_steps=steps,
@@ -119,7 +123,7 @@ def own_trainer(
     folder: Path,
     loss: Callable[..., torch.Tensor] = token_mean,
 ) -> Trainer:
-    """The trainer as `train.sft` builds it, without evaluations and checkpoints."""
+    """Return the trainer that `train.sft` builds, without evaluations and checkpoints."""
     train = student.train
     fuse(student.model)
     if variant.attention is not None:
@@ -155,8 +159,11 @@ def own_trainer(
 
 
 def trl_trainer(variant: Variant, student: Student, clock: Clock, folder: Path) -> Trainer:
-    """TRL's trainer with SFTConfig's defaults for every setting that neither the variant nor the
-    hyperparameters determine. It accepts rows of `datasets` only, so a row is a sample's index."""
+    """Return TRL's trainer with the variant's settings and the student's hyperparameters.
+
+    All other settings have the defaults of SFTConfig. TRL accepts only a dataset of the `datasets`
+    library, so the dataset contains sample indices and the collator looks up the samples.
+    """
     import datasets
     from trl import SFTConfig, SFTTrainer
 
@@ -202,19 +209,19 @@ def trl_trainer(variant: Variant, student: Student, clock: Clock, folder: Path) 
 
 
 class EveryRow(Collator):
-    """Makes batches in which every position has a label and passes through the head."""
+    """Makes batches with labels and logits at every position; prompt tokens have label IGNORED."""
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
         encoded = [encode(s, self._processor, self._max_length) for s in samples]
         return pad(encoded, self._processor.tokenizer.pad_token_id)
 
     def rows(self, samples: Subset, rows: Sequence[dict[str, int]]) -> dict[str, Any]:
-        """Collate the samples at `rows`. TRL selects the supervised positions itself."""
+        """Collate the samples whose indices are in `rows`."""
         return self([samples[row["row"]] for row in rows])
 
 
 class Clock(TrainerCallback):
-    """Records the end and the loss of each step, and the peak of memory."""
+    """Records the end time and the loss of each step, and the peak memory."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device

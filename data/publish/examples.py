@@ -10,7 +10,7 @@ from data.tracks.retrieval.counterfactual import removal_displacement
 from data.world.displacement import cross_scene_displacement
 
 PREFIX_FRAMES = 4
-"""Frames of a prefix on a sheet."""
+"""Number of frames that represent a prefix on a sheet."""
 AXES = {
     "framing": "framing {}",
     "gap": "gap {}",
@@ -19,7 +19,7 @@ AXES = {
     "window_family": "family {}",
     "difficulty": "{}",
 }
-"""Description of each axis in the heading of an item that has it."""
+"""Construction axes of selection items, and how a heading states the value of each."""
 
 
 class ExampleRows:
@@ -49,10 +49,10 @@ class ExampleRows:
         )
 
     def counterfactual(self, query: RetrievalQuery) -> Row:
-        """Return a counterfactual query: the factual frame, the target and other negatives.
+        """Return the prefix, the target and the hard negatives of a counterfactual query.
 
-        The factual frame, the first hard negative, shows the target's moment with the object. A
-        ring marks the object that the counterfactual scene lacks.
+        The first hard negative is the factual frame: the query's own scene at the target's moment.
+        A ring marks the object that the counterfactual scene lacks.
         """
         scene, without = (self._store.scene(i) for i in (query.scene_id, query.target.scene_id))
         removed = [look.phrase for look in scene.objects].index(query.removed_object)
@@ -118,7 +118,9 @@ class ExampleRows:
 
 
 def _moment(record: SelectionItem | RetrievalQuery, frame: FrameRef) -> str:
-    """A frame's index and, in the record's own or its counterfactual scene, its distance from the
-    end of the prefix."""
+    """Describe when a frame occurs: its index and its offset in frames from the end of the prefix.
+
+    The offset is omitted unless the frame is of the record's scene or of its counterfactual scene.
+    """
     own = frame.scene_id.partition("-without-")[0] == record.scene_id
     return f"frame {frame.frame}" + (f" ({frame.frame - record.prefix_stop:+d})" if own else "")

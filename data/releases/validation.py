@@ -1,4 +1,7 @@
-"""Checks that the readers of releases share: a record without the published layout is refused."""
+"""Checks that the readers of other simulators' releases share.
+
+A record that does not have the published layout raises `RecordError`.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,8 @@ from conf.errors import UserError
 class RecordError(UserError):
     """A record that does not have the published layout, or cannot be read.
 
-    The message names the file, its content and what was expected. A caller leaves the record out
-    and counts it, or stops.
+    The message states the file, what it contains and what was expected. A caller either skips and
+    counts the record, or stops.
     """
 
     def __init__(self, message: str, code: str = "invalid-record") -> None:
@@ -27,21 +30,27 @@ class RecordError(UserError):
 
 
 def scene_id(suite: str, *parts: str) -> str:
-    """Return a scene's id, which is safe as a file name."""
+    """Return a scene's id, in which characters that are unsafe in file names are replaced."""
     return "-".join([suite, *(re.sub(r"[^A-Za-z0-9_.-]+", "_", part) for part in parts)])
 
 
 def check_unique_scenes(
     folder: Path, paths: Sequence[Path], id_of: Callable[[Path], str], layout: str
 ) -> list[Path]:
-    """Return `paths`, which must contain a scene and no scene twice.
+    """Return `paths`, one path per scene, after checking that there is one and no scene repeats.
+
+    Args:
+        folder: The folder of the release.
+        paths: The paths of its scenes.
+        id_of: Returns the scene id of a path.
+        layout: The expected content of the folder, in words for error messages.
 
     Raises:
-        UserError: The folder is missing, or contains no scene or a scene twice.
+        UserError: The folder does not exist, contains no scene, or contains a scene twice.
     """
     if not folder.is_dir():
         raise UserError(
-            f"folder {folder} does not exist: name the folder that contains {layout}",
+            f"folder {folder} does not exist: give the folder that contains {layout}",
             code="missing-folder",
         )
     if not paths:
@@ -51,7 +60,7 @@ def check_unique_scenes(
         other = first.setdefault(id_of(path), path)
         if other is not path:
             raise UserError(
-                f"{folder} contains scene {id_of(path)} twice, as {other} and as {path}: name a "
+                f"{folder} contains scene {id_of(path)} twice, as {other} and as {path}: give a "
                 "folder that contains each scene once",
                 code="duplicate-scene",
             )
@@ -59,10 +68,10 @@ def check_unique_scenes(
 
 
 def load_json(path: str | Path) -> dict[str, Any]:
-    """Return the object in a JSON file.
+    """Return the JSON object that a file contains.
 
     Raises:
-        RecordError: The file is missing, damaged or contains something else.
+        RecordError: The file is missing or damaged, or contains another JSON value.
     """
     try:
         record = json.loads(Path(path).read_bytes())
@@ -82,7 +91,7 @@ def get_field(record: Any, key: str, kind: type, where: str) -> Any:
         RecordError: The key is missing or its value has another type.
     """
     if not isinstance(record, dict) or key not in record:
-        raise RecordError(f"{where} has no key {key!r}, which the release has")
+        raise RecordError(f"{where} has no key {key!r}, which the published layout requires")
     if not isinstance(record[key], kind):
         raise RecordError(
             f"{where} has a {type(record[key]).__name__} at {key!r}, expected a {kind.__name__}"
@@ -94,7 +103,7 @@ def check_choice(value: str, choices: Sequence[str], where: str) -> str:
     """Return `value`, which must be one of `choices`.
 
     Raises:
-        RecordError: It is not.
+        RecordError: `value` is not in `choices`.
     """
     if value not in choices:
         raise RecordError(f"{where} is {value!r}, expected {', '.join(choices)}")
@@ -102,7 +111,7 @@ def check_choice(value: str, choices: Sequence[str], where: str) -> str:
 
 
 def finite_array(values: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
-    """Return `values` as a float32 array of `shape`, in which None is any length.
+    """Return `values` as a float32 array of `shape`, where None stands for any length.
 
     Raises:
         RecordError: The values have another shape or are not all finite numbers.
@@ -127,7 +136,7 @@ def _format(shape: Sequence[int | None]) -> str:
 
 
 def decode_image(data: bytes, where: str) -> Image.Image:
-    """Return an encoded image as RGB; transparency is dropped, not blended.
+    """Decode an image to RGB. An alpha channel is discarded, not blended.
 
     Raises:
         RecordError: The image cannot be decoded.

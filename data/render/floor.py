@@ -1,4 +1,4 @@
-"""Per-pixel shading of the floor: one soft lamp and contact shadows."""
+"""Brightness of each pixel of the floor: the light of one lamp, and the objects' soft shadows."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from data.world.camera import Camera
 from data.world.shapes import RADIUS
 
 SHADOW_DEPTH = 0.55
+"""Share of the light that a shadow removes at its centre."""
 
 _SPREAD = 2 * (0.85 * RADIUS) ** 2
+"""Twice the variance of a shadow's Gaussian profile, squared simulator units."""
 _REACH = 1.0
-"""Radius of a shadow, simulator units. Beyond 0.984 it does not change a float32, because
-exp(-d^2 / _SPREAD) times SHADOW_DEPTH is below 2^-25."""
+"""Half the side of the square in which a shadow is computed, simulator units. Farther than 0.984
+from its centre a shadow is below float32 precision: SHADOW_DEPTH * exp(-d^2 / _SPREAD) < 2^-25."""
 
 
 class Floor:
@@ -30,14 +32,14 @@ class Floor:
         self._x = points[:, :1, 0].astype(np.float32).astype(float)
 
     def shade(self, positions: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-        """Compute the brightness of the floor, which falls with distance and under objects.
+        """Compute the brightness of the floor: the light of the lamp less the objects' shadows.
 
         Args:
             positions: (N, 3) positions of the objects.
-            boxes: (N, 4) their shadows' boxes, from `shadows`.
+            boxes: (N, 4) bounding boxes of their shadows, from `shadows`.
 
         Returns:
-            (H, W) float32.
+            (H, W) float32 factors for the colour of the floor.
         """
         shade = self._lit.copy()
         for (x, y), (left, top, right, bottom) in zip(
@@ -57,17 +59,23 @@ class Floor:
         return shade
 
     def shadows(self, positions: np.ndarray) -> np.ndarray:
-        """(..., 4) left, top, right and bottom of the pixels in the shadows of objects at
-        (..., 3)."""
+        """Compute the bounding boxes of the shadows in the image.
+
+        Args:
+            positions: (..., 3) positions of the objects.
+
+        Returns:
+            (..., 4) left, top, right and bottom in pixels; right and bottom are exclusive.
+        """
         ground = np.zeros(positions.shape)
         ground[..., :2] = self._shadow_centres(positions)
         corners = _REACH * np.array([[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]])
-        # A corner behind the camera is projected far below the image and clipped.
+        # `project` places a corner behind the camera far below the image; the box is then clipped.
         pixels, _ = self._camera.project(ground[..., None, :] + corners)
         size = self._camera.width, self._camera.height
         boxes = np.concatenate([pixels.min(axis=-2), pixels.max(axis=-2) + 1], axis=-1)
         return np.clip(boxes, 0, [*size, *size]).astype(int)
 
     def _shadow_centres(self, positions: np.ndarray) -> np.ndarray:
-        """(..., 2) positions on the floor where the shadows of objects at (..., 3) are darkest."""
+        """Return the (..., 2) centres of the shadows of objects at (..., 3) positions."""
         return positions[..., :2] - 0.5 * RADIUS * np.asarray(self._light[:2]) / self._light[2]

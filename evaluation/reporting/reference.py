@@ -1,4 +1,4 @@
-"""The paper's printed results, read from `reference.yaml`."""
+"""The results that the paper prints, read from `reference.yaml`."""
 
 from __future__ import annotations
 
@@ -9,28 +9,34 @@ from typing import Any
 import yaml
 
 SUITE = "dynapix"
-"""The suite of the items in the paper's selection tables by family."""
+"""The suite whose items the paper's selection tables cover."""
 COT_STUDENT = "Physics-grounded CoT"
+"""The name of the paper's CoT student in `reference.yaml`."""
 NOT_MODELS = ("Chance", "Human, majority vote")
+"""Names of rows that are not compared with models for the best value of a column."""
 
 
 @cache
 def reference(group: str) -> Any:
-    """A group of `reference.yaml`: rows with a `name` and values by column heading, or a number."""
+    """Return a group of `reference.yaml`: a list of rows, or a number.
+
+    A row has a `name` and values by column heading.
+    """
     text = (files("evaluation.reporting") / "reference.yaml").read_text(encoding="utf-8")
     return yaml.safe_load(text)[group]
 
 
 def cot_student() -> dict[str, Any]:
-    """The row of the paper's reasoning student."""
+    """Return the row of the paper's CoT student."""
     return next(row for row in reference("selection_distilled") if row["name"] == COT_STUDENT)
 
 
 def reference_rows(group: str, columns: list[str]) -> list[list[str]]:
-    """The rows of a group as table cells under `columns`; "-" where the paper prints no value,
-    and empty in columns that no row of the group has.
+    """Return the rows of a group as table cells under `columns`.
 
-    Rows with `horizons` are followed by a line for each horizon of the time family.
+    A cell is "-" if the paper prints no value for it, and empty if no row of the group has its
+    column. A row with `horizons`, its accuracies in the time family by seconds to the target, is
+    followed by one row for each of them.
     """
     rows, printed = [], {column for row in reference(group) for column in row}
     for row in reference(group):

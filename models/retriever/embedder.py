@@ -1,8 +1,10 @@
-"""The retriever in sentence-transformers: a query is a video with a text, a frame is an image.
+"""Load retrievers with sentence-transformers, and embed queries and frames.
+
+A query is a video and a text; a frame is an image.
 
 Inputs follow Qwen3-VL-Embedding: the instruction is the system message, the video precedes the
-text, and a generation prompt ends the input. The embedding is the normalised state of the last
-token, or many vectors (`models.retriever.multi_vector`). Saved retrievers are plain
+text, and a generation prompt ends the input. The embedding is the normalised hidden state of the
+last token, or one vector per token (`models.retriever.multi_vector`). Saved retrievers are plain
 `SentenceTransformer` or `MultiVectorEncoder` models.
 """
 
@@ -48,14 +50,15 @@ from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
 
 Retriever = SentenceTransformer | MultiVectorEncoder
-"""A retriever with one vector, or with many."""
+"""A retriever with one vector per input, or with many."""
 Item = RetrievalQuery | FrameRef
 """What a retriever embeds."""
 
 ADAPTERS = "adapter_model.safetensors"
-"""The file of adapters over a frozen base."""
+"""The file name of saved adapters."""
 PROCESSING = {
-    # By default the library truncates long inputs, even within a video; the audit refuses them.
+    # By default sentence-transformers truncates long inputs, even within a video. Inputs are never
+    # truncated here: `train.common.audit` raises an error before training if a query is too long.
     "text": {"truncation": False},
     "video": {"do_sample_frames": False},
     "chat_template": {"add_generation_prompt": True},
@@ -69,14 +72,15 @@ def load_retriever(
 
     Args:
         cfg: The preset.
-        precision: Of the passes: bf16 or fp32.
-        texts: What the tokenizer of a base built from an architecture is trained on.
-        folder: Where such a base is written, to be loaded as any other.
+        precision: bf16 or fp32, the precision of the forward and backward passes.
+        texts: Training texts of the tokenizer, if the preset has an `architecture` from which the
+            base is built. Otherwise unused.
+        folder: Where that base is saved before it is loaded.
 
     Raises:
-        UserError: The model is not on this machine and cannot be fetched; it has no vision tower,
-            or another model's processor; it was saved with other pooling, or with trained modules
-            after its backbone.
+        UserError: The model is not on this machine and cannot be downloaded; it is not a Qwen3-VL,
+            has no vision tower or has the processor of another model; or it is a saved retriever
+            with another pooling than the last token, or with trained modules after its backbone.
     """
     source = cfg.model
     if cfg.architecture is not None:
@@ -112,7 +116,7 @@ def load_retriever(
     else:
         pooling = Pooling(backbone.get_embedding_dimension(), pooling_mode="lasttoken")
         model = SentenceTransformer(modules=[backbone, pooling, Normalize()], **options)
-    # The examples of a model card come from texts in the training rows, which only hold numbers.
+    # Training rows contain indices instead of texts, so a model card has no examples to show.
     model.model_card_data.generate_widget_examples = False
     prepare_for_training(model, cfg, precision)
     return model
@@ -127,11 +131,13 @@ def prepare_for_training(model: Retriever, cfg: RetrieverConfig, precision: str)
 
 
 def add_adapters(model: Retriever, lora: LoraConfig) -> None:
-    """Freeze the backbone and add LoRA to its language tower's projections. Adapters are fp32 even
-    over a bf16 base: updates of their size vanish in bf16's steps.
+    """Freeze the backbone and add LoRA adapters to its language tower's projections.
+
+    Adapters are fp32 even if the base is bf16: their updates are so small that bf16 would round
+    them to zero.
 
     Raises:
-        UserError: The pattern is invalid, or matches no module that can be adapted.
+        UserError: `lora.targets` is an invalid pattern, or matches no module that LoRA supports.
     """
     import peft
 
@@ -149,20 +155,24 @@ def add_adapters(model: Retriever, lora: LoraConfig) -> None:
 
 
 def load_adapters(model: Retriever, folder: Path) -> None:
-    """Load into a retriever the adapters saved in a folder, and the weights of the modules after
-    its backbone."""
+    """Load the adapters and the head that were saved in a folder into a retriever.
+
+    The head is the modules after the backbone.
+    """
     import peft
 
     weights = load_file(folder / ADAPTERS)
     adapters = {name.removeprefix(PEFT): weight for name, weight in weights.items()}
     loaded = peft.set_peft_model_state_dict(model[0].model, adapters)
     if loaded.unexpected_keys:
-        raise ValueError(f"{folder} has adapters of other layers: {loaded.unexpected_keys[:2]}")
+        raise ValueError(
+            f"{folder} has adapters for layers that the model lacks: {loaded.unexpected_keys[:2]}"
+        )
     load_head(model, folder)
 
 
 def load_head(model: Retriever, folder: Path) -> None:
-    """Load the weights of a retriever's modules after its backbone."""
+    """Load the weights of the modules after a retriever's backbone from a folder."""
     for part in json.loads((folder / "modules.json").read_text())[1:]:
         weights = folder / part["path"] / "model.safetensors"
         if weights.exists():
@@ -170,7 +180,10 @@ def load_head(model: Retriever, folder: Path) -> None:
 
 
 def build_base(cfg: RetrieverConfig, texts: list[str], folder: Path) -> str:
-    """Build a base from an architecture and its seed, write it to `folder`, and return that."""
+    """Build a base with random weights from an architecture and its seed.
+
+    The base is saved in `folder`, whose path is returned.
+    """
     assert cfg.architecture is not None
     processor = build_processor(texts, cfg.architecture.vocabulary, cfg.image_size)
     build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
@@ -179,11 +192,12 @@ def build_base(cfg: RetrieverConfig, texts: list[str], folder: Path) -> str:
 
 
 def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retriever:
-    """Load the retriever that `train.contrastive` saved in `folder`, with its adapters over the
-    4-bit weights that they were trained on, or the one that `train.export` merged.
+    """Load a retriever that `train.contrastive` or `train.export` saved in `folder`.
+
+    Adapters that are not merged are loaded over their base, in 4 bits if they were trained so.
 
     Raises:
-        UserError: `folder` holds no complete retriever, or its base is not on this machine.
+        UserError: `folder` contains no complete retriever, or its base is not on this machine.
     """
     if (folder / EXPORT).exists() and not (folder / "adapter_config.json").exists():
         return load_merged(folder, cfg)
@@ -205,11 +219,12 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
 
 
 def load_merged(folder: Path, cfg: RetrieverConfig) -> Retriever:
-    """Load a merged retriever that `train.export` wrote, in the precision of its weights, by the
-    library's means alone.
+    """Load a merged retriever that `train.export` saved, with sentence-transformers alone.
+
+    Its weights keep the precision in which they were saved.
 
     Raises:
-        UserError: It cannot be read.
+        UserError: The retriever cannot be read.
     """
     options = {"model_kwargs": {"dtype": "auto", "use_safetensors": True}, "local_files_only": True}
     try:
@@ -221,8 +236,11 @@ def load_merged(folder: Path, cfg: RetrieverConfig) -> Retriever:
 
 
 def weight_options(cfg: RetrieverConfig, precision: str) -> dict[str, Any]:
-    """How weights are loaded: fp32 if all of them are trained, else in the precision of the passes,
-    in 4 bits if the preset says so; from safetensors only."""
+    """Return the arguments of `from_pretrained` for the weights.
+
+    Weights are fp32 if all of them are trained. Otherwise they have the given precision, or 4 bits
+    if the preset quantizes the base. Only safetensors files are read.
+    """
     trains_all = cfg.quantization == "none" and cfg.lora.rank == 0
     dtype = torch.float32 if trains_all else DTYPES[precision]
     options: dict[str, Any] = {"dtype": dtype, "use_safetensors": True}
@@ -285,9 +303,10 @@ def embed(
     batch: int,
     progress: str | None = None,
 ) -> list[torch.Tensor]:
-    """Embed queries, or frames, loading the pixels of `batch` a rank at a time.
+    """Embed queries or frames. Items are all of one kind.
 
     Args:
+        batch: Items per rank of which pixels are in memory at a time.
         progress: Label of a progress bar; None shows none.
 
     Returns:
@@ -298,7 +317,7 @@ def embed(
     """
     encode = model.encode_document if isinstance(items[0], FrameRef) else model.encode_query
     rows: list[torch.Tensor] = []
-    # Within an evaluation the library shares out the inputs of a call among the ranks.
+    # In a distributed evaluation, each call divides its inputs among the ranks.
     step = batch * world_size()
     starts = range(0, len(items), step)
     for start in tqdm(starts, desc=progress, unit="batch", leave=False, disable=progress is None):

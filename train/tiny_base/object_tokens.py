@@ -1,8 +1,9 @@
-"""Auxiliary loss on visual tokens: each token at an object's place predicts the object's words.
+"""Auxiliary loss of the tiny base: the visual token at an object's place predicts its words.
 
-The answers of the questions are a weak signal of what is visible: a model can learn to phrase them
-well with hardly a look at the pictures. The words of the object at each visual token are a strong
-signal. In candidates, a token also predicts the candidate's letter; in clips, the object's heading.
+The language loss alone trains vision slowly, because a model can lower it by learning phrases and
+nearly ignore the images. This loss trains each visual token that shows an object to predict the
+words that name the object: its color, material and shape. In candidates the token also predicts
+the candidate's letter, and in clips the object's heading.
 """
 
 from __future__ import annotations
@@ -23,33 +24,35 @@ from teacher.predicates import COMPASS
 from train.student.trainer import StudentTrainer
 
 WEIGHT = 6.0
-"""Weight of an object at a visual token, in supervised tokens of the response."""
+"""Weight of the loss at one visual token, relative to one supervised token of the response."""
 PLACES = ("top", "left", "right", "center", "bottom")
-"""Words with which regions begin, after "near the"."""
+"""First words of the regions after "near the", such as "top" of "top-left"."""
 MOTION = ("moves", "does")
-"""Words with which motion and rest begin ("moves slowly", "does not move")."""
+"""First words of motion ("moves slowly") and of rest ("does not move")."""
 WORDS = 4
-"""Most words per visual token: color, material, shape, and a candidate's letter or a heading."""
+"""Highest number of words per visual token: color, material, shape, and a candidate's letter or a
+heading."""
 NONE = -1
 """Padding for tokens with fewer words."""
 
 
 def scene_word_tokens(processor: ProcessorMixin) -> dict[str, list[int]]:
-    """The first token of each word for objects, places and motion, by kind of word."""
+    """Return the first token ids of the words for objects, places and motion, by kind of word."""
     kinds = {"color": COLORS, "material": MATERIALS, "shape": SHAPES, "place": PLACES}
     kinds |= {"motion": MOTION, "heading": COMPASS}
     return {kind: [first_token(processor, w) for w in words] for kind, words in kinds.items()}
 
 
 def first_token(processor: ProcessorMixin, word: str) -> int:
+    """Return the id of a word's first token within a sentence."""
     return processor.tokenizer.encode(f" {word}", add_special_tokens=False)[0]
 
 
 class ObjectTokenCollator(Collator):
-    """Adds `sights` (N, 2 + WORDS) to batches, and keeps the logits of all positions.
+    """Makes batches with `sights` (N, 2 + WORDS) and with logits at all positions.
 
-    A row of `sights` has the row and position of a visual token, and the first tokens of its
-    words, padded with NONE.
+    A row of `sights` has the batch row and the position of a visual token, and then the first token
+    ids of its words, padded with NONE.
     """
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
@@ -98,7 +101,8 @@ class ObjectTokenTrainer(StudentTrainer):
             model, inputs, True, num_items_in_batch=num_items_in_batch
         )
         if model.training and len(sights):
-            # Gradients are averaged over ranks; this factor undoes that, as in the language loss.
+            # `num_items_in_batch` counts the tokens of all ranks, but gradients are averaged over
+            # ranks. The factor `world_size` turns the average into a sum, as in the language loss.
             world_size = self.accelerator.num_processes
             loss = (
                 loss
@@ -111,9 +115,10 @@ class ObjectTokenTrainer(StudentTrainer):
 
 
 def object_token_loss(logits: torch.Tensor, sights: torch.Tensor) -> torch.Tensor:
-    """Cross entropy of visual tokens with the words of their objects, summed over `sights`.
+    """Return the cross entropy between the logits at visual tokens and the words of their objects.
 
-    The words of an object are equally likely targets.
+    The target distribution is uniform over the words of an object. The losses of all `sights` are
+    summed.
 
     Args:
         logits: (B, L, V).
