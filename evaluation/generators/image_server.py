@@ -79,10 +79,10 @@ class ImageServer(Server):
 
     cfg: ImageServerConfig
 
-    async def _responses(self, chat: Messages, n: int, request: RequestFields) -> list[Response]:
+    async def _send(self, messages: Messages, n: int, fields: RequestFields) -> list[Response]:
         result = await self.client.images.generate(
             model=self.cfg.model,
-            prompt=chat[0]["content"],
+            prompt=messages[0]["content"],
             n=n,
             size=self.cfg.size,
             response_format="b64_json",
@@ -96,7 +96,7 @@ class ImageServer(Server):
             raise ValueError("the response holds no image that can be decoded")
         return [Response(image) for image in images]
 
-    async def _unknown_model(self) -> UserError:
+    async def _unknown_model_error(self) -> UserError:
         return UserError(
             f"{self.url} generates no images with images.model={self.cfg.model}: it lacks that "
             "model, or does not serve /v1/images/generations, as vLLM-Omni does",

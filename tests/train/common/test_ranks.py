@@ -143,7 +143,8 @@ def same_weights(one: Path, two: Path, name: str = "student/adapter_model.safete
     weights = [load_file(f / name) for f in (one, two)]
     assert weights[0].keys() == weights[1].keys()
     for name, weight in weights[0].items():
-        torch.testing.assert_close(weight, weights[1][name], atol=1e-6, rtol=1e-5)
+        # Ranks sum gradients in another order: fp32 rounding, after steps at a rate of 1e-3.
+        torch.testing.assert_close(weight, weights[1][name], atol=5e-6, rtol=1e-5)
 
 
 def errors_of(ended: subprocess.CompletedProcess[str]) -> list[str]:

@@ -192,7 +192,7 @@ def test_the_card_describes_the_run(settings, forms) -> None:
 @pytest.mark.slow
 def test_an_export_that_embeds_otherwise_is_not_kept(settings, runs, tmp_path, monkeypatch) -> None:
     """Here merging leaves out the adapters."""
-    monkeypatch.setattr(loading, "merged", lambda base, *_: base.dequantize(torch.float32))
+    monkeypatch.setattr(loading, "merge_adapters", lambda base, *_: base.dequantize(torch.float32))
     with raises_user_error("merge-difference"):
         exported(settings, runs, "fp32", tmp_path)
     assert list(tmp_path.iterdir()) == []
