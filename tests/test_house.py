@@ -49,6 +49,19 @@ def test_no_folder_is_crowded() -> None:
     assert not crowded
 
 
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_user_error_has_a_code(package: str) -> None:
+    for path in (ROOT / package).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if (
+                isinstance(node, ast.Call)
+                and isinstance(node.func, ast.Name)
+                and node.func.id == "UserError"
+            ):
+                has_code = len(node.args) > 1 or any(k.arg == "code" for k in node.keywords)
+                assert has_code, f"{path.relative_to(ROOT)}:{node.lineno}"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_imports_nothing_heavy(command: str) -> None:

@@ -287,7 +287,8 @@ def test_texts_that_state_no_choice_have_no_letter():
 
 
 UNITS = [
-    "final\n", "best\n", '"choice": x ', "'choice': x ", '{"choice":"B"} ', "{'a': ", "'", '"', "[[",
+    "final\n", "best\n", '"choice": x ', "'choice': x ", '{"choice":"B"} ', "{'a': ", "'", '"',
+    "[[",
     "Answer:\n", "the answer is ", "A, ", "I cannot ", " ", "\t", "<think>", "</think>", "\\", "A",
     "\u200b", "{", '{"a":', '{"choice":', "\n", "Answer:", "- ",
 ]  # fmt: skip
