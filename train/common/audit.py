@@ -68,29 +68,35 @@ def audit_retriever(
     if cfg.late is None:
         check_widths(cfg, model.get_embedding_dimension())
     processor = model[0].processor
-    asked = model.preprocess([query_input(query, frames, cfg)], prompt=cfg.query_instruction)
-    length = asked["input_ids"].shape[1]
+    query_inputs = model.preprocess([query_input(query, frames, cfg)], prompt=cfg.query_instruction)
+    length = query_inputs["input_ids"].shape[1]
     if length > cfg.max_length:
         raise UserError(
             f"query {query.query_id} has {length} tokens, more than retriever.max_length="
             f"{cfg.max_length}: raise it, or lower retriever.image_size or retriever.frames",
             code="sample-too-long",
         )
-    shown = model.preprocess([frame_input(query.target, frames)], prompt=cfg.frame_instruction)
+    frame_inputs = model.preprocess(
+        [frame_input(query.target, frames)], prompt=cfg.frame_instruction
+    )
     return "\n".join(
         [
             f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'whole'})",
             format_towers(towers),
             f"frames of {cfg.image_size} x {cfg.image_size} px become "
-            f"{grids(asked | {k: shown[k] for k in ('image_grid_thw',)}, processor)}",
-            *(embedded_at_last if cfg.late is None else embedded_at_scored)(model, asked, shown),
+            f"{grids(query_inputs | {k: frame_inputs[k] for k in ('image_grid_thw',)}, processor)}",
+            *(describe_last_tokens if cfg.late is None else describe_scored_tokens)(
+                model, query_inputs, frame_inputs
+            ),
         ]
     )
 
 
-def embedded_at_last(model: SentenceTransformer, asked: dict, shown: dict) -> list[str]:
-    """A query and a frame, decoded."""
-    query, frame = (features["input_ids"][0] for features in (asked, shown))
+def describe_last_tokens(
+    model: SentenceTransformer, query_inputs: dict, frame_inputs: dict
+) -> list[str]:
+    """Decode a query and a frame."""
+    query, frame = (features["input_ids"][0] for features in (query_inputs, frame_inputs))
     decode = model.tokenizer.decode
     return [
         f"the longest query has {len(query)} tokens and is embedded at the last one:",
@@ -100,34 +106,36 @@ def embedded_at_last(model: SentenceTransformer, asked: dict, shown: dict) -> li
     ]
 
 
-def embedded_at_scored(model: MultiVectorEncoder, asked: dict, shown: dict) -> list[str]:
-    """A query and a frame, decoded, what is scored of each between >>> and <<<."""
-    told = []
-    for what, features in (("the longest query", asked), ("a frame", shown)):
+def describe_scored_tokens(
+    model: MultiVectorEncoder, query_inputs: dict, frame_inputs: dict
+) -> list[str]:
+    """Decode a query and a frame, with the scored tokens between >>> and <<<."""
+    lines = []
+    for name, features in (("the longest query", query_inputs), ("a frame", frame_inputs)):
         ids, attended = features["input_ids"], features["attention_mask"]
         scored = find_scored_tokens(model).scored(ids, attended)[0].tolist()
         runs = [
             (kept, model.tokenizer.decode([token for token, _ in run]))
             for kept, run in groupby(zip(ids[0].tolist(), scored, strict=True), lambda one: one[1])
         ]
-        told += [
-            f"{what} has {len(scored)} tokens, {sum(scored)} of them scored:",
+        lines += [
+            f"{name} has {len(scored)} tokens, {sum(scored)} of them scored:",
             squeeze("".join(f">>>{text}<<<" if kept else text for kept, text in runs)),
         ]
     pools = [module for module in model if isinstance(module, HierarchicalTokenPooling)]
-    return [*told, *(f"a frame keeps one of {p.pool_factor} of its vectors" for p in pools)]
+    return [*lines, *(f"a frame keeps one of {p.pool_factor} of its vectors" for p in pools)]
 
 
 def grids(batch: dict, processor: ProcessorMixin) -> str:
     """Describe the vision tokens of a batch as frames x rows x columns."""
     merge = processor.image_processor.merge_size
-    told = []
+    descriptions = []
     for name, what in (("video_grid_thw", "a video"), ("image_grid_thw", "an image")):
         if name in batch:
             time, height, width = batch[name][0].tolist()
             rows, columns = height // merge, width // merge
-            told.append(f"{what} of {time} x {rows} x {columns} tokens")
-    return " and ".join(told)
+            descriptions.append(f"{what} of {time} x {rows} x {columns} tokens")
+    return " and ".join(descriptions)
 
 
 def squeeze(text: str) -> str:
