@@ -36,6 +36,8 @@ OVERLAYS = ("exp", "sweep")
 REMOVED_KEYS: dict[str, str] = {
     "shown": "use examples instead",
     "cards": "use gpus instead",
+    "train.keep": "use train.keep_checkpoints instead",
+    "train.best": "use train.best_metric instead",
     "train.batches": "leave it out: batches are random",
     "train.scene_queries": "leave it out: batches are random",
     "train.mini_batch_tokens": "set train.mini_batch to a number of queries or frames",

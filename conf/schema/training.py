@@ -37,9 +37,9 @@ class TrainConfig:
     speed."""
     evaluations: int = 10
     """Number of evaluations, evenly spaced over the run; each saves a checkpoint."""
-    keep: int = 2
+    keep_checkpoints: int = 2
     """Number of checkpoints to keep, including the best."""
-    best: str | None = None
+    best_metric: str | None = None
     """Metric in metrics.jsonl that selects the checkpoint to export, such as
     eval_answer_letter_accuracy, eval_reasoning_loss or eval_recall@10: a loss by its lowest value,
     any other metric by its highest. null selects the last step."""
@@ -51,7 +51,8 @@ class TrainConfig:
     """Experiment trackers of transformers' Trainer, such as tensorboard, wandb or trackio."""
 
     def check(self) -> list[str]:
-        least = {"weight_decay": 0, "max_grad_norm": 0, "evaluations": 1, "keep": 1, "workers": 0}
+        least = {"weight_decay": 0, "max_grad_norm": 0, "workers": 0}
+        least |= {"evaluations": 1, "keep_checkpoints": 1}
         options = {
             "schedule": ("cosine", "linear", "constant"),
             "precision": ("auto", "bf16", "fp32"),

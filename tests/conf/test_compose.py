@@ -61,7 +61,7 @@ def test_removed_key_names_its_replacement(monkeypatch):
         ("+sweep=lr_rank", "needs-multirun", "+sweep=lr_rank"),
         ("workers=0", "invalid-setting", "workers=0"),
         ("benchmark.height=129", "invalid-setting", "benchmark.height=129"),
-        ("train.keep=0", "invalid-setting", "train.keep=0"),
+        ("train.keep_checkpoints=0", "invalid-setting", "train.keep_checkpoints=0"),
         ("train.max_steps=0", "invalid-setting", "train.max_steps=0"),
     ],
 )

@@ -113,7 +113,7 @@ def test_overrides_and_overlays_replace_the_recipe():
     base = settings("python -m train.sft +exp=base")
     assert base.student.name == "tiny_scratch"
     assert base.student.architecture.vision_layers == 4
-    assert base.benchmark.name == "eyes"
+    assert base.benchmark.name == "tiny_base"
     assert base.train.regime == "describe"
 
 

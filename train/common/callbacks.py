@@ -57,7 +57,7 @@ class JournalCallback(TrainerCallback):
 
 
 class CheckBestMeasure(TrainerCallback):
-    """Refuses a train.best that the evaluation at the start did not measure."""
+    """Refuses a train.best_metric that the evaluation at the start did not measure."""
 
     def on_step_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
         best = args.metric_for_best_model
@@ -67,8 +67,8 @@ class CheckBestMeasure(TrainerCallback):
         names = sorted(k for k in names if not k.endswith((*NOT_REPRODUCIBLE, "_preparation_time")))
         if f"eval_{best.removeprefix('eval_')}" not in names:
             raise UserError(
-                f"train.best={best} is not measured by this run's evaluations; the options are "
-                f"{', '.join(names)}",
+                f"train.best_metric={best} is not measured by this run's evaluations; the options "
+                f"are {', '.join(names)}",
                 code="unknown-option",
             )
 

@@ -114,7 +114,7 @@ def model_card(
         over_nf4=format == "adapter" and preset.quantization == "nf4",
         count=train.validation_items if student else train.validation_queries,
         items="items" if student else "queries",
-        kept=_kept_step(train.best, metrics),
+        kept=_kept_step(train.best_metric, metrics),
         curve=[
             (_label(key), f"{metrics[f'{key}{AT_START_SUFFIX}']:.4g}", f"{value:.4g}")
             for key, value in metrics.items()

@@ -42,12 +42,12 @@ def run_training(
         lower_memory: The settings to lower when memory runs out, as a sentence.
 
     Returns:
-        The step of the best checkpoint, whose weights the trainer's model then has, if train.best
-        names a measure; else None.
+        The step of the best checkpoint, whose weights the trainer's model then has, if
+        train.best_metric names a measure; else None.
 
     Raises:
-        UserError: memory runs out, the disk is full, no evaluation has the measure of train.best,
-            or any other UserError of a worker process or of another rank.
+        UserError: memory runs out, the disk is full, no evaluation has the measure of
+            train.best_metric, or any other UserError of a worker process or of another rank.
     """
     add_callbacks(trainer, run)
     check_fsdp(trainer, checkpoint)

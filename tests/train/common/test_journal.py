@@ -40,8 +40,8 @@ def settings(few_steps) -> SftCommand:
     return few_steps(
         validation_items=4,
         generated_items=2,
-        keep=1,
-        best="eval_answer_generated_parse_rate",
+        keep_checkpoints=1,
+        best_metric="eval_answer_generated_parse_rate",
         report_to=["tensorboard"],
     )
 
@@ -113,7 +113,9 @@ def test_what_is_written_is_what_the_evaluation_reads(
 @pytest.mark.slow
 def test_a_run_is_the_same_unwatched_and_gone_on_with(watched, settings, tmp_path) -> None:
     folder, results = watched
-    plain = replace(settings.train, generated_items=0, best=None, report_to=[], keep=2)
+    plain = replace(
+        settings.train, generated_items=0, best_metric=None, report_to=[], keep_checkpoints=2
+    )
     unwatched = tmp_path / "unwatched"
     unwatched.mkdir()
     sft.main.__wrapped__(replace(settings, train=plain), Run("unwatched", unwatched))
@@ -152,7 +154,7 @@ def test_trackers_are_told_all_that_is_measured(watched) -> None:
 
 @pytest.mark.slow
 def test_a_measure_that_no_evaluation_takes_is_told(settings, tmp_path) -> None:
-    train = replace(settings.train, best="letter_accuracy", report_to=[], generated_items=0)
+    train = replace(settings.train, best_metric="letter_accuracy", report_to=[], generated_items=0)
     with raises_user_error("unknown-option", contains="eval_answer_letter_accuracy"):
         sft.main.__wrapped__(replace(settings, train=train), Run("run", tmp_path))
     assert not list(tmp_path.glob("checkpoint-*"))

@@ -164,7 +164,7 @@ def test_two_ranks_are_one(settings, contrastive_settings, saved_base, few, tmp_
     one = alone(settings, runs / "one")
     # Unlike 4-bit weights, those of such a base are parted too.
     unquantised = replace(settings.student, quantization="none")
-    best = replace(settings.train, best="eval_answer_loss")
+    best = replace(settings.train, best_metric="eval_answer_loss")
     plain = replace(settings, student=unquantised, train=best)
     alone(plain, runs / "plain")
     train = contrastive_settings.train

@@ -191,7 +191,8 @@ def test_other_folders_are_no_checkpoints(tmp_path, caplog) -> None:
 @pytest.mark.parametrize("late", [None, LateConfig(width=24)], ids=["one vector", "many"])
 def test_a_retriever_goes_on_as_if_undisturbed(contrastive_settings, tmp_path, late) -> None:
     """Within its second epoch."""
-    train = replace(contrastive_settings.train, best="mrr", max_steps=8, evaluations=4, keep=4)
+    changes = {"max_steps": 8, "evaluations": 4, "keep_checkpoints": 4}
+    train = replace(contrastive_settings.train, best_metric="mrr", **changes)
     cfg = replace(contrastive_settings.retriever, late=late)
     settings = replace(contrastive_settings, retriever=cfg, train=train)
     whole, killed = train_twice(contrastive.main, settings, tmp_path, step=6)
@@ -212,7 +213,7 @@ def test_a_retriever_goes_on_as_if_undisturbed(contrastive_settings, tmp_path, l
 def test_a_retriever_of_adapters_goes_on_as_if_undisturbed(
     contrastive_settings, saved_base, tmp_path, late
 ) -> None:
-    train = replace(contrastive_settings.train, best="mrr")
+    train = replace(contrastive_settings.train, best_metric="mrr")
     over = {"architecture": None, "model": saved_base, "quantization": "nf4", "lora": DRAWING}
     cfg = replace(contrastive_settings.retriever, late=late, **over)
     settings = replace(contrastive_settings, retriever=cfg, train=train)
@@ -227,7 +228,7 @@ def test_a_retriever_of_adapters_goes_on_as_if_undisturbed(
 
 @pytest.mark.slow
 def test_a_best_checkpoint_that_was_lost_is_told(contrastive_settings, tmp_path) -> None:
-    train = replace(contrastive_settings.train, best="mrr")
+    train = replace(contrastive_settings.train, best_metric="mrr")
     settings = replace(contrastive_settings, train=train)
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     whole.mkdir()
@@ -248,7 +249,7 @@ def test_a_best_checkpoint_that_cannot_be_read_is_no_silent_last_one(
         raise RuntimeError("torn")
 
     monkeypatch.setattr(SentenceTransformerTrainer, "_load_from_checkpoint", torn)
-    train = replace(contrastive_settings.train, best="mrr")
+    train = replace(contrastive_settings.train, best_metric="mrr")
     with pytest.raises(RuntimeError, match="torn"):
         contrastive.main.__wrapped__(
             replace(contrastive_settings, train=train), Run("run", tmp_path)
