@@ -69,7 +69,7 @@ class Clip:
 
 
 @dataclass(frozen=True)
-class Sight:
+class ObjectLabel:
     """An object that is visible in one of a sample's pictures.
 
     Attributes:
@@ -93,7 +93,7 @@ class Sample:
         images: (S, S, 3) uint8 pixels of each image in order, such as the candidates.
         response: The assistant's text, or None if it is to be generated.
         supervised: Whether the response is trained on. An unsupervised sample only fills a batch.
-        sights: Visible objects, for the training of the tiny base.
+        object_labels: Visible objects, for the training of the tiny base.
     """
 
     sample_id: str
@@ -102,7 +102,7 @@ class Sample:
     images: list[np.ndarray]
     response: str | None = None
     supervised: bool = True
-    sights: tuple[Sight, ...] = ()
+    object_labels: tuple[ObjectLabel, ...] = ()
 
     @property
     def pictures(self) -> int:
@@ -220,7 +220,7 @@ def conversation(
     parts: Sequence[str | np.ndarray],
     response: str | None,
     clip: Clip | None = None,
-    sights: Sequence[Sight] = (),
+    object_labels: Sequence[ObjectLabel] = (),
 ) -> Sample:
     """Return a sample of a clip, if any, followed by `parts`: texts and (S, S, 3) uint8 images."""
     content: list[dict[str, Any]] = [{"type": "video"}] if clip else []
@@ -229,4 +229,4 @@ def conversation(
         for part in parts
     ]
     images = [part for part in parts if not isinstance(part, str)]
-    return Sample(sample_id, content, clip, images, response, sights=tuple(sights))
+    return Sample(sample_id, content, clip, images, response, object_labels=tuple(object_labels))

@@ -49,10 +49,10 @@ def first_token(processor: ProcessorMixin, word: str) -> int:
 
 
 class ObjectTokenCollator(Collator):
-    """Makes batches with `sights` (N, 2 + WORDS) and with logits at all positions.
+    """Makes batches with `object_labels` (N, 2 + WORDS) and with logits at all positions.
 
-    A row of `sights` has the batch row and the position of a visual token, and then the first token
-    ids of its words, padded with NONE.
+    A row of `object_labels` has the batch row and the position of a visual token, and then the
+    first token ids of its words, padded with NONE.
     """
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
@@ -62,26 +62,26 @@ class ObjectTokenCollator(Collator):
             batch["labels"], (length - batch["labels"].shape[1], 0), value=IGNORED
         )
         batch["logits_to_keep"] = torch.arange(length)
-        batch["sights"] = torch.tensor(
+        batch["object_labels"] = torch.tensor(
             [
                 row
                 for k, s in enumerate(samples)
                 if s.supervised
-                for row in self._encode_sights(s, k, batch["input_ids"][k])
+                for row in self._encode_object_labels(s, k, batch["input_ids"][k])
             ]
         ).reshape(-1, 2 + WORDS)
         return batch
 
-    def _encode_sights(self, sample: Sample, row: int, ids: torch.Tensor) -> list[list[int]]:
+    def _encode_object_labels(self, sample: Sample, row: int, ids: torch.Tensor) -> list[list[int]]:
         visual = torch.tensor([self._processor.image_token_id, self._processor.video_token_id])
         positions = torch.isin(ids, visual).nonzero()[:, 0].tolist()
         each = len(positions) // max(1, sample.pictures)
         grid = math.isqrt(each)
         rows = []
-        for sight in sample.sights:
-            column, line = (min(int(share * grid), grid - 1) for share in sight.place)
-            position = positions[sight.picture * each + line * grid + column]
-            words = [first_token(self._processor, word) for word in sight.words]
+        for label in sample.object_labels:
+            column, line = (min(int(share * grid), grid - 1) for share in label.place)
+            position = positions[label.picture * each + line * grid + column]
+            words = [first_token(self._processor, word) for word in label.words]
             rows.append([row, position, *words, *[NONE] * (WORDS - len(words))])
         return rows
 
@@ -96,11 +96,11 @@ class ObjectTokenTrainer(StudentTrainer):
         return_outputs: bool = False,
         num_items_in_batch: torch.Tensor | int | None = None,
     ) -> Any:
-        sights = inputs.pop("sights")
+        object_labels = inputs.pop("object_labels")
         loss, outputs = super().compute_loss(
             model, inputs, True, num_items_in_batch=num_items_in_batch
         )
-        if model.training and len(sights):
+        if model.training and len(object_labels):
             # `num_items_in_batch` counts the tokens of all ranks, but gradients are averaged over
             # ranks. The factor `world_size` turns the average into a sum, as in the language loss.
             world_size = self.accelerator.num_processes
@@ -108,23 +108,23 @@ class ObjectTokenTrainer(StudentTrainer):
                 loss
                 + world_size
                 * WEIGHT
-                * object_token_loss(outputs.logits, sights)
+                * object_token_loss(outputs.logits, object_labels)
                 / num_items_in_batch
             )
         return (loss, outputs) if return_outputs else loss
 
 
-def object_token_loss(logits: torch.Tensor, sights: torch.Tensor) -> torch.Tensor:
+def object_token_loss(logits: torch.Tensor, object_labels: torch.Tensor) -> torch.Tensor:
     """Return the cross entropy between the logits at visual tokens and the words of their objects.
 
-    The target distribution is uniform over the words of an object. The losses of all `sights` are
+    The target distribution is uniform over the words of an object. The losses of all objects are
     summed.
 
     Args:
         logits: (B, L, V).
-        sights: (N, 2 + WORDS), see `ObjectTokenCollator`.
+        object_labels: (N, 2 + WORDS), see `ObjectTokenCollator`.
     """
-    row, position, words = sights[:, 0], sights[:, 1], sights[:, 2:]
+    row, position, words = object_labels[:, 0], object_labels[:, 1], object_labels[:, 2:]
     log_probabilities = logits[row, position].float().log_softmax(dim=-1)
     is_word = words != NONE
     each = log_probabilities.gather(1, words.clamp(min=0)).masked_fill(~is_word, 0.0)

@@ -17,7 +17,7 @@ import numpy as np
 from data.records import LETTERS, Scene, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from data.store import Store
-from models.student.prompts import Sample, Sight, answer_line, conversation, load_clip
+from models.student.prompts import ObjectLabel, Sample, answer_line, conversation, load_clip
 from teacher.narrator import write_description, write_match_lines
 from teacher.predicates import (
     REGIONS,
@@ -114,8 +114,8 @@ class _SampleBuilder:
         scene_id, frame = self._random_frame(item, rng)
         pixels = self.frames.array(scene_id, frame)
         answer = describe_frame(self.store.scene(scene_id), frame)
-        sights = self._find_sights([(scene_id, frame, "")])
-        return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], answer, None, sights)
+        labels = self._label_objects([(scene_id, frame, "")])
+        return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], answer, None, labels)
 
     def candidates(self, item: SelectionItem, k: int) -> LazySample:
         """The objects and places of four candidates."""
@@ -301,7 +301,7 @@ class _SampleBuilder:
 
     def _about_four(self, name: str, pictures: list[Picture], question: str, answer: str) -> Sample:
         parts = [*self._label(pictures), f"\n{question}"]
-        return conversation(name, parts, answer, None, self._find_sights(pictures))
+        return conversation(name, parts, answer, None, self._label_objects(pictures))
 
     def _after_clip(
         self,
@@ -315,18 +315,18 @@ class _SampleBuilder:
         scene = self.store.scene(item.scene_id)
         # A visual token of a clip covers two frames; objects are labelled as in the first.
         pairs = [(f, frames[min(k + 1, len(frames) - 1)]) for k, f in enumerate(frames)][::2]
-        sights = [
-            Sight(k, place, (*words, object_heading(scene, index, *pair) or "stationary"))
+        labels = [
+            ObjectLabel(k, place, (*words, object_heading(scene, index, *pair) or "stationary"))
             for k, pair in enumerate(pairs)
             for index, place, words in visible_objects(scene, pair[0])
         ]
-        sights += self._find_sights(pictures, len(pairs))
-        return conversation(f"{item.item_id} (clip and frames)", parts, answer, clip, sights)
+        labels += self._label_objects(pictures, len(pairs))
+        return conversation(f"{item.item_id} (clip and frames)", parts, answer, clip, labels)
 
-    def _find_sights(self, pictures: list[Picture], before: int = 0) -> list[Sight]:
+    def _label_objects(self, pictures: list[Picture], before: int = 0) -> list[ObjectLabel]:
         """The visible objects of pictures, which come after `before` others in the sample."""
         return [
-            Sight(before + k, place, (*words, *letter))
+            ObjectLabel(before + k, place, (*words, *letter))
             for k, (scene_id, frame, letter) in enumerate(pictures)
             for _, place, words in visible_objects(self.store.scene(scene_id), frame)
         ]

@@ -36,15 +36,15 @@ def test_words_are_labels_of_the_tokens_at_their_objects(
     for row, sample in enumerate(samples):
         at = [k for k, t in enumerate(batch["input_ids"][row].tolist()) if t in visual]
         cells = np.reshape(at, (sample.pictures, side, side))
-        for sight in sample.sights:
-            x, y = (min(math.floor(share * side), side - 1) for share in sight.place)
-            words = [first_token(processor, word) for word in sight.words]
+        for label in sample.object_labels:
+            x, y = (min(math.floor(share * side), side - 1) for share in label.place)
+            words = [first_token(processor, word) for word in label.words]
             filled = [*words, *[NONE] * (WORDS - len(words))]
-            expected.append([row, int(cells[sight.picture, y, x]), *filled])
+            expected.append([row, int(cells[label.picture, y, x]), *filled])
             if len(words) == WORDS and sample.clip is None:
-                before = sample.content[2 * sight.picture]["text"]
-                assert before == f"\nCandidate {sight.words[-1]}: "
-    assert batch["sights"].tolist() == expected
+                before = sample.content[2 * label.picture]["text"]
+                assert before == f"\nCandidate {label.words[-1]}: "
+    assert batch["object_labels"].tolist() == expected
     assert {row for row, *_ in expected} == set(range(len(samples)))
 
 
@@ -59,14 +59,14 @@ def test_visible_objects_are_described(micro_store) -> None:
 
 def test_loss_is_minimal_for_equal_probabilities() -> None:
     """The minimum is the entropy of three equally likely words; padding does not count."""
-    sights = torch.tensor([[0, 1, 4, 5, 6, NONE]])
+    object_labels = torch.tensor([[0, 1, 4, 5, 6, NONE]])
     even = torch.full((1, 3, 10), -torch.inf)
     even[0, 1, [4, 5, 6]] = 0.0
-    assert object_token_loss(even, sights).item() == pytest.approx(math.log(3))
+    assert object_token_loss(even, object_labels).item() == pytest.approx(math.log(3))
     tilted = even.clone()
     tilted[0, 1, 4] = 1.0
-    assert object_token_loss(tilted, sights).item() > math.log(3)
+    assert object_token_loss(tilted, object_labels).item() > math.log(3)
     elsewhere = torch.zeros(1, 3, 10)
-    assert object_token_loss(elsewhere, sights.repeat(2, 1)).item() == pytest.approx(
+    assert object_token_loss(elsewhere, object_labels.repeat(2, 1)).item() == pytest.approx(
         2 * math.log(10)
     )

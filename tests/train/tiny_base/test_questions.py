@@ -149,16 +149,16 @@ def test_headings_of_objects_at_visual_tokens(micro_store, kinds) -> None:
         sample = lazy.load(0)
         item = items[sample.sample_id.partition(" (")[0]]
         scene, frames = micro_store.scene(item.scene_id), sample.clip.indices
-        assert {sight.picture for sight in sample.sights} <= set(range(sample.pictures))
-        for sight in sample.sights:
-            index = [tuple(o.phrase.split()) for o in scene.objects].index(sight.words[:3])
-            pair = [frames[2 * sight.picture], frames[2 * sight.picture + 1]]
+        assert {label.picture for label in sample.object_labels} <= set(range(sample.pictures))
+        for label in sample.object_labels:
+            index = [tuple(o.phrase.split()) for o in scene.objects].index(label.words[:3])
+            pair = [frames[2 * label.picture], frames[2 * label.picture + 1]]
             moves = np.linalg.norm(scene.velocities[pair[1], index]) >= 0.05
-            assert (sight.words[3] != "stationary") == moves
+            assert (label.words[3] != "stationary") == moves
             if moves:
                 gone = np.diff(scene.image_positions[pair, index], axis=0)[0]
-                assert np.dot(gone, DIRECTIONS[sight.words[3]]) > 0
-            headings.add(sight.words[3])
+                assert np.dot(gone, DIRECTIONS[label.words[3]]) > 0
+            headings.add(label.words[3])
     assert len(headings) > 4
 
 
