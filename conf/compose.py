@@ -7,9 +7,10 @@ the schema once more. Every mistake becomes a SettingsError of one sentence.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
+from difflib import SequenceMatcher
 from importlib.resources import files
 from typing import Any
 
@@ -27,7 +28,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import conf.multirun.plugins  # noqa: F401  registers the launcher that run_folder.yaml names
 from conf.errors import SettingsError
-from conf.keys import flatten, keys, nearest
+from conf.runs import flatten
 
 CONFIG_NAMES = {"train.export": "export_model", "evaluation.study.export": "export_study"}
 """Config names of the commands that share their module's last name with data.export."""
@@ -63,7 +64,7 @@ def config_name(command: str) -> str:
 def compose(command: str, schema: type, overrides: list[str]) -> Any:
     """Compose the settings of one run as an instance of `schema`. Raises SettingsError."""
     with _hydra(command, schema), _settings_errors(command, schema):
-        return strict(_compose(command, overrides), schema)
+        return validate_settings(_compose(command, overrides), schema)
 
 
 def preflight(command: str, schema: type, overrides: list[str], sweep: bool) -> None:
@@ -75,24 +76,25 @@ def preflight(command: str, schema: type, overrides: list[str], sweep: bool) -> 
         parser = OverridesParser.create(config_loader=loader)
         parsed = parser.parse_overrides(overrides)
         first = _jobs_with_each_value(parsed)[0] if sweep else overrides
-        cfg = _compose(command, first, return_hydra_config=True)
-        params = cfg.hydra.sweeper.get("params") or {}
-        if not sweep:
-            if params:
-                overlays = " ".join(o for o in overrides if o.startswith("+sweep="))
-                raise SettingsError(f"{overlays} is a sweep: run it with -m", code="needs-multirun")
-            strict(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"]), schema)
-            return
-        preset = [f"{key}={value}" for key, value in params.items()]
-        parsed = parser.parse_overrides(preset) + parsed
+        hydra = _compose(command, first, return_hydra_config=True).hydra
+        params = hydra.sweeper.get("params") or {}
+        if params and not sweep:
+            overlays = " ".join(o for o in overrides if o.startswith("+sweep="))
+            raise SettingsError(f"{overlays} is a sweep: run it with -m", code="needs-multirun")
+        parsed = parser.parse_overrides([f"{k}={v}" for k, v in params.items()]) + parsed
+        is_search = hydra.runtime.choices["hydra/sweeper"] != "basic"
+        intervals = [o.input_line for o in parsed if o.is_interval_sweep()]
+        if sweep and intervals and not is_search:
+            raise SettingsError(
+                f"{intervals[0]}: add hydra/sweeper=optuna to sample from an interval",
+                code="needs-search",
+            )
+    if not sweep:
+        jobs = [overrides]
+    elif is_search:
         jobs = _jobs_with_each_value(parsed)
-        if cfg.hydra.runtime.choices["hydra/sweeper"] == "basic":
-            for override in filter(Override.is_interval_sweep, parsed):
-                raise SettingsError(
-                    f"{override.input_line}: add hydra/sweeper=optuna to sample from an interval",
-                    code="needs-search",
-                )
-            [jobs] = BasicSweeper.split_arguments(parsed, None)
+    else:
+        [jobs] = BasicSweeper.split_arguments(parsed, None)
     for job in jobs:
         compose(command, schema, job)
 
@@ -125,12 +127,12 @@ def options(command: str, schema: type) -> dict[str, list[str]]:
     return {group: names for group, names in groups.items() if names and group in taken}
 
 
-def strict(cfg: DictConfig, schema: type) -> Any:
+def validate_settings(cfg: DictConfig, schema: type) -> Any:
     """Convert composed settings to an instance of `schema`.
 
     Raises:
         OmegaConfBaseException: A key is not in the schema or has a value of the wrong type.
-        SettingsError: A value is missing, or a dataclass's `check()` refuses it.
+        SettingsError: A value is missing, or `Settings.check()` refuses it.
     """
     plain = OmegaConf.to_container(cfg, resolve=True)
     merged = OmegaConf.merge(OmegaConf.structured(schema), plain)
@@ -138,19 +140,9 @@ def strict(cfg: DictConfig, schema: type) -> Any:
         lines = [f"{key} is not set: give {key}=..." for key in missing]
         raise SettingsError("\n".join(lines), code="missing-setting")
     settings = OmegaConf.to_object(merged)
-    if problems := list(_check(settings)):
+    if problems := settings.check():
         raise SettingsError("\n".join(problems))
     return settings
-
-
-def _check(settings: Any) -> Iterator[str]:
-    """Sentences of every `check()`, those of nested dataclasses first."""
-    for field in fields(settings):
-        value = getattr(settings, field.name)
-        if is_dataclass(value):
-            yield from _check(value)
-    if hasattr(settings, "check"):
-        yield from settings.check()
 
 
 @contextmanager
@@ -206,7 +198,27 @@ def _unknown_key(command: str, schema: type, key: str) -> str:
         return f"{key} was removed: {REMOVED_KEYS[key]}"
     if key.startswith("hydra."):
         return f"Hydra has no key {key}"
-    defaults = OmegaConf.to_container(hydra_compose(config_name(command)))
-    guess = nearest(key, [*keys(schema), *flatten(defaults), *OVERLAYS])
+    defaults = flatten(OmegaConf.to_container(hydra_compose(config_name(command))))
+    # A group such as `student` is a key too.
+    parts = (known.split(".") for known in defaults)
+    known = {".".join(part[:end]) for part in parts for end in range(1, len(part) + 1)}
+    guess = nearest_key(key, known | {*OVERLAYS})
     hint = f"; did you mean {'+' if guess in OVERLAYS else ''}{guess}?" if guess else ""
     return f"{command} has no key {key}{hint}"
+
+
+def nearest_key(key: str, known: Iterable[str]) -> str | None:
+    """The known key most similar to `key`, or None.
+
+    The last part of a key counts most, so that `lr` suggests `train.lr`.
+    """
+
+    def similarity(other: str) -> float:
+        last, other_last = key.rpartition(".")[2], other.rpartition(".")[2]
+        return (
+            SequenceMatcher(None, key, other).ratio()
+            + 2 * SequenceMatcher(None, last, other_last).ratio()
+        )
+
+    best = max(sorted(known), key=similarity)
+    return best if similarity(best) > 1.8 else None

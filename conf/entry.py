@@ -16,14 +16,17 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from conf.compose import config_name, preflight, register, strict
-from conf.errors import UserError
+from conf.compose import config_name, preflight, register, validate_settings
+from conf.errors import SettingsError, UserError
 from conf.failures import report_failures
 from conf.help import help_text
 from conf.runs import Run, lock_folder, open_run, rank, run_name, world_size, write_json
 
 Metrics = dict[str, float]
 Main = Callable[[Any, Run], Metrics | None]
+
+HYDRA_MODES = ("run", "multirun", "cfg", "info", "shell_completion")
+"""Hydra's options that exclude each other."""
 
 
 def command(name: str, schema: type) -> Callable[[Main], Callable[[], None]]:
@@ -52,6 +55,11 @@ def _start(name: str, schema: type, main: Main) -> None:
     if args.help:
         _print(help_text(name, schema, args.overrides))
         return
+    modes = [f"--{mode}" for mode in HYDRA_MODES if getattr(args, mode)]
+    if len(modes) > 1:
+        raise SettingsError(f"{modes[0]} with {modes[1]}: give one of them", "conflicting-options")
+    if args.resolve and not args.cfg:
+        raise SettingsError("--resolve: add --cfg job to print settings", "conflicting-options")
     if not (args.hydra_help or args.info or args.shell_completion):
         sweep = args.multirun or "hydra.mode=MULTIRUN" in args.overrides
         if sweep and world_size() > 1:
@@ -75,7 +83,7 @@ def _start(name: str, schema: type, main: Main) -> None:
 
 def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None:
     """Run one job: lock and open its folder, call `main`, write its metrics."""
-    settings = strict(cfg, schema)
+    settings = validate_settings(cfg, schema)
     job = HydraConfig.get()
     overrides = list(job.overrides.task)
     folder = Path(os.path.relpath(job.runtime.output_dir))

@@ -14,14 +14,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
 from conf.errors import SettingsError, UserError
-from conf.keys import flatten
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +36,7 @@ TRAINER_FOLDERS = {"student": "sft", "retriever": "contrastive"}
 """Folder of the training runs of each product below checkpoints/."""
 
 PACKAGES = (
-    "torch", "transformers", "peft", "bitsandbytes", "accelerate", "sentence-transformers", "trl",
+    "torch", "transformers", "peft", "bitsandbytes", "accelerate", "sentence-transformers",
     "hydra-core", "omegaconf", "numpy", "pybullet",
 )  # fmt: skip
 """Packages whose versions run.json records."""
@@ -193,13 +192,27 @@ def differences(folder: Path, settings: dict[str, Any]) -> list[str]:
     return setting_differences(OmegaConf.to_container(OmegaConf.load(path)), settings)
 
 
+def flatten(value: Any, key: str = "") -> dict[str, Any]:
+    """Nested settings by dotted key."""
+    if not isinstance(value, dict) or not value:
+        return {key: value}
+    return {
+        dotted: leaf
+        for name, inner in value.items()
+        for dotted, leaf in flatten(inner, f"{key}.{name}" if key else str(name)).items()
+    }
+
+
 def setting_differences(before: Any, now: Any) -> list[str]:
     """Each setting that differs between two nested dicts, as a phrase with both values."""
-    before, now, absent = flatten(before), flatten(now), object()
+    before, now = (
+        {key: json.dumps(value) for key, value in flatten(settings).items()}
+        for settings in (before, now)
+    )
     return [
-        f"{key} was {_json(before, key)} and is now {_json(now, key)}"
-        for key in sorted(before.keys() | now.keys())
-        if key not in RESULT_NEUTRAL_KEYS and before.get(key, absent) != now.get(key, absent)
+        f"{key} was {before.get(key, 'absent')} and is now {now.get(key, 'absent')}"
+        for key in sorted((before.keys() | now.keys()) - RESULT_NEUTRAL_KEYS)
+        if before.get(key) != now.get(key)
     ]
 
 
@@ -215,10 +228,6 @@ def write_text(path: Path, text: str) -> None:
     os.replace(part, path)
 
 
-def _json(flat: dict[str, Any], key: str) -> str:
-    return json.dumps(flat[key]) if key in flat else "absent"
-
-
 def _record(
     folder: Path, settings: dict[str, Any], command: str, overrides: list[str]
 ) -> dict[str, Any]:
@@ -232,7 +241,7 @@ def _record(
         "git": _git(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "packages": {name: v for name in PACKAGES if (v := _version(name))},
+        "packages": {name: version(name) for name in PACKAGES},
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "earlier_starts": [*earlier["earlier_starts"], earlier["started"]] if earlier else [],
     }
@@ -245,27 +254,19 @@ def run_id(run: Run) -> str:
     return hashlib.sha256(f"{run.folder.resolve()} {first}".encode()).hexdigest()[:16]
 
 
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
-
-
 def _git() -> dict[str, Any] | None:
     """The commit of the code and whether the code has changed since; None outside a repository."""
     try:
-        commit = _git_output("rev-parse", "HEAD")
-        return {"commit": commit, "dirty": bool(_git_output("status", "--porcelain"))}
+        commit, changes = (
+            subprocess.run(
+                ["git", *arguments],
+                cwd=Path(__file__).parent,
+                capture_output=True,
+                text=True,
+                check=True,
+            ).stdout.strip()
+            for arguments in (["rev-parse", "HEAD"], ["status", "--porcelain"])
+        )
     except (OSError, subprocess.CalledProcessError):
         return None
-
-
-def _git_output(*arguments: str) -> str:
-    return subprocess.run(
-        ["git", *arguments],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.strip()
+    return {"commit": commit, "dirty": bool(changes)}

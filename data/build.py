@@ -9,9 +9,9 @@ from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 
+from conf.compose import nearest_key
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
-from conf.keys import nearest
 from conf.schema import BenchmarkConfig, BuildCommand
 from data.parallel import Workers
 from data.partial_build import find_change, lock_partial_build
@@ -132,7 +132,8 @@ def check_names(cfg: BenchmarkConfig) -> None:
     known["retrieval.builders"] = [str(b) for b in future.BUILDERS]
     problems = [
         f"benchmark.{key}.{name}: unknown name, did you mean "
-        f"{nearest(name, known[key]) or known[key][0]}? The options are {', '.join(known[key])}"
+        f"{nearest_key(name, known[key]) or known[key][0]}? "
+        f"The options are {', '.join(known[key])}"
         for key, named in quotas.items()
         for name in named
         if key in known and name not in known[key]

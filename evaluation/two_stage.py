@@ -12,7 +12,7 @@ from conf.entry import Run, command
 from conf.errors import UserError
 from conf.runs import write_text
 from conf.schema import ContrastiveCommand, SftCommand, TwoStageCommand
-from conf.schema.two_stage import ROUTES
+from conf.schema.evaluation import ROUTES
 
 log = logging.getLogger(__name__)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import signal
@@ -22,7 +21,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
 from conf.gpus import visible_gpus
-from conf.multirun.table import JOB_FILE, final_metrics, read_jobs, write_sweep_table
+from conf.multirun.table import JOB_FILE, read_job, read_jobs, write_sweep_table
 from conf.runs import differences, run_name, write_json
 
 log = logging.getLogger(__name__)
@@ -31,13 +30,7 @@ POLL = 0.05
 """Time (s) between two looks at the child processes."""
 GRACE = 10.0
 """Time (s) for a terminated child process to end before it is killed."""
-PARENT_ONLY = (
-    "hydra.mode",
-    "hydra.sweep",
-    "hydra.launcher",
-    "hydra/sweeper",
-    "hydra/launcher",
-)
+PARENT_ONLY = ("hydra.mode", "hydra.sweep", "hydra.launcher", "hydra/sweeper", "hydra/launcher")
 """Hydra overrides that are not passed on to the jobs."""
 
 
@@ -58,9 +51,6 @@ class Job:
 
 class ProcessLauncher(Launcher):
     """Runs one job at a time on each visible GPU, or one job at a time without a GPU."""
-
-    # Hydra only instantiates launchers of this package.
-    __module__ = "hydra_plugins.dynapix"
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
@@ -92,9 +82,14 @@ class ProcessLauncher(Launcher):
         with closing(self.run([job for job in jobs if not self._is_finished(job)])) as ended:
             for job, succeeded in ended:
                 _record_end(job, succeeded)
+        records = [read_job(job.folder) for job in jobs]
         return [
-            JobReturn(job.overrides, status=JobStatus.COMPLETED, _return_value=_metrics(job))
-            for job in jobs
+            JobReturn(
+                record["overrides"],
+                status=JobStatus.COMPLETED,
+                _return_value=record["metrics"] if record["status"] == "done" else None,
+            )
+            for record in records
         ]
 
     def run(self, jobs: list[Job]) -> Iterator[tuple[Job, bool]]:
@@ -175,20 +170,12 @@ def _record_end(job: Job, succeeded: bool) -> None:
     """Record and log how a job ended."""
     _record(job, "done" if succeeded else "failed")
     if succeeded:
-        values = list(final_metrics(_metrics(job) or {}).items())[:3]
+        values = list(read_job(job.folder)["metrics"].items())[:3]
         log.info("%s: done%s", job.title, "".join(f", {name} {v:.4g}" for name, v in values))
         return
     output = job.output.read_text(errors="replace") if job.output.exists() else ""
     lines = "".join(f"\n    {line}" for line in output.splitlines()[-5:])
     log.error("%s: failed, last lines of %s:%s", job.title, job.output, lines)
-
-
-def _metrics(job: Job) -> dict[str, float] | None:
-    """Metrics of a job; None if it failed."""
-    if json.loads((job.folder / JOB_FILE).read_text())["status"] == "failed":
-        return None
-    path = job.folder / "metrics.json"
-    return json.loads(path.read_text()) if path.exists() else {}
 
 
 def _record(job: Job, status: str) -> None:

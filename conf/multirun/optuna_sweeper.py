@@ -11,6 +11,7 @@ import json
 import logging
 import math
 import random
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,7 @@ from omegaconf import DictConfig
 
 from conf.errors import SettingsError, UserError
 from conf.gpus import visible_gpus
-from conf.multirun.table import final_metrics, is_lower_better
+from conf.multirun.table import is_lower_better
 from conf.runs import other_settings_error, setting_differences, write_json
 
 if TYPE_CHECKING:
@@ -37,23 +38,15 @@ METRICS = {"train.sft": "answer_letter_accuracy", "train.contrastive": "mrr"}
 """Default of hydra.sweeper.metric for each command."""
 
 
+@dataclass
 class OptunaSweeper(Sweeper):
-    # Hydra only instantiates sweepers of this package.
-    __module__ = "hydra_plugins.dynapix"
+    """A sweeper whose fields are the keys of conf/hydra/sweeper/optuna.yaml."""
 
-    def __init__(
-        self,
-        metric: str | None,
-        n_trials: int,
-        n_jobs: int | None,
-        seed: int,
-        params: dict[str, str] | None,
-    ) -> None:
-        self.metric = metric
-        self.n_trials = n_trials
-        self.n_jobs = n_jobs
-        self.seed = seed
-        self.params = params or {}
+    metric: str | None
+    n_trials: int
+    n_jobs: int | None
+    seed: int
+    params: dict[str, str] | None
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
@@ -67,22 +60,32 @@ class OptunaSweeper(Sweeper):
 
     def sweep(self, arguments: list[str]) -> None:
         """Run trials until the study has `n_trials`."""
-        overrides = self._overrides(arguments)
+        # Overrides of the command line replace the parameters of a sweep preset.
+        lines = [*(f"{key}={value}" for key, value in (self.params or {}).items()), *arguments]
+        parsed = OverridesParser.create(config_loader=self.loader).parse_overrides(lines)
+        overrides = {override.get_key_element(): override for override in parsed}
         swept = {key: o for key, o in overrides.items() if o.is_sweep_override()}
         self.fixed = [str(o.input_line) for key, o in overrides.items() if key not in swept]
-        self._check(swept)
+        if self.metric is None:
+            raise SettingsError(
+                "this command has no default metric to search by: give "
+                "hydra.sweeper.metric=NAME, with a name in a run's metrics.json",
+                code="missing-metric",
+            )
+        if not swept:
+            raise SettingsError(
+                "the search has no parameters: give a key several values, or an interval such as "
+                "'train.lr=tag(log,interval(1e-5,1e-3))'",
+                code="nothing-to-search",
+            )
         optuna = _import_optuna()
         space = {key: distribution(override) for key, override in swept.items()}
-        study = optuna.create_study(
-            direction="minimize" if is_lower_better(str(self.metric)) else "maximize"
-        )
+        direction = "minimize" if is_lower_better(self.metric) else "maximize"
+        study = optuna.create_study(direction=direction)
         settings = {key: str(o.input_line).partition("=")[2] for key, o in overrides.items()}
         for params in self._recorded_trials(settings):
-            study.add_trial(
-                optuna.trial.create_trial(
-                    state=optuna.trial.TrialState.RUNNING, params=params, distributions=space
-                )
-            )
+            study.enqueue_trial(params)
+            study.ask(space)
         log.info("search by %s: %d jobs", self.metric, self.n_trials)
         self._run_trials(study, first=0)
         batch = max(1, self.n_jobs or len(visible_gpus()))
@@ -96,27 +99,10 @@ class OptunaSweeper(Sweeper):
             self.folder.mkdir(parents=True, exist_ok=True)
             write_json(self.folder / STUDY_FILE, {"settings": settings, "trials": trials})
             self._run_trials(study, first)
-        _log_best(study, str(self.metric))
-
-    def _overrides(self, arguments: list[str]) -> dict[str, Override]:
-        """Parameters of a sweep preset, replaced by overrides of the command line, by key."""
-        lines = [*(f"{key}={value}" for key, value in self.params.items()), *arguments]
-        parsed = OverridesParser.create(config_loader=self.loader).parse_overrides(lines)
-        return {override.get_key_element(): override for override in parsed}
-
-    def _check(self, swept: dict[str, Override]) -> None:
-        if self.metric is None:
-            raise SettingsError(
-                "this command has no default metric to search by: give "
-                "hydra.sweeper.metric=NAME, with a name in a run's metrics.json",
-                code="missing-metric",
-            )
-        if not swept:
-            raise SettingsError(
-                "the search has no parameters: give a key several values, or an interval such as "
-                "'train.lr=tag(log,interval(1e-5,1e-3))'",
-                code="nothing-to-search",
-            )
+        if any(trial.value is not None for trial in study.trials):
+            best = study.best_trial
+            params = " ".join(f"{key.lstrip('+')}={value}" for key, value in best.params.items())
+            log.info("best: #%d %s, %s %.4g", best.number, params, self.metric, best.value)
 
     def _recorded_trials(self, settings: dict[str, str]) -> list[dict[str, Any]]:
         """Settings of the trials of an earlier start. Raises SettingsError for another search."""
@@ -140,7 +126,7 @@ class OptunaSweeper(Sweeper):
         ):
             if job.return_value is None:
                 continue
-            metrics = final_metrics(job.return_value)
+            metrics = job.return_value
             if self.metric not in metrics:
                 raise UserError(
                     f"hydra.sweeper.metric={self.metric} is not a metric of this command; the "
@@ -188,10 +174,3 @@ def _import_optuna() -> Any:
         ) from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna
-
-
-def _log_best(study: Study, metric: str) -> None:
-    if any(trial.value is not None for trial in study.trials):
-        best = study.best_trial
-        params = " ".join(f"{key.lstrip('+')}={value}" for key, value in best.params.items())
-        log.info("best: #%d %s, %s %.4g", best.number, params, metric, best.value)

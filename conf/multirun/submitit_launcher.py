@@ -21,8 +21,6 @@ POLL = 0.5
 class SubmititLauncher(ProcessLauncher):
     """Submits all unfinished jobs to a cluster and waits for them; leaving early cancels them."""
 
-    __module__ = "hydra_plugins.dynapix"
-
     def __init__(self, cluster: str, submitit_folder: str, **parameters: Any) -> None:
         self.cluster = cluster
         self.folder = submitit_folder

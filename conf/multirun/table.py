@@ -17,19 +17,17 @@ LOWER_IS_BETTER = r"loss|_rank$|set_aside|too_short|reject"
 
 
 def read_jobs(folder: Path) -> list[dict[str, Any]]:
-    """The jobs of a sweep that have ended, by number.
-
-    Returns:
-        For each job its number (`job`), `overrides`, `status` (done or failed) and `metrics`.
-    """
-    jobs = []
-    for path in folder.glob(f"[0-9]*/{JOB_FILE}"):
-        job = {"job": int(path.parent.name), "metrics": {}, **json.loads(path.read_text())}
-        metrics = path.with_name("metrics.json")
-        if job["status"] == "done" and metrics.exists():
-            job["metrics"] = final_metrics(json.loads(metrics.read_text()))
-        jobs.append(job)
+    """The jobs of a sweep that have ended, by number."""
+    jobs = [read_job(path.parent) for path in folder.glob(f"[0-9]*/{JOB_FILE}")]
     return sorted(jobs, key=lambda job: job["job"])
+
+
+def read_job(folder: Path) -> dict[str, Any]:
+    """The number (`job`), overrides, status (done or failed) and final metrics of an ended job."""
+    job = json.loads((folder / JOB_FILE).read_text())
+    path = folder / "metrics.json"
+    metrics = json.loads(path.read_text()) if job["status"] == "done" and path.exists() else {}
+    return {"job": int(folder.name), "metrics": final_metrics(metrics), **job}
 
 
 def final_metrics(metrics: dict[str, float]) -> dict[str, float]:

@@ -5,12 +5,7 @@ preset (`conf/<group>/<name>.yaml`) sets the values that differ. `check()` retur
 invalid value or combination of values, with the keys as the user types them.
 """
 
-from conf.schema.benchmark import (
-    BenchmarkConfig,
-    Quota,
-    RetrievalTrackConfig,
-    SelectionConfig,
-)
+from conf.schema.benchmark import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from conf.schema.commands import (
     PARALLEL_BACKENDS,
     BuildCommand,
@@ -20,13 +15,19 @@ from conf.schema.commands import (
     ExportModelCommand,
     GalleryCommand,
     NarrateCommand,
+    ServeCommand,
+    SftCommand,
+    StatisticsCommand,
+)
+from conf.schema.evaluation import (
+    ExportStudyCommand,
+    MatcherConfig,
     ReportCommand,
     RetrieveCommand,
     SelectCommand,
-    ServeCommand,
-    SftCommand,
     SimilarityCommand,
-    StatisticsCommand,
+    StudyCommand,
+    TwoStageCommand,
 )
 from conf.schema.models import (
     ArchitectureConfig,
@@ -35,8 +36,5 @@ from conf.schema.models import (
     RetrieverConfig,
     StudentConfig,
 )
-from conf.schema.servers import ImageServerConfig, ServerConfig, ServersConfig
-from conf.schema.study import ExportStudyCommand, StudyCommand
-from conf.schema.teacher import TeacherConfig
+from conf.schema.servers import ImageServerConfig, ServerConfig, ServersConfig, TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainConfig
-from conf.schema.two_stage import MatcherConfig, TwoStageCommand

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 from omegaconf import MISSING
 
-from conf.schema.checks import check_fraction, check_minimum, check_options, check_share
+from conf.schema.settings import Settings, setting
+
+ENCODERS = ("qwen3_vl", "vlm2vec", "dual", "languagebind")
 
 
 @dataclass
-class ArchitectureConfig:
+class ArchitectureConfig(Settings):
     """Sizes of a Qwen3-VL that is built offline with random weights, a tokenizer and a
     processor."""
 
@@ -42,12 +44,12 @@ class ArchitectureConfig:
 
 
 @dataclass
-class LoraConfig:
-    rank: int = 16
+class LoraConfig(Settings):
+    rank: int = setting(16, least=0)
     """Rank of the adapters; 0 adds no adapters and trains the whole model."""
     alpha: int = 32
     """Scale of the adapters: their output is multiplied by alpha / rank."""
-    dropout: float = 0.0
+    dropout: float = setting(0.0, least=0, below=1)
     """Dropout probability of the adapters' inputs."""
     targets: str = (
         r"(model\.)*language_model\.layers\.\d+\."
@@ -58,10 +60,8 @@ class LoraConfig:
 
 
 @dataclass
-class ModelConfig:
+class ModelConfig(Settings):
     """Settings that students and retrievers share."""
-
-    GROUP: ClassVar[str]
 
     name: str = MISSING
     """Name of the model in reports."""
@@ -74,85 +74,68 @@ class ModelConfig:
     """Allow the model's own Python code to run."""
     architecture: ArchitectureConfig | None = None
     """Sizes of a model to build with random weights; null loads `model`."""
-    quantization: str = "nf4"
+    quantization: str = setting("nf4", ("nf4", "none"))
     """Quantisation of the base's weights: nf4 (4 bits) or none."""
     lora: LoraConfig = field(default_factory=LoraConfig)
-    image_size: int = 336
+    image_size: int = setting(336, least=32)
     """Width and height (px) to which frames are resized before the model's image processor."""
-    frames: int = 12
+    frames: int = setting(12, least=2)
     """Evenly spaced frames per prefix."""
-    max_length: int = 3072
+    max_length: int = setting(3072, least=1)
     """Maximum length of an input with its response (tokens); a longer one raises an error and is
     never truncated."""
 
-    def check(self) -> list[str]:
-        group, lora = self.GROUP, self.lora
-        least = {"image_size": 32, "frames": 2, "max_length": 1}
-        problems = check_minimum(self, f"{group}.", least)
-        problems += check_options(self, f"{group}.", {"quantization": ("nf4", "none")})
-        problems += check_minimum(lora, f"{group}.lora.", {"rank": 0})
-        problems += check_fraction(lora, f"{group}.lora.", ["dropout"])
+    def find_problems(self, group: str) -> Iterator[str]:
+        rank = self.lora.rank
+        quantization = f"{group}quantization={self.quantization}"
         if (self.model is None) == (self.architecture is None):
-            problems.append(
-                f"{group}.model and {group}.architecture: set exactly one, a model to load or the "
+            yield (
+                f"{group}model and {group}architecture: set exactly one, a model to load or the "
                 "sizes of a model to build"
             )
-        if self.quantization == "nf4" and lora.rank == 0:
-            problems.append(
-                f"{group}.quantization=nf4 with {group}.lora.rank=0: 4-bit weights cannot be "
-                f"trained directly; set {group}.quantization=none or raise {group}.lora.rank"
+        if self.quantization == "nf4" and rank == 0:
+            yield (
+                f"{quantization} with {group}lora.rank=0: 4-bit weights cannot be trained "
+                f"directly; set {group}quantization=none or raise {group}lora.rank"
             )
-        if self.architecture is not None and (self.quantization == "nf4" or lora.rank > 0):
-            problems.append(
-                f"{group}.quantization={self.quantization} and {group}.lora.rank={lora.rank} "
-                f"with {group}.architecture: a model with random weights is trained as a whole; "
-                f"set {group}.quantization=none and {group}.lora.rank=0"
+        if self.architecture is not None and (self.quantization == "nf4" or rank > 0):
+            yield (
+                f"{quantization} and {group}lora.rank={rank} with {group}architecture: a model "
+                f"with random weights is trained as a whole; set {group}quantization=none and "
+                f"{group}lora.rank=0"
             )
-        return problems
 
 
 @dataclass
 class StudentConfig(ModelConfig):
-    GROUP: ClassVar[str] = "student"
-
-    max_new_tokens: int = 512
+    max_new_tokens: int = setting(512, least=1)
     """Maximum length of a response (tokens), including its thinking."""
     thinking: bool = False
     """Let the model think before its response; its thinking is not scored."""
-    temperature: float = 0.0
+    temperature: float = setting(0.0, least=0)
     """Sampling temperature of responses; 0 decodes greedily."""
-    top_p: float = 1.0
+    top_p: float = setting(1.0, above=0, most=1)
     """Sample from the most likely tokens whose probabilities sum to this share."""
-    top_k: int = 0
+    top_k: int = setting(0, least=0)
     """Sample from this number of most likely tokens; 0 sets no limit."""
-
-    def check(self) -> list[str]:
-        least = {"max_new_tokens": 1, "temperature": 0, "top_k": 0}
-        problems = super().check() + check_minimum(self, "student.", least)
-        return problems + check_share(self, "student.", ["top_p"])
-
-
-ENCODERS = ("qwen3_vl", "vlm2vec", "dual", "languagebind")
 
 
 @dataclass
-class LateConfig:
+class LateConfig(Settings):
     """Late interaction: one vector per token of a frame, and of a query's clip and question. The
     score sums, over the query's vectors, the highest similarity to any vector of the frame. Train
     with train.scale near 1."""
 
-    width: int = 128
+    width: int = setting(128, least=1)
     """Dimensions of a vector."""
-    pool: int = 1
+    pool: int = setting(1, least=1)
     """Pooling factor: the number of similar vectors of a frame that are averaged into one; 1 keeps
     every vector."""
 
 
 @dataclass
 class RetrieverConfig(ModelConfig):
-    GROUP: ClassVar[str] = "retriever"
-
-    encoder: str = "qwen3_vl"
+    encoder: str = setting("qwen3_vl", ENCODERS)
     """Kind of model. qwen3_vl and vlm2vec embed a prefix and its question jointly; dual (CLIP,
     SigLIP 2) and languagebind embed them separately and add the embeddings. Only qwen3_vl can be
     trained; the others are measured as released."""
@@ -169,36 +152,27 @@ class RetrieverConfig(ModelConfig):
     frame_instruction: str = "Represent the user's input."
     """System prompt of a frame."""
 
-    def check(self) -> list[str]:
-        problems = super().check()
+    def find_problems(self, group: str) -> Iterator[str]:
+        yield from super().find_problems(group)
         descending = sorted(set(self.widths), reverse=True) == list(self.widths)
         if not self.widths or not descending or self.widths[-1] < 1:
-            problems.append(
-                f"retriever.widths={self.widths}: give one or more widths above 0 in strictly "
+            yield (
+                f"{group}widths={self.widths}: give one or more widths above 0 in strictly "
                 "descending order"
             )
-        if self.late is not None:
-            problems += check_minimum(self.late, "retriever.late.", {"width": 1, "pool": 1})
-        return problems + self._encoder_problems()
-
-    def _encoder_problems(self) -> list[str]:
-        if self.encoder not in ENCODERS:
-            return check_options(self, "retriever.", {"encoder": ENCODERS})
-        problems = []
-        if self.encoder != "qwen3_vl" and (
+        encoder = f"{group}encoder={self.encoder}"
+        if self.encoder in ENCODERS[1:] and (
             self.quantization != "none"
             or self.lora.rank
             or self.late is not None
             or self.architecture is not None
         ):
-            problems.append(
-                f"retriever.encoder={self.encoder} is measured as released: set "
-                "retriever.quantization=none and retriever.lora.rank=0, and leave retriever.late "
-                "and retriever.architecture null"
+            yield (
+                f"{encoder} is measured as released: set {group}quantization=none and "
+                f"{group}lora.rank=0, and leave {group}late and {group}architecture null"
             )
         if (self.encoder == "languagebind") != (self.image_model is not None):
-            problems.append(
-                f"retriever.image_model={self.image_model} with retriever.encoder={self.encoder}: "
-                "languagebind needs an image_model, and no other encoder takes one"
+            yield (
+                f"{group}image_model={self.image_model} with {encoder}: languagebind needs an "
+                "image_model, and no other encoder takes one"
             )
-        return problems

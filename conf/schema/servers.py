@@ -1,30 +1,34 @@
-"""Settings of OpenAI-compatible servers and of their clients."""
+"""Settings of the clients of OpenAI-compatible servers: teacher, measured model and images."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from conf.schema.checks import check_minimum, is_url
+from omegaconf import MISSING
+
+from conf.schema.settings import Settings, is_url, setting
 
 
 @dataclass
-class ServersConfig:
+class ServersConfig(Settings):
     """Settings that every group of servers has."""
 
     GROUP: ClassVar[str]
+    """Name of the group in messages of the client."""
 
     url: Any = None
     """Address of an OpenAI-compatible server, such as http://127.0.0.1:8000/v1, or a list of
     servers of the same model; null uses no server."""
     model: str | None = None
     """Name of the model on the server."""
-    concurrency: int = 128
+    concurrency: int = setting(128, least=1)
     """Concurrent requests over all servers; 128 requests saturate one vLLM server."""
-    timeout: float = 120.0
+    timeout: float = setting(120.0, least=1)
     """Timeout of a request (s)."""
-    patience: float = 600.0
+    patience: float = setting(600.0, least=0)
     """Time (s) without any reachable server after which the command gives up."""
 
     @property
@@ -34,15 +38,12 @@ class ServersConfig:
             return []
         return list(self.url) if isinstance(self.url, list) else [self.url]
 
-    def check(self) -> list[str]:
-        group = self.GROUP
-        problems = check_minimum(self, f"{group}.", {"concurrency": 1, "timeout": 1, "patience": 0})
+    def find_problems(self, group: str) -> Iterator[str]:
         if self.url == []:
-            problems.append(f"{group}.url=[] is empty: give an address, or null for no server")
+            yield f"{group}url=[] is empty: give an address, or null for no server"
         for url in self.urls:
             if not isinstance(url, str) or not is_url(url):
-                problems.append(f"{group}.url={url} is not a URL, such as http://127.0.0.1:8000/v1")
-        return problems
+                yield f"{group}url={url} is not a URL, such as http://127.0.0.1:8000/v1"
 
 
 @dataclass
@@ -53,16 +54,15 @@ class ServerConfig(ServersConfig):
 
     model: str | None = None
     """Name of the model or of an adapter on the server; null uses student.model."""
-    concurrency: int = 32
+    concurrency: int = setting(32, least=1)
     """Concurrent requests over all servers; each contains the frames of an item."""
-    timeout: float = 600.0
+    timeout: float = setting(600.0, least=1)
     """Timeout of a request (s); a response with thinking takes minutes."""
 
-    def check(self) -> list[str]:
-        problems = super().check()
+    def find_problems(self, group: str) -> Iterator[str]:
+        yield from super().find_problems(group)
         if self.model is not None and self.url is None:
-            problems.append(f"server.model={self.model} without a server: give server.url=...")
-        return problems
+            yield f"{group}model={self.model} without a server: give {group}url=..."
 
 
 @dataclass
@@ -71,17 +71,62 @@ class ImageServerConfig(ServersConfig):
 
     GROUP: ClassVar[str] = "images"
 
-    concurrency: int = 4
+    concurrency: int = setting(4, least=1)
     """Concurrent requests over all servers."""
-    timeout: float = 600.0
+    timeout: float = setting(600.0, least=1)
     """Timeout of a request (s)."""
     size: str = "480x320"
     """Width x height (px) of a generated image, before it is preprocessed like a frame."""
-    seed: int = 0
+    seed: int = setting(0, least=0)
     """Seed of every image, so that the same text gives the same image."""
 
-    def check(self) -> list[str]:
-        problems = super().check() + check_minimum(self, "images.", {"seed": 0})
+    def find_problems(self, group: str) -> Iterator[str]:
+        yield from super().find_problems(group)
         if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", self.size):
-            problems.append(f"images.size={self.size} is not a size in px, such as 480x320")
-        return problems
+            yield f"{group}size={self.size} is not a size in px, such as 480x320"
+
+
+@dataclass
+class TeacherConfig(ServersConfig):
+    """A model on a server, or the built-in narrator without one."""
+
+    GROUP: ClassVar[str] = "teacher"
+
+    name: str = MISSING
+    """Name of the teacher, recorded with every rationale."""
+    seed: int = setting(0, least=0)
+    """Seed of the built-in narrator's phrasing. A server does not receive it, but is asked again
+    for every rationale when it changes."""
+    min_words: int = 80
+    """Minimum length of a rationale (words)."""
+    max_words: int = 250
+    """Maximum length of a rationale (words)."""
+    attempts: int = setting(4, least=1)
+    """Maximum number of responses requested for an item before it is set aside."""
+    fallback: bool = False
+    """Let the built-in narrator narrate the items that are set aside; its rationales are marked."""
+    samples: int = setting(3, least=1)
+    """Responses per request for an item whose previous response was rejected."""
+    temperature: float = setting(0.7, least=0)
+    """Sampling temperature of the server's responses."""
+    top_p: float = setting(0.8, above=0, most=1)
+    """Sample from the most likely tokens whose probabilities sum to this share."""
+    top_k: int = 20
+    """Sample from this number of most likely tokens."""
+    max_tokens: int = setting(640, least=1)
+    """Maximum length of a response (tokens)."""
+    grammar: bool = False
+    """Constrain the server's decoding to the form of a rationale."""
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        yield from super().find_problems(group)
+        if (self.url is None) != (self.model is None):
+            yield f"{group}url and {group}model: set both (a server) or neither"
+        if not 0 < self.min_words <= self.max_words:
+            yield (
+                f"{group}min_words={self.min_words} and {group}max_words={self.max_words}: "
+                "need 0 < min <= max"
+            )
+        for name in ("grammar", "fallback"):
+            if getattr(self, name) and self.url is None:
+                yield f"{group}{name}=true needs a server: give {group}url=..."

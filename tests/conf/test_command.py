@@ -57,6 +57,7 @@ def test_run_without_results_takes_other_settings(folder):
         (["end=disk"], 1, f"error: some/file: No space left on device; {RESUME}"),
         (["end=interrupt"], 130, "interrupted; run the same command again to resume\n"),
         (["+teacher.sed=1"], 2, "did you mean teacher.seed?  [unknown-key]\n"),
+        (["-m", "--cfg", "job"], 2, "[conflicting-options]\n"),
         (["checkpoints=toy.py"], 1, f"error: toy.py/toy/default: Not a directory; {RESUME}"),
     ],
 )

@@ -21,7 +21,7 @@ from tests.user_errors import raises_user_error
         ("sed=3", "seed"),
         ("benchmark.selection.time.in_1s.trian=3", "benchmark.selection.time.in_1s.train"),
         ("+expp=cot", "+exp"),
-        ("student={lrr: 3}", "student.lora"),
+        ("student={lrr: 3}", "train.lr"),
     ],
 )
 def test_unknown_key_suggests_the_nearest(override, suggested):

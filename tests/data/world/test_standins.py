@@ -153,14 +153,14 @@ def test_standin_frames_have_its_own_view(store: Store) -> None:
     ],
 )
 def test_invalid_standin_settings_are_refused(changes: dict[str, str], key: str) -> None:
-    (problem,) = BenchmarkConfig(name="wrong", **changes).check()
+    (problem,) = BenchmarkConfig(name="wrong", **changes).check("benchmark.")
     assert key in problem
 
 
 def test_standin_has_no_counterfactual_scenes() -> None:
     cfg = kind("physion")
     cfg.retrieval.counterfactual = Quota(train=0, test=4)
-    (problem,) = cfg.check()
+    (problem,) = cfg.check("benchmark.")
     assert "benchmark.retrieval.counterfactual" in problem
 
 

@@ -111,7 +111,7 @@ def test_batch_settings_that_contradict_each_other(contrastive_settings) -> None
         ({"mini_batch": 5}, "train.mini_batch=5"),
         ({"mine_every": 2, "hard_negatives": 0}, "train.mine_every=2"),
     ):
-        (problem,) = replace(train, **change).check()
+        (problem,) = replace(train, **change).check("train.")
         assert name in problem
     (problem,) = replace(contrastive_settings, train=replace(train, hard_negatives=3)).check()
     assert "train.hard_negatives=3" in problem

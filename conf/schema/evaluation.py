@@ -1,0 +1,221 @@
+"""Settings of the commands that evaluate, report and run the human study."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from urllib.parse import urlsplit
+
+from omegaconf import MISSING
+
+from conf.schema.benchmark import BenchmarkConfig
+from conf.schema.commands import CommandConfig
+from conf.schema.models import RetrieverConfig, StudentConfig
+from conf.schema.servers import ImageServerConfig, ServerConfig
+from conf.schema.settings import Settings, check_choices, check_run, is_url, setting
+from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
+
+RESPONSE_MODES = ("reasoning", "answer", "record", "constrained")
+ROUTES = ("cot_text", "predict_caption", "predict_image", "predict_generated_image")
+
+
+@dataclass
+class SelectCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    student: StudentConfig = MISSING
+    server: ServerConfig = field(default_factory=ServerConfig)
+    train: SftTrainConfig = field(default_factory=SftTrainConfig)
+    """The preset's training recipe. A base uses only its precision and its regime's prompt."""
+    model: str | None = None
+    """Run folder of train.sft or folder that train.export wrote, with its own student and recipe;
+    null measures the student's base."""
+    modes: list[str] | None = None
+    """Response modes to measure: reasoning (rationale, then answer), answer (only the answer),
+    record (structured record) and constrained (record, with decoding constrained to its JSON
+    schema). null uses the modes that the student was trained in; for a base, record and
+    constrained."""
+    batch: int = setting(16, least=1)
+    """Items per forward pass."""
+    limit: int | None = setting(None, least=1)
+    """Maximum number of test items, spread evenly over the families; null uses all."""
+    seed: int = setting(0, least=0)
+    """Seed of the items that `limit` samples, of sampled responses and of the bootstrap."""
+    suite: str | None = setting(None, ("matched_anchor", None))
+    """matched_anchor measures the pairs of items that differ only in the question's anchor (event
+    or time); null measures the benchmark's standard items."""
+    control: str | None = setting(None, ("candidate_only", "shuffled_prefix", None))
+    """candidate_only leaves out the prefix, shuffled_prefix shuffles its frames; each control is
+    measured beside the unchanged items. null measures only the unchanged items."""
+
+    def find_problems(self, group: str) -> list[str]:
+        return check_suite(self) + check_choices("modes", self.modes, RESPONSE_MODES)
+
+
+@dataclass
+class EmbeddingCommand(CommandConfig):
+    """Settings of the commands that measure a retriever."""
+
+    benchmark: BenchmarkConfig = MISSING
+    retriever: RetrieverConfig = MISSING
+    train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
+    """The preset's training recipe, of which only the precision is used."""
+    model: str | None = None
+    """Run folder of train.contrastive or folder that train.export wrote, with its own retriever and
+    recipe; null measures the preset's released model."""
+    batch: int = setting(64, least=1)
+    """Queries, prefixes or frames per forward pass."""
+    seed: int = setting(0, least=0)
+    """Seed of every sample, including the bootstrap's."""
+
+
+@dataclass
+class RetrieveCommand(EmbeddingCommand):
+    index: str = setting("exact", ("exact", "faiss"))
+    """exact compares each query with every frame; faiss uses an approximate index (extra `index`)
+    for databases of millions of frames, and reports its recall against exact search."""
+    probes: int = setting(16, least=1)
+    """Lists of the approximate index that a query searches, of about sqrt(number of frames)."""
+
+
+@dataclass
+class SimilarityCommand(EmbeddingCommand):
+    limit: int | None = setting(None, least=1)
+    """Maximum number of test items, spread evenly over the families; null uses all."""
+    suite: str | None = setting(None, ("matched_anchor", None))
+    """matched_anchor measures the pairs of items that differ only in the question's anchor (event
+    or time); null measures the benchmark's standard items."""
+
+    def find_problems(self, group: str) -> list[str]:
+        return check_suite(self)
+
+
+@dataclass
+class ReportCommand(CommandConfig):
+    runs: list[str] | None = None
+    """Run folders below `checkpoints`, or patterns of them, such as [select/cot,retrieve/*]; null
+    reports every finished run."""
+    items: int = setting(120, least=0)
+    """Maximum number of items of a benchmark on the page, spread over the subtypes and over right
+    and wrong answers."""
+    seed: int = setting(0, least=0)
+    """Seed of the sample of these items."""
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        if self.runs is not None and (not self.runs or not all(r.strip("/. ") for r in self.runs)):
+            yield (
+                f"runs={self.runs}: name folders below {self.checkpoints}, such as "
+                "runs=[select/cot,retrieve/*], or leave runs=null for every finished run"
+            )
+
+
+@dataclass
+class MatcherConfig(Settings):
+    """Frozen encoder that matches written texts to the database: the preset of any retriever."""
+
+    retriever: RetrieverConfig = MISSING
+    train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
+    """The preset's training recipe, of which only the precision is used."""
+    model: str | None = None
+    """Run folder of train.contrastive or folder that train.export wrote, with its own retriever and
+    recipe; null uses the preset's released model."""
+    batch: int = setting(64, least=1)
+    """Texts or frames per forward pass."""
+
+
+@dataclass
+class TwoStageCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    student: StudentConfig = MISSING
+    server: ServerConfig = field(default_factory=ServerConfig)
+    train: SftTrainConfig = field(default_factory=SftTrainConfig)
+    """The preset's training recipe, of which a base uses only the precision."""
+    model: str | None = None
+    """Writing model: run folder of train.sft or folder that train.export wrote, with its own
+    student and recipe; null uses the student's base."""
+    matcher: MatcherConfig = field(default_factory=MatcherConfig)
+    images: ImageServerConfig = field(default_factory=ImageServerConfig)
+    routes: list[str] | None = None
+    """Routes to measure: cot_text (the future state in a rationale, matched to frames),
+    predict_caption (a description of the future frame, matched to the same model's descriptions of
+    the database's frames), predict_image (that description, matched to frames) and
+    predict_generated_image (an image that the image server generates from it, matched to frames).
+    null uses cot_text for a student, and the first three for a base."""
+    batch: int = setting(16, least=1)
+    """Queries or frames per forward pass of the writing model."""
+    seed: int = setting(0, least=0)
+    """Seed of sampled texts and of the bootstrap."""
+
+    def find_problems(self, group: str) -> list[str]:
+        routes = self.routes or ()
+        if "predict_drawn" in routes:
+            return ["routes: predict_drawn is now called predict_generated_image"]
+        problems = check_choices("routes", self.routes, ROUTES)
+        generates = "predict_generated_image" in routes
+        if generates and not (self.images.urls and self.images.model):
+            problems.append(
+                "routes: predict_generated_image needs an image server: set "
+                "images.url=http://HOST:PORT/v1 and images.model=NAME"
+            )
+        return problems
+
+
+@dataclass
+class StudyCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    items: str = "60"
+    """Number of test items, sampled evenly from the families; or a file of items, with one item_id
+    or one JSON object with an item_id per line."""
+    annotators: int = setting(3, least=1)
+    """Number of annotators, each with a personal link; each of them answers every item."""
+    practice: int = setting(3, least=0)
+    """Practice items from the training split, which each annotator answers first, with feedback and
+    without a score."""
+    rest_every: int = setting(20, least=1)
+    """Items after which an annotator is offered a break."""
+    seed: int = setting(0, least=0)
+    """Seed of the sample of items and of each annotator's order of items and candidates."""
+    host: str = "127.0.0.1"
+    """Network address at which the server listens; 0.0.0.0 (all addresses) also needs `public`."""
+    port: int = 8765
+    """Port at which the server listens."""
+    public: str | None = None
+    """Address at which annotators reach the study, such as https://study.example.org behind a
+    proxy; null uses host and port."""
+
+    @property
+    def address(self) -> str:
+        """Beginning of the annotators' links."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return (self.public or f"http://{host}:{self.port}").rstrip("/")
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        if not self.items or (self.items.isdecimal() and int(self.items) == 0):
+            yield f"items={self.items} selects no item: give a number or a file"
+        if not 0 < self.port < 65536:
+            yield f"port={self.port} is not a port: give a number from 1 to 65535"
+        example = "such as https://study.example.org"
+        if self.public is None and self.host in ("0.0.0.0", "::"):
+            yield (
+                f"host={self.host} is not an address that annotators can open: give "
+                f"public=ADDRESS, {example}"
+            )
+        if self.public is not None:
+            url = urlsplit(self.public)
+            if not is_url(self.public) or not url.netloc or url.path not in ("", "/"):
+                yield f"public={self.public} is not the URL of a host, {example}"
+
+
+@dataclass
+class ExportStudyCommand(CommandConfig):
+    run: str = "default"
+    """Run of evaluation.study to export: its name or its folder."""
+
+    def find_problems(self, group: str) -> list[str]:
+        return check_run(self.run, f"{self.checkpoints}/study")
+
+
+def check_suite(cfg: SelectCommand | SimilarityCommand) -> list[str]:
+    """A limit that leaves no pair of a suite of pairs."""
+    if cfg.suite == "matched_anchor" and cfg.limit == 1:
+        return ["limit=1 with suite=matched_anchor: a pair has two items; give limit=2 or more"]
+    return []

@@ -1,0 +1,94 @@
+"""Base class of all groups of settings, with the checks that several groups share."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import field, fields
+from typing import Any
+from urllib.parse import urlsplit
+
+from conf.runs import is_run_name, resolve_run_name
+
+BOUNDS = {
+    "least": (operator.ge, "{} or more"),
+    "above": (operator.gt, "above {}"),
+    "most": (operator.le, "at most {}"),
+    "below": (operator.lt, "below {}"),
+}
+"""The comparison and the wording of each bound that `setting` takes."""
+
+
+def setting(default: Any, options: Sequence[str | None] = (), **bounds: float) -> Any:
+    """Return a dataclass field that has only certain values.
+
+    Args:
+        default: The default value.
+        options: All values that the setting may have.
+        bounds: Any of BOUNDS, such as `least=1`. They do not apply to null.
+    """
+    return field(default=default, metadata={"options": options, "bounds": bounds})
+
+
+class Settings:
+    """A group of settings, which is a dataclass with settings and nested groups as its fields."""
+
+    def check(self, group: str = "") -> list[str]:
+        """Return one sentence per invalid setting of this group and of its nested groups.
+
+        Args:
+            group: Prefix of this group's keys as the user types them, such as ``"train."``.
+        """
+        problems = []
+        for entry in fields(self):
+            key, value = f"{group}{entry.name}", getattr(self, entry.name)
+            if isinstance(value, Settings):
+                problems += value.check(f"{key}.")
+            elif isinstance(value, dict):
+                for name, nested in value.items():
+                    problems += nested.check(f"{key}.{name}.")
+            else:
+                problems += check_value(key, value, **entry.metadata)
+        return [*problems, *self.find_problems(group)]
+
+    def find_problems(self, group: str) -> Iterable[str]:
+        """Further problems of this group, such as settings that exclude each other."""
+        return ()
+
+
+def check_value(
+    key: str, value: Any, options: Sequence[str | None] = (), bounds: Mapping[str, float] = {}
+) -> list[str]:
+    """A value that is not one of its options, or is outside its bounds."""
+    if options and value not in options:
+        return [f"{key}={value}: the options are {', '.join(o or 'null' for o in options)}"]
+    if value is None or all(BOUNDS[name][0](value, bound) for name, bound in bounds.items()):
+        return []
+    wanted = " and ".join(BOUNDS[name][1].format(bound) for name, bound in bounds.items())
+    return [f"{key}={value} must be {wanted}"]
+
+
+def is_url(text: str) -> bool:
+    """Whether `text` is a complete http or https address."""
+    try:
+        parts = urlsplit(text)
+        return parts.scheme in ("http", "https") and parts.port != 0 and " " not in text
+    except ValueError:
+        return False
+
+
+def check_choices(name: str, chosen: Sequence[str] | None, options: Sequence[str]) -> list[str]:
+    """A list that is empty, repeats a value or has one that is not an option; null passes."""
+    if chosen is None or (chosen and len(set(chosen)) == len(chosen) and set(chosen) <= {*options}):
+        return []
+    return [f"{name}={chosen}: give one or more of {', '.join(options)}, each once"]
+
+
+def check_run(run: str, folder: str) -> list[str]:
+    """A `run` that is neither the name of a run in `folder` nor a folder inside it."""
+    if is_run_name(resolve_run_name(run, folder)):
+        return []
+    return [
+        f"run={run} is not a run in {folder}: give its name or its folder, and "
+        "checkpoints=FOLDER if the runs are elsewhere"
+    ]
