@@ -10,59 +10,52 @@ import pytest
 from benchmarks.speed import hours
 from tests.user_errors import raises_user_error
 
-FAST = hours.Rate("sft_gpu", "qwen3_vl_8b", "nf4", 10.0, "a card", "2026-01-31")
+FAST = hours.Rate("sft", "qwen3_vl_8b", "nf4", 10.0, "a card", "2026-01-31")
+COT = "train.sft +exp=cot"
 
 
 @pytest.fixture(scope="module")
-def steps() -> dict[str, hours.Step]:
-    return {s.name: s for s in hours.steps("qwen3_vl_8b", "qwen3_vl_emb_8b")}
+def runs() -> dict[str, hours.TrainingRun]:
+    return {run.name: run for run in hours.list_runs("qwen3_vl_8b", "qwen3_vl_emb_8b")}
 
 
-def test_hours_are_passes_over_the_rate() -> None:
-    assert hours.hours(36_000, 10.0) == 1.0
-    assert hours.hours(36_000, 2.5) == 4 * hours.hours(36_000, 10.0)
-
-
-def test_a_run_passes_what_the_paper_trains_on_each_epoch(steps: dict[str, hours.Step]) -> None:
+def test_a_run_trains_on_the_papers_samples_in_each_epoch(runs) -> None:
     items, queries, epochs = 1_151 + 1_619 + 6_598, 18_000, 3
-    assert steps["train.sft +exp=answer_only"].passes == items * epochs
-    assert steps["train.sft +exp=cot"].passes == 2 * items * epochs
-    assert steps["train.contrastive"].passes == queries * epochs
+    assert runs["train.sft +exp=answer_only"].samples == items * epochs
+    assert runs[COT].samples == 2 * items * epochs
+    assert runs["train.contrastive"].samples == queries * epochs
 
 
-def test_a_rate_gives_the_hours_of_the_steps_that_it_measures(
-    steps: dict[str, hours.Step],
-) -> None:
-    shown = hours.table(list(steps.values()), [FAST])
-    cot = next(line for line in shown.splitlines() if line.startswith("train.sft +exp=cot "))
+def test_hours_are_samples_divided_by_the_rate(runs) -> None:
+    table = hours.format_table(list(runs.values()), [FAST])
+    cot = next(line for line in table.splitlines() if line.startswith(f"{COT} "))
     assert f"{2 * 9_368 * 3 / 10 / 3600:.1f}  a card, 2026-01-31" in cot
-    (missing,) = [line for line in shown.splitlines() if "No rate" in line]
+    (missing,) = [line for line in table.splitlines() if "No rate" in line]
     assert "train.contrastive" in missing
-    assert "python -m benchmarks.speed.contrastive_gpu qwen3_vl_8b --base nf4" in missing
+    assert "python -m benchmarks.speed.contrastive qwen3_vl_emb_8b --quantization nf4" in missing
 
 
-def test_without_a_rate_no_figure_is_given(steps: dict[str, hours.Step]) -> None:
-    other = [FAST, hours.Rate("sft_gpu", "qwen3_vl_2b", "nf4", 30.0, "a card", "2026-01-31")]
-    for rates in ([], [r for r in other if r.preset == "qwen3_vl_2b"]):
-        shown = hours.table(list(steps.values()), rates)
-        assert all(line.startswith("No rate is measured for") for line in shown.splitlines())
-        assert "python -m benchmarks.speed.sft_gpu qwen3_vl_8b --base nf4" in shown
+def test_a_missing_rate_gives_no_figure(runs) -> None:
+    other = hours.Rate("sft", "qwen3_vl_2b", "nf4", 30.0, "a card", "2026-01-31")
+    table = hours.format_table(list(runs.values()), [other])
+    assert all(line.startswith("No rate is measured for") for line in table.splitlines())
+    assert "python -m benchmarks.speed.sft qwen3_vl_8b --quantization nf4" in table
 
 
-def test_of_a_card_the_last_rate_counts(tmp_path: Path, steps: dict[str, hours.Step]) -> None:
+def test_the_last_rate_of_a_card_counts(tmp_path: Path, runs) -> None:
     path = tmp_path / "rates.jsonl"
-    assert hours.read(path) == []
+    assert hours.read_rates(path) == []
     for rate, card in ((1.0, "a card"), (4.0, "another card"), (8.0, "a card")):
-        hours.add("sft_gpu", "qwen3_vl_8b", "nf4", rate, card, path)
-    shown = hours.table([steps["train.sft +exp=cot"]], hours.read(path)).splitlines()
-    assert [float(line.split()[3]) for line in shown[1:]] == [8.0, 4.0]
+        hours.add_rate("sft", "qwen3_vl_8b", "nf4", rate, card, path)
+    table = hours.format_table([runs[COT]], hours.read_rates(path)).splitlines()
+    assert [float(line.split()[3]) for line in table[1:]] == [8.0, 4.0]
 
 
 @pytest.mark.parametrize(
     "line", ["{", json.dumps({"rate": 3}), json.dumps(vars(FAST) | {"rate": 0})]
 )
-def test_a_line_that_is_no_rate_is_named(tmp_path: Path, line: str) -> None:
+def test_an_invalid_line_is_named(tmp_path: Path, line: str) -> None:
     path = tmp_path / "rates.jsonl"
     path.write_text(f"{json.dumps(vars(FAST))}\n{line}\n")
     with raises_user_error("damaged-file", contains="rates.jsonl, line 2"):
-        hours.read(path)
+        hours.read_rates(path)

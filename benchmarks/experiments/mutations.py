@@ -1,15 +1,27 @@
-"""Flips facts of predicates, so that a rationale narrated from them states a falsehood."""
+"""How many false words of rationales the validator detects, and how many true ones it contradicts.
+
+    python -m benchmarks.experiments.mutations store/small
+    python -m benchmarks.experiments.mutations tests/teacher/prose.jsonl
+
+The rationales are those of the built-in narrator for the training items of a built benchmark, or
+those of a JSON lines file with the fields item_id, text and predicates. Each rationale is read as
+it is and after one word of each kind was replaced by a false one. Prints the detected share of each
+kind with some of the missed words, and the claims of the unchanged rationales by kind and verdict.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from random import Random
 from typing import Any
 
-from data.records import COLORS, SelectionItem
+from data.records import COLORS, LETTERS
+from data.store import open_store
 from teacher.narrator import write_rationale
 from teacher.predicates import (
     COMPASS,
@@ -22,229 +34,168 @@ from teacher.predicates import (
     Meeting,
     ObjectFacts,
     Predicates,
+    extract_predicates,
 )
+from teacher.validation.claim_extraction import extract_claims
 
 ALL_REGIONS = [region for row in REGIONS for region in row]
-ALL_SPEEDS = ["stationary", *(word for _, word in SPEEDS), VERY_FAST]
-STILL = r"stationary|\brests\b|does not move"
-PAIRED = {"courses": "collision course", "contacts": "ontact|meet", "close": "very close"}
+MOVING = [*(word for _, word in SPEEDS), VERY_FAST]
+MISSES_PRINTED = 6
+
+Mutation = tuple[str, tuple[int, int]]
+"""A text with a false word, and the span of this word."""
 
 
-@dataclass(frozen=True)
-class Mutation:
-    """Flipped predicates, and patterns that match in a sentence that states the flipped fact."""
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("source", type=Path, help="a built benchmark or a file of rationales")
+    parser.add_argument("--limit", type=int, help="maximum number of rationales")
+    args = parser.parse_args()
+    results: dict[str, list[bool]] = defaultdict(list)
+    misses: dict[str, list[str]] = defaultdict(list)
+    claims: Counter[tuple[str, str]] = Counter()
+    for number, (item_id, text, predicates) in enumerate(read_rationales(args.source)):
+        if number == args.limit:
+            break
+        claims.update((claim.kind, claim.verdict) for claim in extract_claims(text, predicates))
+        rng = Random(item_id)
+        for kind in MUTATIONS:
+            options = list(MUTATIONS[kind](text, predicates, rng))
+            if not options:
+                continue
+            false_text, (start, stop) = rng.choice(options)
+            results[kind].append(is_contradicted(false_text, predicates))
+            if not results[kind][-1]:
+                context = false_text[max(0, start - 60) : stop + 60].replace("\n", " ")
+                misses[kind].append(f"{item_id}: {context}")
+    for kind, detected in results.items():
+        share = sum(detected) / len(detected)
+        print(f"{kind:10} {share:7.2%} detected ({sum(detected)} of {len(detected)})")
+        for miss in misses[kind][:MISSES_PRINTED]:
+            print(f"    {miss}")
+    verdicts = ("supported", "contradicted", "unknown")
+    print(f"{'claims':14}" + "".join(f"{verdict:>14}" for verdict in verdicts))
+    for kind in sorted({kind for kind, _ in claims}):
+        print(f"{kind:14}" + "".join(f"{claims[kind, verdict]:14}" for verdict in verdicts))
 
-    predicates: Predicates
-    patterns: tuple[str, ...]
 
-    def is_stated(self, text: str) -> bool:
-        """Whether a sentence of the rationale states the flipped fact."""
-        sentences = re.split(r"(?<=\.)\s", text)
-        return any(all(re.search(p, s) for p in self.patterns) for s in sentences)
+def read_rationales(source: Path) -> Iterator[tuple[str, str, Predicates]]:
+    """The item id, text and predicates of each rationale."""
+    if source.is_file():
+        for line in source.read_text().splitlines():
+            record = json.loads(line)
+            yield record["item_id"], record["text"], parse_predicates(record["predicates"])
+        return
+    store = open_store(source)
+    for item in store.selection("train"):
+        predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
+        if predicates is not None:
+            yield item.item_id, write_rationale(predicates, item, 0), predicates
 
 
-def predicates_from(record: dict[str, Any]) -> Predicates:
+def is_contradicted(text: str, predicates: Predicates) -> bool:
+    return any(claim.verdict == "contradicted" for claim in extract_claims(text, predicates))
+
+
+def parse_predicates(record: dict[str, Any]) -> Predicates:
     """Rebuild predicates from the JSON form of their `to_dict`."""
-
-    def pairs(name: str, make: Callable[..., Any]) -> tuple[Any, ...]:
-        return tuple(make(**{**m, "objects": tuple(m["objects"])}) for m in record[name])
-
-    candidates = tuple(
+    kinds = {"objects": ObjectFacts, "courses": Meeting, "contacts": Meeting, "close": Closeness}
+    parsed = {name: tuple(value) for name, value in record.items() if isinstance(value, list)}
+    for name, kind in kinds.items():
+        rows = (
+            {k: tuple(v) if isinstance(v, list) else v for k, v in r.items()} for r in record[name]
+        )
+        parsed[name] = tuple(kind(**row) for row in rows)
+    parsed["candidates"] = tuple(
         CandidateFacts(**{**c, "differences": tuple(Difference(**d) for d in c["differences"])})
         for c in record["candidates"]
     )
-    return Predicates(
-        record["instant"],
-        record["moment"],
-        tuple(ObjectFacts(**o) for o in record["objects"]),
-        tuple(record["entering"]),
-        tuple(record["leaving"]),
-        pairs("courses", Meeting),
-        pairs("contacts", Meeting),
-        pairs("close", Closeness),
-        candidates,
-    )
+    return Predicates(**{**record, **parsed})
 
 
-def mutations(predicates: Predicates, kind: str, rng: Random) -> list[Mutation]:
-    """All flips of one kind, each to a random false value."""
-    return KINDS[kind](predicates, rng)
+def replace_words(
+    text: str, words: Sequence[str], rng: Random, predicates: Predicates | None = None
+) -> Iterator[Mutation]:
+    """Replace each of `words` by another one of them.
+
+    With `predicates`, words after an object of unknown motion stay: no word for it is false.
+    """
+    pattern = "|".join(sorted(words, key=len, reverse=True))
+    for match in re.finditer(rf"\b(?:{pattern})\b(?!-)", text):
+        if predicates is None or is_motion_known(text, match.start(), predicates):
+            yield replace_match(text, match, rng.choice([w for w in words if w != match[0]]))
 
 
-def falsehoods(
-    predicates: Predicates, item: SelectionItem, kind: str, rng: Random, seed: int = 0
-) -> Iterator[tuple[str, Mutation]]:
-    """Rationales that the built-in narrator writes from flipped facts and that state them."""
-    text = write_rationale(predicates, item, seed)
-    options = mutations(predicates, kind, rng)
-    rng.shuffle(options)
-    for mutation in options:
-        false = write_rationale(mutation.predicates, item, seed)
-        if false != text and mutation.is_stated(false):
-            yield false, mutation
+def replace_match(text: str, match: re.Match[str], word: str) -> Mutation:
+    start = match.start()
+    return text[:start] + word + text[match.end() :], (start, start + len(word))
 
 
-def _other(rng: Random, words: list[str] | tuple[str, ...], *but: str | None) -> str:
-    return rng.choice([w for w in words if w not in but])
+def is_motion_known(text: str, position: int, predicates: Predicates) -> bool:
+    """Whether the predicates know the motion of the last object named before `position`."""
+    before = text[text.rfind(".", 0, position) + 1 : position].lower()
+    last = max(predicates.objects, key=lambda facts: before.rfind(facts.object))
+    return last.object not in before or last.speed is not None
 
 
-def _with_object(p: Predicates, i: int, **changes: Any) -> Predicates:
-    return replace(
-        p, objects=(*p.objects[:i], replace(p.objects[i], **changes), *p.objects[i + 1 :])
-    )
+def replace_colors(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+    """Replace the colour of an object so that the name fits no object of the scene."""
+    known = str(predicates.to_dict())
+    for match in re.finditer(rf"\b({'|'.join(COLORS)})( (?:metal|rubber) \w+)", text):
+        free = [color for color in COLORS if f"{color}{match[2]}" not in known]
+        if free and not match[2].endswith("s"):
+            yield replace_match(text, match, rng.choice(free) + match[2])
 
 
-def _with_difference(p: Predicates, c: int, d: int, **changes: Any) -> Predicates:
-    facts = p.candidates[c]
-    flips = list(facts.differences)
-    flips[d] = replace(flips[d], **changes)
-    candidates = list(p.candidates)
-    candidates[c] = replace(facts, differences=tuple(flips))
-    return replace(p, candidates=tuple(candidates))
-
-
-def _differences(p: Predicates) -> list[tuple[int, int, str, Difference]]:
-    return [
-        (c, d, facts.letter, difference)
-        for c, facts in enumerate(p.candidates)
-        for d, difference in enumerate(facts.differences)
-    ]
-
-
-def directions(p: Predicates, rng: Random) -> list[Mutation]:
-    flips = []
-    for i, o in enumerate(p.objects):
-        for field in ("heading", "travel"):
-            if getattr(o, field):
-                direction = _other(rng, COMPASS, o.heading, o.travel)
-                patterns = (f"{o.object}", rf"toward the {direction}\b")
-                flips.append(Mutation(_with_object(p, i, **{field: direction}), patterns))
-    for c, d, letter, difference in _differences(p):
-        if difference.heading:
-            direction = _other(rng, COMPASS, difference.heading)
-            patterns = (f"andidate {letter}", rf"{difference.object} [^.]*toward the {direction}\b")
-            flips.append(Mutation(_with_difference(p, c, d, heading=direction), patterns))
-    return flips
-
-
-def speeds(p: Predicates, rng: Random) -> list[Mutation]:
-    flips = []
-    for i, o in enumerate(p.objects):
-        if o.speed is None:
-            continue
-        speed = _other(rng, ALL_SPEEDS, o.speed)
-        word = STILL if speed == "stationary" else rf"[mM]ov(?:ing|es) {speed}\b"
-        flips.append(Mutation(_with_object(p, i, speed=speed), (o.object, word)))
-    return flips
-
-
-def regions(p: Predicates, rng: Random) -> list[Mutation]:
-    flips = []
-    for i, o in enumerate(p.objects):
-        for field in ("region", "target_region"):
-            if getattr(o, field) in ALL_REGIONS:
-                region = _other(rng, ALL_REGIONS, o.region, o.target_region)
-                patterns = (f"{o.object}", rf"{region}(?![-\w])")
-                flips.append(Mutation(_with_object(p, i, **{field: region}), patterns))
-    for c, d, letter, difference in _differences(p):
-        if difference.region:
-            places = {o.object: o.target_region for o in p.objects}
-            region = _other(rng, ALL_REGIONS, difference.region, places[difference.object])
-            patterns = (f"andidate {letter}", rf"{difference.object} {region}(?![-\w])")
-            flips.append(Mutation(_with_difference(p, c, d, region=region), patterns))
-    for k, close in enumerate(p.close):
-        region = _other(rng, ALL_REGIONS, close.region)
-        flipped = (*p.close[:k], replace(close, region=region), *p.close[k + 1 :])
-        flips.append(Mutation(replace(p, close=flipped), (f"very close {region}(?![-\\w])",)))
-    return flips
-
-
-def pairs(p: Predicates, rng: Random) -> list[Mutation]:
-    """Replace the partner of a pair by an object for which the fact is false."""
-    names = [o.object for o in p.objects]
-    met = {frozenset(m.objects) for m in (*p.courses, *p.contacts)}
-    near = {frozenset(c.objects) for c in p.close}
-    flips = []
-    for field, known in (("courses", met), ("contacts", met), ("close", near)):
-        facts = getattr(p, field)
-        for k, fact in enumerate(facts):
-            kept = fact.objects[0]
-            free = [n for n in names if n != kept and frozenset((kept, n)) not in known]
+def replace_partners(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+    """Replace the partner in each clause of the motion analysis that states exactly one pair."""
+    names = [facts.object for facts in predicates.objects]
+    met = {frozenset(m.objects) for m in (*predicates.courses, *predicates.contacts)}
+    start, stop = text.find("Motion analysis:"), text.find("Prediction:")
+    for clause in re.finditer(r"[^.;]+[.;]", text[start:stop]):
+        begin, end = start + clause.start(), start + clause.end()
+        inside = list(re.compile("|".join(names)).finditer(text, begin, end))
+        pair = frozenset(match[0] for match in inside)
+        denied = re.search(r"\b(?:not?|never|without|avoid|misse?s?|clear)\b", clause[0])
+        stated = re.search(r"contact|colli|meet|hit|strik|struck|touch|run|course|path", clause[0])
+        if len(inside) == 2 and pair in met and stated and not denied:
+            kept = inside[0][0]
+            free = [n for n in names if n not in pair and frozenset((kept, n)) not in met]
             if free:
-                partner = rng.choice(free)
-                new = replace(fact, objects=(kept, partner))
-                flipped = replace(p, **{field: (*facts[:k], new, *facts[k + 1 :])})
-                flips.append(Mutation(flipped, (kept, partner, PAIRED[field])))
-    if p.courses:
-        flips.append(Mutation(replace(p, courses=()), ("No pair",)))
-    return flips
+                yield replace_match(text, inside[1], rng.choice(free))
 
 
-def colors(p: Predicates, rng: Random) -> list[Mutation]:
-    flips = []
-    text = json.dumps(p.to_dict())
-    names = {o.object for o in p.objects}
-    for o in p.objects:
-        color, _, looks = o.object.partition(" ")
-        free = [c for c in COLORS if f"{c} {looks}" not in text]
-        if color in COLORS and free and len(names) == len(p.objects):
-            name = f"{rng.choice(free)} {looks}"
-            flipped = predicates_from(json.loads(text.replace(f'"{o.object}"', f'"{name}"')))
-            flips.append(Mutation(flipped, (name,)))
-    return flips
+def replace_answer(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+    for match in re.finditer(r"(?<=^Answer: )[A-D]", text, re.MULTILINE):
+        yield replace_match(text, match, rng.choice([c for c in LETTERS if c != match[0]]))
 
 
-def answers(p: Predicates, rng: Random) -> list[Mutation]:
-    """Swap the facts of the right candidate with those of another one."""
-    letters = [c.letter for c in p.candidates]
-    right = letters.index(p.answer)
-    other = rng.choice([i for i in range(len(letters)) if i != right])
-    return [Mutation(_swapped(p, right, other), (f"andidate {letters[other]}",))]
+def swap_candidates(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+    """Exchange the letters of the right candidate and of another one before the answer.
+
+    Letters without the word "candidate", which occur in free prose, stay.
+    """
+    right = predicates.answer
+    other = rng.choice([letter for letter in LETTERS if letter != right])
+    start, stop = text.find("Candidate analysis:"), text.find("Answer:")
+    swapped = {right: other, other: right}
+    body = re.sub(r"(?<=andidate )[A-D]\b", lambda m: swapped.get(m[0], m[0]), text[start:stop])
+    if body != text[start:stop]:
+        yield text[:start] + body + text[stop:], (start, stop)
 
 
-def candidates(p: Predicates, rng: Random) -> list[Mutation]:
-    """Swap the facts of two wrong candidates."""
-    wrong = [i for i, c in enumerate(p.candidates) if not c.agrees]
-    i, j = rng.sample(wrong, 2)
-    first, second = p.candidates[i], p.candidates[j]
-    if first.other_objects == second.other_objects and (
-        first.differences[0] in second.differences and second.differences[0] in first.differences
-    ):
-        # The statement about each is true of both.
-        return []
-    return [Mutation(_swapped(p, i, j), (f"andidate {p.candidates[i].letter}",))]
-
-
-def _swapped(p: Predicates, i: int, j: int) -> Predicates:
-    flips = list(p.candidates)
-    flips[i], flips[j] = (
-        replace(flips[j], letter=flips[i].letter),
-        replace(flips[i], letter=flips[j].letter),
-    )
-    return replace(p, candidates=tuple(flips))
-
-
-def times(p: Predicates, rng: Random) -> list[Mutation]:
-    """Change when a pair meets: another time, or never."""
-    flips = []
-    for k, course in enumerate(p.courses):
-        if course.when == "unseen":
-            continue
-        when = rng.choice([w for w in ("imminent", "soon", "later", None) if w != course.when])
-        flipped = (*p.courses[:k], replace(course, when=when), *p.courses[k + 1 :])
-        patterns = "without contact|not meet" if when is None else f"about to|{when}"
-        flips.append(Mutation(replace(p, courses=flipped), (*course.objects, patterns)))
-    return flips
-
-
-KINDS: dict[str, Callable[[Predicates, Random], list[Mutation]]] = {
-    "direction": directions,
-    "speed": speeds,
-    "region": regions,
-    "pair": pairs,
-    "color": colors,
-    "answer": answers,
-    "imminence": times,
-    "candidate": candidates,
+MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutation]]] = {
+    "direction": lambda text, p, rng: replace_words(text, COMPASS, rng, p),
+    "region": lambda text, p, rng: replace_words(text, ALL_REGIONS, rng),
+    "speed": lambda text, p, rng: replace_words(text, MOVING, rng, p),
+    "time": lambda text, p, rng: replace_words(text, ("imminent", "soon", "later"), rng),
+    "color": replace_colors,
+    "pair": replace_partners,
+    "answer": replace_answer,
+    "candidate": swap_candidates,
 }
-"""The generators of flips, by kind of fact."""
+"""The generator of false texts of each kind of word."""
+
+
+if __name__ == "__main__":
+    main()

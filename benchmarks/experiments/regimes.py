@@ -5,23 +5,20 @@ without each of its parts, three seeds each, on more than a thousand test items.
     python -m benchmarks.experiments.regimes --table    # print the recorded results
 
 Every chosen letter is recorded in `letters.parquet`, one row per test item, run and mode, under the
-hash of the base's weights. A run that is recorded is not trained again. Accuracies are means over
-the seeds; intervals are 95% percentile intervals of a bootstrap that resamples scenes and seeds.
+hash of the base's weights. Accuracies are means over the seeds; intervals are 95% percentile
+intervals of a bootstrap that resamples scenes and seeds.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from threading import Lock
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from benchmarks.experiments.jobs import run, run_all
+from benchmarks.experiments.experiment import Experiment, Job, create_parser
 from conf.compose import compose
 from conf.schema import SelectCommand, SftCommand
 from data.records import FAMILIES
@@ -47,105 +44,54 @@ PAIRS = (
 )
 """The differences in the second table: first minus second."""
 DRAWS = 4000
-WRITING = Lock()
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
-    parser.add_argument("--benchmark", default="comparison")
+    parser = create_parser(__doc__, "comparison", LETTERS)
     parser.add_argument("--student", default="tiny")
-    parser.add_argument("--store", default="store")
-    parser.add_argument("--checkpoints", default="checkpoints")
-    parser.add_argument("--letters", type=Path, default=LETTERS, help="table of recorded answers")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time; they share the cores")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--table", action="store_true", help="only print the recorded results")
     args = parser.parse_args()
     preset = compose("train.sft", SftCommand, [f"student={args.student}"]).student
-    experiment = Experiment(
-        args.benchmark, args.student, args.store, Path(args.checkpoints), args.letters,
-        base=weights_digest(preset.model),
-    )  # fmt: skip
-    if not args.table:
-        run(["data.build", f"benchmark={args.benchmark}", f"store={args.store}"])
-        # Seed by seed: a comparison over fewer seeds is complete early.
-        trained = [regime for regime in MODES if regime != "zero-shot"]
-        jobs = [("zero-shot", 0), *((r, seed) for seed in range(args.seeds) for r in trained)]
-        run_all(partial(train_and_evaluate, experiment), experiment.missing(jobs), args.jobs)
-    print_tables(experiment.recorded(args.seeds))
+    base = weights_digest(preset.model)
+    identity = {"base": base, "benchmark": args.benchmark}
+    experiment = Experiment(args, identity, "regime", "train.sft", "evaluation.select")
+
+    def evaluate(job: Job, threads: int) -> list[dict[str, Any]]:
+        regime, seed = job
+        student = f"student={args.student}"
+        training = [f"+exp={regime}", f"seed={seed}", student]
+        # By default a base is prompted for the structured record, unknown to the tiny base.
+        zero_shot = regime == "zero-shot"
+        folder = experiment.train_and_evaluate(
+            f"{args.benchmark}-{base[:8]}-{regime}-{seed}",
+            None if zero_shot else training,
+            [student, "batch=64", *(["modes=[reasoning,answer]"] if zero_shot else [])],
+            threads,
+        )
+        return read_letters(folder, Path(args.store), args.benchmark, regime)
+
+    # Seed by seed: a comparison over fewer seeds is complete early.
+    trained = [regime for regime in MODES if regime != "zero-shot"]
+    jobs = [("zero-shot", 0), *((r, seed) for seed in range(args.seeds) for r in trained)]
+    print_tables(experiment.run(jobs, evaluate))
 
 
-@dataclass(frozen=True)
-class Experiment:
-    """The compared runs and the table that records their answers."""
-
-    benchmark: str
-    student: str
-    store: str
-    checkpoints: Path
-    letters: Path
-    base: str
-
-    def name(self, regime: str, seed: int) -> str:
-        return f"{self.benchmark}-{self.base[:8]}-{regime}-{seed}"
-
-    def missing(self, jobs: list[tuple[str, int]]) -> list[tuple[str, int]]:
-        """The jobs whose answers are not recorded."""
-        table = self.recorded()
-        done = set(zip(table.regime, table.seed, strict=True))
-        return [job for job in jobs if job not in done]
-
-    def recorded(self, seeds: int | None = None) -> pd.DataFrame:
-        """The recorded answers of this benchmark and base, of the first `seeds` seeds."""
-        table = pd.read_parquet(self.letters)
-        table = table[(table.base == self.base) & (table.benchmark == self.benchmark)]
-        return table if seeds is None else table[table.seed < seeds]
-
-
-def train_and_evaluate(experiment: Experiment, job: tuple[str, int], threads: int) -> None:
-    """Train and evaluate one student, and record its letters."""
-    regime, seed = job
-    name = experiment.name(regime, seed)
-    shared = [
-        f"student={experiment.student}", f"benchmark={experiment.benchmark}",
-        f"store={experiment.store}", f"checkpoints={experiment.checkpoints}", f"run={name}",
-    ]  # fmt: skip
-    # By default a base is prompted for the structured record, which the tiny base never learned.
-    model = ["modes=[reasoning,answer]"]
-    if regime != "zero-shot":
-        run(["train.sft", f"+exp={regime}", f"seed={seed}", *shared], threads)
-        model = [f"model={experiment.checkpoints / 'sft' / name}"]
-    evaluated = experiment.checkpoints / "select" / name
-    if not (evaluated / "metrics.json").exists():
-        run(["evaluation.select", *model, "batch=64", *shared], threads)
-    record_letters(experiment, regime, seed, evaluated / "answers.jsonl")
-
-
-def record_letters(experiment: Experiment, regime: str, seed: int, answers: Path) -> None:
-    """Append one run's letters to the table."""
-    benchmark = compose("evaluation.select", SelectCommand, [f"benchmark={experiment.benchmark}"])
-    items = open_store(Path(experiment.store) / benchmark.benchmark.name).selection("test")
-    lines = [json.loads(line) for line in answers.read_text().splitlines()]
+def read_letters(folder: Path, store: Path, benchmark: str, regime: str) -> list[dict[str, Any]]:
+    """The letter of each test item in each mode of a run."""
+    cfg = compose("evaluation.select", SelectCommand, [f"benchmark={benchmark}"]).benchmark
+    lines = [json.loads(line) for line in (folder / "answers.jsonl").read_text().splitlines()]
     letters = {(r["item_id"], r["mode"]): r["letter"] for r in lines if "item_id" in r}
-    rows = [
+    return [
         {
-            "base": experiment.base, "benchmark": experiment.benchmark, "regime": regime,
-            "seed": seed, "mode": mode, "item_id": item.item_id, "family": item.family,
-            "scene_id": item.scene_id, "answer": item.letter,
-            "letter": letters[item.item_id, mode],
+            "mode": mode, "item_id": item.item_id, "family": item.family,
+            "scene_id": item.scene_id, "answer": item.letter, "letter": letters[item.item_id, mode],
         }
-        for item in items
+        for item in open_store(store / cfg.name).selection("test")
         for mode in MODES[regime]
     ]  # fmt: skip
-    with WRITING:
-        table = pd.concat([pd.read_parquet(experiment.letters), pd.DataFrame(rows)])
-        table.to_parquet(experiment.letters, index=False, compression="zstd")
 
 
 def print_tables(table: pd.DataFrame) -> None:
     """Print accuracies by regime and mode, then differences between them, in percent."""
-    if table.empty:
-        raise SystemExit("error: no answers are recorded for this base: run without --table")
     groups = [(regime, mode) for regime in MODES for mode in MODES[regime]]
     correct = {g: credit_matrix(table, *g) for g in groups}
     correct = {group: credits for group, credits in correct.items() if credits.shape[1]}

@@ -4,8 +4,8 @@
 
 For each number of scenes, the dynapix preset is built with proportional quotas in three stages:
 scenes with their oracle, items and queries, databases. Prints the seconds of each stage, scenes per
-second and worker, and the peak memory of all processes together. An interrupted build resumes below
-FOLDER (store/growth), so only an uninterrupted run is a measurement.
+second and worker, and the peak memory of all processes together. An interrupted build resumes in
+FOLDER (store/growth), so only an uninterrupted build is measured correctly.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from data.world.scenes import make_scenes
 PAPER_SCENES = 10_000
 
 
-def preset(scenes: int) -> BenchmarkConfig:
+def scale_preset(scenes: int) -> BenchmarkConfig:
     """The dynapix preset for another number of scenes, with proportional quotas and databases."""
     cfg = compose("data.build", BuildCommand, ["benchmark=dynapix"]).benchmark
     cfg.name, cfg.scenes, share = f"growth-{scenes}", scenes, scenes / PAPER_SCENES
@@ -52,23 +52,23 @@ def preset(scenes: int) -> BenchmarkConfig:
     return cfg
 
 
-class Peak:
+class MemoryMonitor:
     """Samples the memory (GiB) of this process and its children and keeps the maximum."""
 
     def __init__(self) -> None:
-        self.gib = 0.0
+        self.peak_gib = 0.0
         threading.Thread(target=self._watch, daemon=True).start()
 
     def _watch(self) -> None:
         own = psutil.Process()
         while True:
-            held = 0
+            total = 0
             for process in (own, *own.children(recursive=True)):
                 try:
-                    held += process.memory_info().rss
+                    total += process.memory_info().rss
                 except psutil.NoSuchProcess:
                     continue
-            self.gib = max(self.gib, held / 2**30)
+            self.peak_gib = max(self.peak_gib, total / 2**30)
             time.sleep(0.5)
 
 
@@ -80,24 +80,24 @@ def timed(times: dict[str, float], stage: str) -> Iterator[None]:
 
 
 def measure(scenes: int, folder: Path, workers: int) -> str:
-    cfg, pool, peak = preset(scenes), Workers(workers), Peak()
+    cfg, pool, memory = scale_preset(scenes), Workers(workers), MemoryMonitor()
     times: dict[str, float] = {}
-    with lock_partial_build(cfg, folder / cfg.name) as growing:
+    with lock_partial_build(cfg, folder / cfg.name) as partial:
         with timed(times, "scenes"):
-            scene_ids, _ = make_scenes(cfg, growing, pool, strict=True)
+            scene_ids, _ = make_scenes(cfg, partial, pool, strict=True)
         with timed(times, "items"):
-            items, queries, dropped = make_items_and_queries(cfg, growing, scene_ids, pool)
+            items, queries, dropped = make_items_and_queries(cfg, partial, scene_ids, pool)
         with timed(times, "databases"):
-            scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(growing, name)))
+            scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(partial, name)))
             queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
-    found = count_records(scene_ids, items, queries, databases) | dropped | left_out
-    short = find_shortfalls(cfg, items, queries, databases)
-    print("\n".join(f"  {name:<40}{many:>8,}" for name, many in found.items()))
-    print("\n".join(f"  short: {cell} has {has}" for cell, has in short.items()))
-    absent = len(list(growing.glob("scenes/*-without-*.npz")))
-    rate = (scenes + absent) / times["scenes"] / workers
+    counts = count_records(scene_ids, items, queries, databases) | dropped | left_out
+    shortfalls = find_shortfalls(cfg, items, queries, databases)
+    print("\n".join(f"  {name:<40}{count:>8,}" for name, count in counts.items()))
+    print("\n".join(f"  below its quota: {cell} has {count}" for cell, count in shortfalls.items()))
+    counterfactual = len(list(partial.glob("scenes/*-without-*.npz")))
+    rate = (scenes + counterfactual) / times["scenes"] / workers
     row = "".join(f"{times[stage]:>11.1f}" for stage in ("scenes", "items", "databases"))
-    return f"{scenes:>8,}{absent:>9,}{row}{rate:>14.1f}{peak.gib:>10.1f}"
+    return f"{scenes:>8,}{counterfactual:>16,}{row}{rate:>14.1f}{memory.peak_gib:>10.1f}"
 
 
 def main() -> None:
@@ -108,8 +108,10 @@ def main() -> None:
     options = parser.parse_args()
     logging.basicConfig(level=logging.WARNING)
     rows = [measure(scenes, options.folder, options.workers) for scenes in options.scenes]
-    print(f"\n{options.workers} workers; seconds a stage; scenes counted with those that lack one")
-    head = f"{'scenes':>8}{'absent':>9}{'scenes':>11}{'items':>11}{'databases':>11}"
+    print(
+        f"\n{options.workers} workers; seconds per stage; rate of scenes with counterfactual ones"
+    )
+    head = f"{'scenes':>8}{'counterfactual':>16}{'scenes':>11}{'items':>11}{'databases':>11}"
     print(head + f"{'scenes/s/core':>14}{'peak GiB':>10}")
     print("\n".join(rows))
 

@@ -1,153 +1,221 @@
-"""The retriever's trainer beside plain sentence-transformers, on the same batches of real queries.
+"""The speed and memory of the retriever trainer, compared with plain sentence-transformers.
 
-    python -m benchmarks.speed.contrastive speed
-    python -m benchmarks.speed.contrastive growth
+    python -m benchmarks.speed.contrastive                      # a tiny retriever, on any machine
+    python -m benchmarks.speed.contrastive --batch 32 128 512   # by the number of queries a step
+    python -m benchmarks.speed.contrastive qwen3_vl_emb_8b      # a released size, on a GPU
 
-`speed` trains some steps in every variant, each in its own process, in turns. It prints
-medians over the rounds of queries a second and of the process's peak memory, and of each round's
-ratio to the plain library. The plain library gets rows that name queries too, so that it reads
-pixels batch by batch, its own collator, its loss's mini-batches by tokens, and, in one variant,
-this project's attention and memory settings.
+Every variant trains on the same batches of the queries of `benchmark=small`, in its own process;
+variants take turns. Printed are medians over the rounds and the ratios to the plain library. The
+rate of our trainer with the preset's settings on a GPU is recorded for benchmarks.speed.hours.
+The tiny retriever has adapters over the tiny base in 4 bits; a released size has random weights, so
+nothing is downloaded.
 
-`growth` trains on batches of 32, 128 and 512 queries: peak memory and queries a second.
+The plain library has its own collator and losses, and reads pixels batch by batch, as ours does.
+Its variants have mini-batches by tokens, or this project's attention and memory settings.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
-import subprocess
-import sys
 import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
+import torch
+from sentence_transformers import SentenceTransformerTrainer, SentenceTransformerTrainingArguments
+from sentence_transformers.sentence_transformer.data_collator import SentenceTransformerDataCollator
+from sentence_transformers.sentence_transformer.losses import (
+    CachedMultipleNegativesRankingLoss,
+    MatryoshkaLoss,
+)
+from transformers import Trainer, set_seed
 
+from benchmarks.speed import comparison, hours
+from benchmarks.speed.comparison import SEED, Measurements, timing_arguments
 from conf.compose import compose
 from conf.schema import ContrastiveCommand
+from data.build import ensure_benchmark
+from data.records import RetrievalQuery
+from data.render.frame_cache import FrameReader
+from models import compat
+from models.lora_kernels import fuse
+from models.precision import resolve_precision
+from models.retriever import embedder
+from train.retriever.batches import QueryBatchSampler, batch_columns
+from train.retriever.run import build_loss
+from train.retriever.trainer import NUMBER, IndexCollator, RetrieverTrainer, numbered_rows
 
-OVERRIDES = [
-    "retriever=tiny",
-    "retriever.architecture=null",
-    "retriever.model=checkpoints/bases/tiny",
-    "retriever.quantization=nf4",
-    "retriever.lora.rank=16",
-    "retriever.image_size=128",
-    "retriever.max_length=2048",
-    "retriever.widths=[192,128,64,32]",
-    "train.hard_negatives=1",
-    "train.mini_batch=16",
-]
-PLAIN = "plain sentence-transformers"
-VARIANTS: dict[str, dict[str, Any]] = {
-    PLAIN: {"plain": True},
-    "plain, by tokens": {"plain": True, "plain_tokens": 3072},
-    "plain, helped": {"plain": True, "helped": True},
-    "ours": {},
-    "  with inputs loaded ahead": {"workers": 2},
-    "ours, with reused features": {"reuse_features": True},
+TINY = [
+    "retriever=tiny", "retriever.architecture=null", "retriever.model=checkpoints/bases/tiny",
+    "retriever.lora.rank=16", "retriever.image_size=128", "retriever.max_length=2048",
+    "retriever.widths=[192,128,64,32]", "train.mini_batch=16",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A trainer and the settings of `train` in which it differs from the preset."""
+
+    overrides: tuple[str, ...] = ()
+    plain: bool = False
+    tokens: int | None = None
+    """Tokens in a mini-batch of the plain library, instead of `train.mini_batch`."""
+    helped: bool = False
+    """Give the plain library this project's attention and memory settings."""
+
+
+PLAIN, OURS = "plain sentence-transformers", "ours"
+VARIANTS = {
+    PLAIN: Variant(plain=True),
+    "plain, by tokens": Variant(plain=True, tokens=3072),
+    "plain, helped": Variant(plain=True, helped=True),
+    OURS: Variant(),
+    "ours, inputs loaded in advance": Variant(("workers=2",)),
+    "ours, vision features reused": Variant(("reuse_features=true",)),
+    "ours, both": Variant(("workers=2", "reuse_features=true")),
 }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    commands = parser.add_subparsers(required=True)
-    for name, measure in (("speed", measure_speed), ("growth", measure_growth)):
-        command = commands.add_parser(name)
-        command.add_argument("--steps", type=int, default=3, help="steps that count, after one")
-        command.add_argument("--rounds", type=int, default=3)
-        command.add_argument("--benchmark", default="small")
-        command.add_argument("--store", default="store", help="where the benchmark is or is built")
-        command.add_argument("--precision", default="fp32", help="also bf16, of all variants")
-        command.set_defaults(measure=measure)
-        if name == "speed":
-            command.add_argument("--only", nargs="*", help="these variants, beside the plain one")
-    single = commands.add_parser("one", help="one variant, for the others")
-    single.add_argument("variant", type=json.loads)
-    single.set_defaults(measure=print_one)
+    parser.add_argument("--batch", type=int, nargs="+", default=[128], help="queries a step")
+    comparison.add_arguments(parser, steps=3, variants=VARIANTS)
     args = parser.parse_args()
-    args.measure(args)
-
-
-def measure_speed(args: argparse.Namespace) -> None:
-    names = list(VARIANTS) if args.only is None else [PLAIN, *args.only]
-    rounds: list[dict[str, dict[str, Any]]] = [{} for _ in range(args.rounds)]
-    turns = [(results, name) for results in rounds for name in names]
-    for results, name in tqdm(turns, unit="training"):
-        results[name] = in_process(args, batch=128, **VARIANTS[name])
-    print(f"\nbatches of 128 queries, {args.steps} steps", flush=True)
-    print(f"{'':<34}{'queries/s':>10}{'of plain':>10}{'GiB':>7}{'of plain':>10}{'loss':>10}")
-    for name in names:
-        line = f"{name:<34}"
-        for key, width in (("rate", 10), ("peak", 7)):
-            line += f"{statistics.median(r[name][key] for r in rounds):>{width}.2f}"
-            ratio = statistics.median(r[name][key] / r[PLAIN][key] for r in rounds)
-            line += f"{ratio:>10.2f}"
-        print(f"{line}{rounds[0][name]['loss']:>10.4f}", flush=True)
-
-
-def measure_growth(args: argparse.Namespace) -> None:
-    print(f"{'':<34}{'batch':>6}{'queries/s':>11}{'GiB':>7}")
-    for name in (PLAIN, "ours", "ours, with reused features"):
-        for batch in (32, 128, 512):
-            results = [
-                in_process(args, batch=batch, **VARIANTS[name])
-                for _ in tqdm(range(args.rounds), desc=name, unit="training", leave=False)
-            ]
-            rate, peak = (statistics.median(r[key] for r in results) for key in ("rate", "peak"))
-            print(f"{name:<34}{batch:>6}{rate:>11.2f}{peak:>7.2f}", flush=True)
-
-
-def in_process(args: argparse.Namespace, **variant: Any) -> dict[str, Any]:
-    """The result of `train_one` in a new process."""
-    variant = {
-        "steps": args.steps,
-        "benchmark": args.benchmark,
-        "store": args.store,
-        "precision": args.precision,
-        **variant,
-    }
-    command = [sys.executable, "-m", "benchmarks.speed.contrastive", "one", json.dumps(variant)]
-    done = subprocess.run(command, text=True, capture_output=True)
-    if done.returncode:
-        print(done.stderr, file=sys.stderr)
-        raise RuntimeError(f"{variant} has failed")
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def print_one(args: argparse.Namespace) -> None:
-    print(json.dumps(train_one(**args.variant)), flush=True)
-
-
-def train_one(
-    steps: int,
-    benchmark: str,
-    store: str,
-    plain: bool = False,
-    helped: bool = False,
-    plain_tokens: int | None = None,
-    **switches: Any,
-) -> dict[str, Any]:
-    """Train a variant in this process: queries a second, the process's peak memory and the last
-    loss. With `helped`, the plain library has this project's attention and memory settings."""
-    from benchmarks.speed.contrastive_runs import train
-
-    overrides = [f"train.{name}={value}" for name, value in switches.items()]
-    cfg = compose(
-        "train.contrastive",
-        ContrastiveCommand,
-        [*OVERRIDES, f"benchmark={benchmark}", f"store={store}", *overrides],
-    )
+    overrides = [
+        *(TINY if args.preset == "tiny" else [f"retriever={args.preset}"]),
+        "benchmark=small", f"store={args.store}", f"retriever.quantization={args.quantization}",
+        "train.hard_negatives=1", f"train.precision={resolve_precision(args.precision)}",
+    ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
-        helped = helped or not plain
-        figures = train(cfg, steps + 1, plain, helped, plain_tokens, Path(folder))
+        if args.preset != "tiny":
+            cfg = compose("train.contrastive", ContrastiveCommand, overrides)
+            store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+            texts = embedder.tokenizer_texts(store.retrieval("train"), cfg.retriever)
+            size = args.preset.replace("emb_", "")
+            comparison.write_random_base(size, texts, cfg.retriever.image_size, Path(folder))
+            overrides.append(f"retriever.model={folder}")
+        for batch in args.batch:
+            print(f"\nbatches of {batch} queries")
+            compare_speed([*overrides, f"train.batch={batch}"], args)
+
+
+def compare_speed(overrides: list[str], args: argparse.Namespace) -> None:
+    results = comparison.compare(
+        lambda name: comparison.run_in_process(
+            measure, overrides, VARIANTS[name], args.steps, environment={}
+        ),
+        args.only or list(VARIANTS),
+        PLAIN,
+        "queries",
+        args.rounds,
+    )
+    if OURS in results and args.preset != "tiny" and torch.cuda.is_available():
+        rate = statistics.median(result.rate for result in results[OURS])
+        hours.add_rate(
+            "contrastive", args.preset, args.quantization, rate, comparison.device_name()
+        )
+
+
+def measure(overrides: list[str], variant: Variant, steps: int) -> Measurements:
+    """Train a variant in this process for one step more than `steps`."""
+    changes = [f"train.{change}" for change in variant.overrides]
+    overrides = [*overrides, *changes, f"train.max_steps={steps + 1}"]
+    cfg = compose("train.contrastive", ContrastiveCommand, overrides)
+    helped = variant.helped or not variant.plain
+    if helped:
+        compat.keep_freed_memory()
+    set_seed(SEED)
+    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    queries = store.retrieval("train")
+    frames = FrameReader(store, cfg.retriever.image_size)
+    with tempfile.TemporaryDirectory() as folder:
+        model = embedder.load_retriever(cfg.retriever, cfg.train.precision, [], Path(folder))
+        if not helped:
+            model[0].model.set_attn_implementation("sdpa")
+        build = build_plain_trainer if variant.plain else build_own_trainer
+        trainer = build(cfg, model, queries, frames, Path(folder), variant.tokens)
+        return comparison.train(trainer, cfg.train.batch)
+
+
+def shared_options(cfg: ContrastiveCommand, queries: list[RetrievalQuery], folder: Path) -> dict:
+    """The arguments that both trainers share."""
+    train = cfg.train
     return {
-        "rate": cfg.train.batch * len(figures.seconds) / sum(figures.seconds),
-        "peak": figures.peak,
-        "loss": figures.losses[-1],
+        "args": SentenceTransformerTrainingArguments(
+            **timing_arguments(train, folder) | {"dataloader_num_workers": 0},
+            per_device_train_batch_size=train.batch,
+            dataloader_drop_last=True,
+        ),
+        "train_dataset": numbered_rows(len(queries)),
+        "sampler": QueryBatchSampler(queries, train.hard_negatives, train.batch, SEED),
     }
+
+
+def build_own_trainer(cfg, model, queries, frames, folder, tokens) -> Trainer:
+    """The trainer as `train.contrastive` builds it, without evaluations and checkpoints."""
+    fuse(model)
+    return RetrieverTrainer(
+        model=model,
+        **shared_options(cfg, queries, folder),
+        loss=build_loss(cfg.train, cfg.retriever, model, frames),
+        data_collator=IndexCollator(preprocess_fn=model.preprocess),
+        columns_of=lambda numbers: batch_columns(
+            [queries[k] for k in numbers], cfg.train.hard_negatives
+        ),
+    )
+
+
+def build_plain_trainer(cfg, model, queries, frames, folder, tokens) -> Trainer:
+    """The library's trainer, collator and losses; its collator reads pixels batch by batch."""
+    columns = ["query", "target", *(f"negative_{k}" for k in range(cfg.train.hard_negatives))]
+    prompts = dict.fromkeys(columns, cfg.retriever.frame_instruction)
+    collator = FrameCollator(
+        preprocess_fn=model.preprocess,
+        prompts=prompts | {"query": cfg.retriever.query_instruction},
+    )
+    collator.load = lambda number: load_columns(queries[number], columns, frames, cfg)
+    ranking = CachedMultipleNegativesRankingLoss(
+        model,
+        scale=cfg.train.scale,
+        mini_batch_size=cfg.train.mini_batch,
+        mini_batch_num_tokens=tokens,
+    )
+    return PlainTrainer(
+        model=model,
+        **shared_options(cfg, queries, folder),
+        loss=MatryoshkaLoss(model, ranking, list(cfg.retriever.widths), cfg.train.width_weights),
+        data_collator=collator,
+    )
+
+
+def load_columns(
+    query: RetrievalQuery, columns: Sequence[str], frames: FrameReader, cfg: ContrastiveCommand
+) -> dict[str, Any]:
+    """The inputs of a query, of its target and of its hard negatives, with their pixels."""
+    images = (embedder.frame_input(f, frames) for f in (query.target, *query.hard_negatives))
+    inputs = [embedder.query_input(query, frames, cfg.retriever), *images]
+    return dict(zip(columns, inputs, strict=False))
+
+
+class PlainTrainer(SentenceTransformerTrainer):
+    """The library's trainer on batches of ours."""
+
+    def __init__(self, *args: Any, sampler: QueryBatchSampler, **options: Any) -> None:
+        self._sampler = sampler
+        super().__init__(*args, **options)
+
+    def get_batch_sampler(self, *_: Any, **__: Any) -> QueryBatchSampler:
+        return self._sampler
+
+
+class FrameCollator(SentenceTransformerDataCollator):
+    """The library's collator over rows that name queries by number."""
+
+    def __call__(self, rows: list[dict[str, int]]) -> dict[str, Any]:
+        return super().__call__([self.load(row[NUMBER]) for row in rows])
 
 
 if __name__ == "__main__":

@@ -1,171 +1,278 @@
-"""The student's trainer beside TRL's SFTTrainer on a CPU, over the tiny base (extra `bench`).
+"""The speed and memory of the student trainer, compared with TRL's SFTTrainer (extra `bench`).
 
-    python -m benchmarks.speed.sft speed
-    python -m benchmarks.speed.sft loss
+    python -m benchmarks.speed.sft                # the tiny student, on any machine
+    python -m benchmarks.speed.sft qwen3_vl_8b    # a released size, on a GPU
+    python -m benchmarks.speed.sft --losses
 
-`speed` trains the tiny benchmark's samples with every variant, each in its own process, in turns.
-It prints medians over the rounds of samples per second and peak memory, and of their ratios to
-ours. TRL runs with its default settings, with each setting that could help it, and with the
-MALLOC_* variables that replace our trainer's call of mallopt. Each loss follows its trainer's own
-convention.
+Every variant trains on the same samples of the tiny benchmark in the same order, with the same base
+and hyperparameters, in its own process; variants take turns. Printed are medians over the rounds
+and the ratios to our trainer with the preset's settings, whose rate on a GPU is recorded for
+benchmarks.speed.hours. A released size has random weights, so nothing is downloaded. Each loss
+follows its trainer's own convention.
 
-`loss` trains over the unquantised base in fp32 and compares the losses of all steps with TRL's; our
-trainer then uses TRL's convention, the mean over a micro-batch's tokens and over micro-batches.
+TRL runs with its default settings and with each setting that could help it, including the MALLOC_*
+variables, which set what our trainer sets with mallopt. Its own collator supports no videos, so it
+has a collator of ours. It does not pack samples with images, and casts adapters over 4-bit weights
+to bf16. Without TRL only our trainer is measured.
+
+`--losses` compares the losses of all steps in fp32 over the unquantised base; our trainer then uses
+TRL's convention, the mean over a micro-batch's tokens and over micro-batches.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import os
+import importlib.util
 import statistics
-import subprocess
-import sys
 import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
+from torch.utils.data import SequentialSampler, Subset
+from transformers import ProcessorMixin, Trainer, TrainingArguments, set_seed
+
+from benchmarks.speed import comparison, hours
+from benchmarks.speed.comparison import SEED, Measurements, timing_arguments
 from conf.compose import compose
 from conf.schema import SftCommand
+from data.build import ensure_benchmark
+from models import compat, loading
+from models.attention import flash_attention
+from models.lora_kernels import fuse
+from models.memory import available_cpu_bytes
+from models.precision import resolve_precision
+from models.student.collator import Collator, encode, letter_ids, pad
+from models.student.prompts import Sample
+from teacher.narrate import ensure_rationales
+from train.common.arguments import prefetch_factor
+from train.student.dataset import tokenizer_corpus
+from train.student.length_sampler import LengthSampler
+from train.student.metrics import LetterAccuracy
+from train.student.packing import PackingCollator, packing_rope
+from train.student.regimes import TrainerCollator
+from train.student.run import load_datasets
+from train.student.trainer import StudentTrainer, token_mean
+from train.student.vision_cache import VisionCache
 
-if TYPE_CHECKING:
-    import torch
-
-OVERRIDES = ["+exp=cot", "student=tiny"]
 MALLOC = {
     "MALLOC_MMAP_THRESHOLD_": str(1 << 30),
     "MALLOC_TRIM_THRESHOLD_": str((1 << 31) - 1),
     "MALLOC_TOP_PAD_": str(64 << 20),
 }
 """The environment variables for what `models.compat.keep_freed_memory` sets in the process."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A trainer and the settings of `train` in which it differs from the preset."""
+
+    overrides: tuple[str, ...] = ()
+    trl: bool = False
+    flash: bool = False
+    """Let TRL use flash attention if it is installed."""
+    environment: dict[str, str] = field(default_factory=dict)
+
+
 OURS, DEFAULT = "ours", "TRL, default settings"
-TRL = {"trainer": "trl"}
-VARIANTS: dict[str, dict[str, Any]] = {
-    OURS: {"micro_batch": 4},
-    "ours, activations recomputed": {"micro_batch": 4, "recompute": True},
-    DEFAULT: {**TRL, "recompute": True},
-    "TRL, activations kept": TRL,
-    "TRL, kept, micro-batch 4": {**TRL, "micro_batch": 4},
-    "TRL, kept, a worker": {**TRL, "workers": 1},
-    "TRL, kept, MALLOC_*": {**TRL, "environment": MALLOC},
-    "TRL, kept, 4, MALLOC_*": {**TRL, "micro_batch": 4, "environment": MALLOC},
+KEPT, RECOMPUTED = "gradient_checkpointing=false", "gradient_checkpointing=true"
+TRL_SETTINGS = ("workers=0", "micro_batch=8", KEPT)
+VARIANTS = {
+    OURS: Variant(),
+    "ours, activations kept": Variant((KEPT,)),
+    "ours, activations recomputed": Variant((RECOMPUTED,)),
+    "ours, micro-batch 4, padded": Variant(("micro_batch=4", "packing=false")),
+    "ours, micro-batch 4, packed": Variant(("micro_batch=4", "packing=true")),
+    "ours, vision features reused": Variant(("reuse_features=true",)),
+    "ours, 4 workers": Variant(("workers=4",)),
+    DEFAULT: Variant((*TRL_SETTINGS, RECOMPUTED), trl=True),
+    "TRL, kept": Variant(TRL_SETTINGS, trl=True),
+    "TRL, kept, 4": Variant((*TRL_SETTINGS, "micro_batch=4"), trl=True),
+    "TRL, kept, 4 workers": Variant((*TRL_SETTINGS, "workers=4"), trl=True),
+    "TRL, kept, flash attention": Variant(TRL_SETTINGS, trl=True, flash=True),
+    "TRL, kept, MALLOC_*": Variant(TRL_SETTINGS, trl=True, environment=MALLOC),
 }
+"""The variants by name; "kept" keeps activations, 4 is the micro-batch instead of 8."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    commands = parser.add_subparsers(required=True)
-    for name, steps, measure in (("speed", 8, measure_speed), ("loss", 6, measure_loss)):
-        command = commands.add_parser(name)
-        command.add_argument("--steps", type=int, default=steps, help="steps after the first")
-        command.add_argument("--rounds", type=int, default=3)
-        command.add_argument("--store", default="store", help="folder of the built benchmarks")
-        command.set_defaults(measure=measure)
-    single = commands.add_parser("one", help="one variant; used by the others")
-    single.add_argument("variant", type=json.loads)
-    single.set_defaults(measure=lambda args: print(json.dumps(train_one(**args.variant))))
+    parser.add_argument("--losses", action="store_true", help="compare losses instead")
+    comparison.add_arguments(parser, steps=8, variants=VARIANTS)
     args = parser.parse_args()
-    args.measure(args)
+    if args.losses:
+        args.precision, args.quantization = "fp32", "none"
+    overrides = [
+        "+exp=cot", f"student={args.preset}", f"store={args.store}",
+        f"student.quantization={args.quantization}",
+        f"train.precision={resolve_precision(args.precision)}",
+    ]  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        if args.preset != "tiny":
+            write_base(overrides, args.preset, Path(folder))
+            overrides.append(f"student.model={folder}")
+        if args.losses:
+            compare_losses(overrides, args.steps)
+        else:
+            compare_speed(overrides, args)
 
 
-def measure_speed(args: argparse.Namespace) -> None:
-    rounds = [
-        {name: train_in_process(args, name, **variant) for name, variant in VARIANTS.items()}
-        for _ in range(args.rounds)
-    ]
-    print(f"{args.steps} steps of {rounds[0][OURS]['batch']} samples")
-    print(f"{'':<34}{'samples/s':>10}{'of ours':>9}{'peak GiB':>10}{'of ours':>9}{'loss':>9}")
-    for name in VARIANTS:
-        line = f"{name:<34}"
-        for key in ("rate", "peak"):
-            line += f"{statistics.median(r[name][key] for r in rounds):>10.2f}"
-            line += f"{statistics.median(r[name][key] / r[OURS][key] for r in rounds):>9.2f}"
-        print(f"{line}{rounds[0][name]['losses'][-1]:>9.4f}", flush=True)
-    peers = [name for name, variant in VARIANTS.items() if "trainer" in variant]
-    best = max(peers, key=lambda name: statistics.median(r[name]["rate"] for r in rounds))
-    for name in (DEFAULT, best):
-        ratio = statistics.median(r[OURS]["rate"] / r[name]["rate"] for r in rounds)
-        print(f"{ratio:.2f} times {name}", flush=True)
+def compare_speed(overrides: list[str], args: argparse.Namespace) -> None:
+    has_trl = importlib.util.find_spec("trl") is not None
+    names = args.only or [name for name, variant in VARIANTS.items() if has_trl or not variant.trl]
+    results = comparison.compare(
+        lambda name: measure_in_process(overrides, VARIANTS[name], args.steps),
+        names,
+        OURS,
+        "samples",
+        args.rounds,
+    )
+    if OURS in results and args.preset != "tiny" and torch.cuda.is_available():
+        rate = statistics.median(result.rate for result in results[OURS])
+        hours.add_rate("sft", args.preset, args.quantization, rate, comparison.device_name())
 
 
-def measure_loss(args: argparse.Namespace) -> None:
-    exact = {"precision": "fp32", "quantization": "none"}
-    ours = train_in_process(args, OURS, trl_loss=True, **exact)["losses"]
-    theirs = train_in_process(args, DEFAULT, **VARIANTS[DEFAULT], **exact)["losses"]
+def compare_losses(overrides: list[str], steps: int) -> None:
+    ours = measure_in_process(overrides, VARIANTS[OURS], steps, True)
+    theirs = measure_in_process(overrides, VARIANTS[DEFAULT], steps)
     print(f"{'step':>4}{'ours':>12}{'TRL':>12}{'difference':>12}")
-    for step, (loss, other) in enumerate(zip(ours, theirs, strict=True), 1):
+    for step, (loss, other) in enumerate(zip(ours.losses, theirs.losses, strict=True), 1):
         print(f"{step:>4}{loss:>12.6f}{other:>12.6f}{abs(loss - other):>12.1e}")
 
 
-def train_in_process(args: argparse.Namespace, name: str, **variant: Any) -> dict[str, Any]:
-    """The result of `train_one` in a new process."""
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1", **variant.pop("environment", {})}
-    settings = {"name": name, "steps": args.steps + 1, "store": args.store, **variant}
-    command = [sys.executable, "-m", "benchmarks.speed.sft", "one", json.dumps(settings)]
-    done = subprocess.run(command, env=environment, text=True, capture_output=True)
-    if done.returncode:
-        print(done.stderr, file=sys.stderr)
-        raise RuntimeError(f"{name} failed")
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def train_one(
-    store: str,
-    steps: int,
-    precision: str = "auto",
-    quantization: str = "nf4",
-    trl_loss: bool = False,
-    **variant: Any,
-) -> dict[str, Any]:
-    """Train one variant in this process: samples per second, losses and peak memory in GiB."""
-    from torch.utils.data import Subset
-    from transformers import set_seed
-
-    from benchmarks.speed import sft_runs
-    from data.build import ensure_benchmark
-    from models import compat, loading
-    from models.precision import resolve_precision
-    from teacher.narrate import ensure_rationales
-    from train.student.length_sampler import LengthSampler
-    from train.student.run import load_datasets
-
-    cfg = compose("train.sft", SftCommand, OVERRIDES)
-    cfg.train.precision, cfg.student.quantization = resolve_precision(precision), quantization
-    built = ensure_benchmark(cfg.benchmark, Path(store), cfg.workers)
-    rationales = ensure_rationales(built, cfg.teacher)
-    variant = sft_runs.Variant(**variant)
-    if variant.trainer == "ours":
-        compat.keep_freed_memory()
-    set_seed(sft_runs.SEED)
-    model, processor = loading.load_student(cfg.student, cfg.train.precision, list)
-    training, _ = load_datasets(cfg, built, rationales)
-    lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
-    order = islice(LengthSampler(lengths, cfg.train.batch, cfg.seed), steps * cfg.train.batch)
-    student = sft_runs.Student(
-        model, processor, Subset(training, list(order)), cfg.train, cfg.student.max_length
+def measure_in_process(
+    overrides: list[str], variant: Variant, steps: int, trl_loss: bool = False
+) -> Measurements | str:
+    return comparison.run_in_process(
+        measure, overrides, variant, steps, trl_loss, environment=variant.environment
     )
-    options = {}
-    if trl_loss:
-        options["loss"] = partial(mean_of_means, cfg.train.batch // variant.micro_batch)
+
+
+def measure(overrides: list[str], variant: Variant, steps: int, trl_loss: bool) -> Measurements:
+    """Train a variant in this process for one step more than `steps`."""
+    changes = [f"train.{change}" for change in variant.overrides]
+    cfg = compose("train.sft", SftCommand, [*overrides, *changes, f"train.max_steps={steps + 1}"])
+    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    rationales = ensure_rationales(store, cfg.teacher)
+    if not variant.trl:
+        compat.keep_freed_memory()
+    set_seed(SEED)
+    model, processor = loading.load_student(cfg.student, cfg.train.precision, list)
+    training, _ = load_datasets(cfg, store, rationales)
+    lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
+    order = LengthSampler(lengths, cfg.train.batch, cfg.seed)
+    samples = Subset(training, list(islice(order, (steps + 1) * cfg.train.batch)))
     with tempfile.TemporaryDirectory() as folder:
-        figures = sft_runs.train(variant, student, steps, Path(folder), **options)
-    return {
-        "batch": cfg.train.batch,
-        "rate": cfg.train.batch * len(figures.seconds) / (sum(figures.seconds) or 1),
-        "losses": figures.losses,
-        "peak": figures.peak,
-    }
+        if variant.trl:
+            trainer = build_trl_trainer(cfg, model, processor, samples, Path(folder), variant.flash)
+        else:
+            trainer = build_own_trainer(cfg, model, processor, samples, Path(folder), trl_loss)
+        return comparison.train(trainer, cfg.train.batch)
+
+
+def build_own_trainer(
+    cfg: SftCommand,
+    model: torch.nn.Module,
+    processor: ProcessorMixin,
+    samples: Subset,
+    folder: Path,
+    trl_loss: bool,
+) -> Trainer:
+    """Return the trainer that `train.sft` builds, without evaluations and checkpoints."""
+    train, accumulation = cfg.train, cfg.train.batch // cfg.train.micro_batch
+    fuse(model)
+    collator = Collator(processor, cfg.student.max_length)
+    rope = packing_rope(model, train.packing)
+    packs = rope and PackingCollator(processor, cfg.student.max_length, rope)
+    cache = None
+    if train.reuse_features:
+        cache = VisionCache(model, train.precision, available_cpu_bytes() // 2)
+    return StudentTrainer(
+        model=model,
+        args=TrainingArguments(
+            **timing_arguments(train, folder),
+            per_device_train_batch_size=train.micro_batch,
+            gradient_accumulation_steps=accumulation,
+            dataloader_prefetch_factor=prefetch_factor(train.workers, accumulation),
+            label_names=["labels"],
+        ),
+        data_collator=TrainerCollator(collator, cache is not None),
+        training_collator=TrainerCollator(packs or collator, cache is not None),
+        train_dataset=samples,
+        compute_loss_func=partial(mean_of_means, accumulation) if trl_loss else token_mean,
+        sampler=SequentialSampler(samples),
+        accuracy=LetterAccuracy(letter_ids(processor)),
+        vision_cache=cache,
+    )
 
 
 def mean_of_means(
     micro_batches: int, outputs: Any, labels: torch.Tensor, num_items_in_batch: Any = None
 ) -> torch.Tensor:
     """TRL's loss for this model: the mean over a micro-batch's tokens, then over micro-batches."""
-    from train.student.trainer import token_mean
-
     return token_mean(outputs, labels) / micro_batches
+
+
+def build_trl_trainer(
+    cfg: SftCommand,
+    model: torch.nn.Module,
+    processor: ProcessorMixin,
+    samples: Subset,
+    folder: Path,
+    flash: bool,
+) -> Trainer:
+    """Return TRL's trainer with the same hyperparameters; other settings have TRL's defaults.
+
+    TRL accepts only a dataset of the `datasets` library, so the dataset contains sample indices and
+    the collator looks up the samples.
+    """
+    import datasets
+    from trl import SFTConfig, SFTTrainer
+
+    train = cfg.train
+    attention = flash_attention(train.precision) if flash else None
+    model.get_base_model().set_attn_implementation(attention or "sdpa")
+    collator = FullCollator(processor, cfg.student.max_length)
+    return SFTTrainer(
+        model=model,
+        args=SFTConfig(
+            **timing_arguments(replace(train, gradient_checkpointing=False), folder),
+            gradient_checkpointing=train.gradient_checkpointing,
+            per_device_train_batch_size=train.micro_batch,
+            gradient_accumulation_steps=train.batch // train.micro_batch,
+            train_sampling_strategy="sequential",
+            # The default of 1,024 tokens would truncate within an image.
+            max_length=cfg.student.max_length,
+            dataset_kwargs={"skip_prepare_dataset": True},
+        ),
+        data_collator=partial(collator.collate_rows, samples),
+        train_dataset=datasets.Dataset.from_dict({"row": range(len(samples))}),
+        processing_class=processor,
+    )
+
+
+class FullCollator(Collator):
+    """Makes batches with labels at every position, as TRL expects them."""
+
+    def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
+        encoded = [encode(s, self._processor, self._max_length) for s in samples]
+        return pad(encoded, self._processor.tokenizer.pad_token_id)
+
+    def collate_rows(self, samples: Subset, rows: Sequence[dict[str, int]]) -> dict[str, Any]:
+        """Collate the samples whose indices are in `rows`."""
+        return self([samples[row["row"]] for row in rows])
+
+
+def write_base(overrides: list[str], preset: str, folder: Path) -> None:
+    """Save a random base of a preset's size with a tokenizer for the benchmark's texts."""
+    cfg = compose("train.sft", SftCommand, overrides)
+    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    texts = tokenizer_corpus(store, ensure_rationales(store, cfg.teacher))
+    comparison.write_random_base(preset, texts, cfg.student.image_size, folder)
 
 
 if __name__ == "__main__":

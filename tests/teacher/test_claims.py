@@ -10,9 +10,7 @@ from random import Random
 
 import pytest
 
-from benchmarks.experiments.mutations import KINDS, falsehoods, predicates_from
-from benchmarks.experiments.paraphrases import paraphrase
-from benchmarks.experiments.prose import EDITS
+from benchmarks.experiments.mutations import MUTATIONS, parse_predicates
 from conf.schema import TeacherConfig
 from teacher.narrator import write_rationale
 from teacher.predicates import (
@@ -216,33 +214,32 @@ def narrated(benchmark_store):
 
 @pytest.mark.slow
 def test_no_claim_of_the_narrator_is_contradicted(narrated):
-    for item, predicates, text in narrated:
+    for _, predicates, text in narrated:
         assert contradicted(text, predicates) == []
-        assert contradicted(paraphrase(text, Random(item.item_id)), predicates) == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_false_fact_is_contradicted(narrated, kind):
+@pytest.mark.parametrize("kind", MUTATIONS)
+def test_false_word_of_the_narrator_is_contradicted(narrated, kind):
     detected = []
-    for item, predicates, _ in narrated:
-        for false, _ in falsehoods(predicates, item, kind, Random(item.item_id), seed=1):
+    for item, predicates, text in narrated:
+        for false, _ in MUTATIONS[kind](text, predicates, Random(item.item_id)):
             detected.append(bool(contradicted(false, predicates)))
     assert sum(detected) >= 0.97 * len(detected) > 20
 
 
 def test_no_true_claim_of_a_language_model_is_contradicted():
     for record in PROSE:
-        assert contradicted(record["text"], predicates_from(record["predicates"])) == []
+        assert contradicted(record["text"], parse_predicates(record["predicates"])) == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", EDITS)
+@pytest.mark.parametrize("kind", ["direction", "region", "speed", "color", "pair", "answer"])
 def test_false_word_in_prose_is_contradicted(kind):
     detected = []
     for record in PROSE:
-        predicates = predicates_from(record["predicates"])
-        edits = EDITS[kind](record["text"], predicates, Random(record["item_id"]))
+        predicates = parse_predicates(record["predicates"])
+        edits = MUTATIONS[kind](record["text"], predicates, Random(record["item_id"]))
         detected += [bool(contradicted(text, predicates)) for text, _ in edits]
     assert sum(detected) >= 0.97 * len(detected) > 20
 
@@ -269,7 +266,7 @@ def test_validator_rejects_contradictions_and_returns_claims(narrated):
     assert verdict.accepted
     assert {c.verdict for c in verdict.claims} <= {"supported", "unknown"}
     assert sum(c.verdict == "supported" for c in verdict.claims) > 20
-    text, _ = next(falsehoods(predicates, item, "color", Random(0), seed=1))
+    text, _ = next(MUTATIONS["color"](text, predicates, Random(0)))
     false = validate_rationale(text, predicates, item, cfg)
     assert not false.accepted
     assert {reason.split(":")[0] for reason in false.reasons} == {"contradicts"}

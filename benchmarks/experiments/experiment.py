@@ -1,0 +1,141 @@
+"""Trains and evaluates variants with several seeds, and records their results in a parquet file.
+
+A run that is recorded is not trained again. The project's own commands do the work in subprocesses;
+they resume, so an interrupted experiment resumes when its script is started again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import pandas as pd
+
+Job = tuple[str, int]
+"""A variant and a seed."""
+WRITING = Lock()
+
+
+def create_parser(description: str, benchmark: str, record: Path) -> argparse.ArgumentParser:
+    """A parser of the options of every experiment, with their defaults."""
+    parser = argparse.ArgumentParser(description=description.partition("\n\n")[0])
+    parser.add_argument("--benchmark", default=benchmark)
+    parser.add_argument("--store", default="store")
+    parser.add_argument("--checkpoints", type=Path, default=Path("checkpoints"))
+    parser.add_argument("--record", type=Path, default=record, help="file of recorded results")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time; they share the cores")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--table", action="store_true", help="only print the recorded results")
+    return parser
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The runs that an experiment compares."""
+
+    args: argparse.Namespace
+    """Options of `create_parser`."""
+    identity: dict[str, str]
+    """Values of the record's columns that the rows of this experiment share."""
+    variant: str
+    """Column of the record with the variant."""
+    trainer: str
+    """Command that trains a variant, such as train.sft."""
+    evaluator: str
+    """Command that evaluates a variant, such as evaluation.select."""
+
+    @property
+    def shared(self) -> list[str]:
+        """Overrides of all commands."""
+        args = self.args
+        return [
+            f"benchmark={args.benchmark}", f"store={args.store}", f"checkpoints={args.checkpoints}",
+        ]  # fmt: skip
+
+    def read_results(self, seeds: int | None = None) -> pd.DataFrame:
+        """The recorded results, of the first `seeds` seeds."""
+        table = pd.read_parquet(self.args.record)
+        for column, value in self.identity.items():
+            table = table[table[column] == value]
+        return table if seeds is None else table[table.seed < seeds]
+
+    def run(
+        self, jobs: Iterable[Job], evaluate: Callable[[Job, int], list[dict[str, Any]]]
+    ) -> pd.DataFrame:
+        """Run the jobs that are not recorded, and return all results.
+
+        Args:
+            jobs: The runs to compare.
+            evaluate: Returns a run's rows of the record; it runs with a number of threads.
+        """
+        if not self.args.table:
+            run_command(["data.build", *self.shared[:2]])
+            recorded = self.read_results()
+            done = set(zip(recorded[self.variant], recorded.seed, strict=True))
+            threads = max(1, (os.cpu_count() or 1) // self.args.jobs)
+            with ThreadPoolExecutor(self.args.jobs) as pool:
+                missing = [job for job in jobs if job not in done]
+                for future in [
+                    pool.submit(self._record, evaluate, job, threads) for job in missing
+                ]:
+                    future.result()
+        results = self.read_results(self.args.seeds)
+        if results.empty:
+            raise SystemExit("error: no results are recorded: run without --table")
+        return results
+
+    def _record(
+        self, evaluate: Callable[..., list[dict[str, Any]]], job: Job, threads: int
+    ) -> None:
+        variant, seed = job
+        shared = {**self.identity, self.variant: variant, "seed": seed}
+        rows = pd.DataFrame([shared | row for row in evaluate(job, threads)])
+        with WRITING:
+            table = pd.concat([pd.read_parquet(self.args.record), rows])
+            table.to_parquet(self.args.record, index=False, compression="zstd")
+
+    def train_and_evaluate(
+        self,
+        name: str,
+        training: Sequence[str] | None,
+        evaluation: Sequence[str],
+        threads: int,
+    ) -> Path:
+        """Train and evaluate a run, and return the folder of its evaluation.
+
+        Args:
+            training: Overrides of the trainer; None evaluates without training.
+            evaluation: Further overrides of the evaluation.
+        """
+        shared = [*self.shared, f"run={name}"]
+        if training is not None:
+            run_command([self.trainer, *training, *shared], threads)
+            kind = self.trainer.partition(".")[2]
+            evaluation = [*evaluation, f"model={self.args.checkpoints / kind / name}"]
+        folder = self.args.checkpoints / self.evaluator.partition(".")[2] / name
+        if not (folder / "metrics.json").exists():
+            run_command([self.evaluator, *evaluation, *shared], threads)
+        return folder
+
+
+def run_command(command: Sequence[str], threads: int | None = None) -> None:
+    """Run `python -m` with a command and wait for it.
+
+    Raises:
+        SystemExit: The command fails; the message holds the end of its standard error.
+    """
+    print("python -m", *command, flush=True)
+    environment = {**os.environ, **({"OMP_NUM_THREADS": str(threads)} if threads else {})}
+    done = subprocess.run(
+        [sys.executable, "-m", *command], env=environment, capture_output=True, text=True
+    )
+    if done.returncode:
+        raise SystemExit(f"error: {' '.join(command)} failed:\n{done.stderr[-2000:]}")
