@@ -4,30 +4,17 @@ import json
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from conf.failures import report_failures
+from tests.conf.toy_process import run_toy
 
 RESUME = "fix this and run the same command again to resume  [write-failed]\n"
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A working folder that contains the toy command."""
-    shutil.copy(Path(__file__).with_name("toy.py"), tmp_path)
-    return tmp_path
-
-
-def toy(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "toy", *arguments], cwd=folder, capture_output=True, text=True
-    )
-
-
 def test_run_writes_its_record_and_can_be_repeated(folder):
-    done = toy(folder, "x=2", "workers=1")
+    done = run_toy(folder, "x=2", "workers=1")
     assert (done.returncode, done.stdout) == (0, "")
     assert done.stderr == "x is 2.0 in checkpoints/toy/x-2\n"
     run = folder / "checkpoints/toy/x-2"
@@ -35,15 +22,15 @@ def test_run_writes_its_record_and_can_be_repeated(folder):
     assert json.loads((run / "metrics.json").read_text())["loss"] == 4
     assert json.loads((run / "run.json").read_text())["overrides"] == ["x=2", "workers=1"]
     assert "x is 2.0" in (run / "run.log").read_text()
-    assert toy(folder, "x=2").returncode == 0
-    refused = toy(folder, "x=3", "run=x-2")
+    assert run_toy(folder, "x=2").returncode == 0
+    refused = run_toy(folder, "x=3", "run=x-2")
     assert refused.returncode == 2
     assert "[other-settings]" in refused.stderr
 
 
 def test_run_without_results_takes_other_settings(folder):
-    assert toy(folder, "end=mistake", "run=one").returncode == 1
-    assert toy(folder, "x=3", "run=one").returncode == 0
+    assert run_toy(folder, "end=mistake", "run=one").returncode == 1
+    assert run_toy(folder, "x=3", "run=one").returncode == 0
     run = folder / "checkpoints/toy/one"
     assert json.loads((run / "metrics.json").read_text())["loss"] == 9
     record = json.loads((run / "run.json").read_text())
@@ -62,7 +49,7 @@ def test_run_without_results_takes_other_settings(folder):
     ],
 )
 def test_mistake_ends_in_one_sentence(folder, arguments, status, end):
-    done = toy(folder, *arguments)
+    done = run_toy(folder, *arguments)
     assert done.returncode == status
     assert done.stderr.endswith(end)
     assert "Traceback" not in done.stderr
@@ -80,7 +67,7 @@ def test_library_error_on_a_full_disk_is_a_failed_write(monkeypatch, tmp_path, c
 
 
 def test_bug_keeps_its_traceback(folder):
-    done = toy(folder, "end=bug")
+    done = run_toy(folder, "end=bug")
     assert done.returncode == 1
     assert "Traceback" in done.stderr
     assert done.stderr.endswith("ValueError: a bug\n")

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from importlib.resources import files
@@ -13,7 +12,6 @@ from pathlib import Path
 
 import psutil
 import pytest
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
@@ -24,24 +22,13 @@ from conf.multirun.optuna_sweeper import STUDY_FILE, _import_optuna, distributio
 from conf.multirun.table import is_lower_better, varying_overrides
 from conf.schema import ContrastiveCommand, SftCommand
 from conf.schema.training import REGIMES
-from tests.conf.test_presets import SCHEMAS
+from tests.conf.toy_process import NO_GPU, run_toy, start_toy
 from tests.user_errors import raises_user_error
 
 PRESETS = Path(str(files("conf"))) / "sweep"
 SEARCH = ("-m", "x=interval(0.5,3.0)", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=2")
 BY_LOSS = "hydra.sweeper.metric=loss"
 TWO_GPUS = {**os.environ, "CUDA_VISIBLE_DEVICES": "0,1"}
-NO_GPU = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}
-
-
-def toy(folder: Path, *arguments: str, env=NO_GPU) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "toy", *arguments]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=env, timeout=300)
-
-
-def start_toy(folder: Path, *arguments: str, env=NO_GPU) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "toy", *arguments]
-    return subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True, env=env)
 
 
 def wait_for(*paths: Path) -> None:
@@ -56,28 +43,24 @@ def rows(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A working folder that contains the toy command."""
-    shutil.copy(Path(__file__).with_name("toy.py"), tmp_path)
-    return tmp_path
-
-
 @pytest.fixture(scope="module")
 def searched(tmp_path_factory) -> Path:
     """A working folder with a finished search by loss."""
     folder = tmp_path_factory.mktemp("searched")
     shutil.copy(Path(__file__).with_name("toy.py"), folder)
-    done = toy(folder, *SEARCH, BY_LOSS, "run=s")
+    done = run_toy(folder, *SEARCH, BY_LOSS, "run=s")
     assert done.returncode == 0, done.stderr
-    (folder / "stderr").write_text(done.stderr)
+    table = rows(folder / "checkpoints/toy/s")
+    lowest = min(table, key=lambda row: float(row["loss"]))
+    assert f"best: #{lowest['job']} x={lowest['x']}, loss" in done.stderr
+    assert all(0.5 <= float(row["x"]) <= 3 for row in table)
     return folder
 
 
 @pytest.mark.slow
 def test_sweep_survives_a_failed_job_and_resumes(folder):
     sweep = ("-m", "x=1,2", "end=well,bug", "run=s")
-    done = toy(folder, *sweep, env=TWO_GPUS)
+    done = run_toy(folder, *sweep, env=TWO_GPUS)
     assert done.returncode == 1
     assert "#1 x=1 end=bug: failed" in done.stderr
     assert "ValueError: a bug" in done.stderr
@@ -94,12 +77,12 @@ def test_sweep_survives_a_failed_job_and_resumes(folder):
     assert "x is 2.0" in (runs / "2/output.log").read_text()
     assert "x: 2.0" in (runs / "2/config.yaml").read_text()
 
-    again = toy(folder, *sweep, env=TWO_GPUS)
+    again = run_toy(folder, *sweep, env=TWO_GPUS)
     assert "#0 x=1 end=well: already finished, skipped" in again.stderr
     assert "#1 x=1 end=bug: started" in again.stderr
     assert json.loads((runs / "0/run.json").read_text())["earlier_starts"] == []
 
-    shorter = toy(folder, "-m", "x=1", "end=well", "run=s")
+    shorter = run_toy(folder, "-m", "x=1", "end=well", "run=s")
     assert shorter.returncode == 0
     assert [row["job"] for row in rows(runs)] == ["0"]
 
@@ -121,7 +104,7 @@ def test_killed_sweep_ends_its_children(folder, env, concurrent):
 
 @pytest.mark.slow
 def test_one_job_runs_on_each_gpu(folder):
-    done = toy(folder, "-m", "x=1,2", "end=meet", env=TWO_GPUS)
+    done = run_toy(folder, "-m", "x=1,2", "end=meet", env=TWO_GPUS)
     assert done.returncode == 0, done.stderr
     # Without run=, the name of a sweep comes from its overrides.
     runs = folder / "checkpoints/toy/end-meet+x-1-2"
@@ -159,7 +142,7 @@ def test_driver_lists_the_gpus(monkeypatch, tmp_path):
 
 @pytest.mark.slow
 def test_cluster_writes_the_same_table_and_run_folders(folder):
-    done = toy(folder, "-m", "x=2", "end=well,bug", "run=s", "hydra/launcher=submitit_local")
+    done = run_toy(folder, "-m", "x=2", "end=well,bug", "run=s", "hydra/launcher=submitit_local")
     assert done.returncode == 1
     assert "ValueError: a bug" in done.stderr
     runs = folder / "checkpoints/toy/s"
@@ -182,17 +165,9 @@ def test_cluster_writes_the_same_table_and_run_folders(folder):
     ],
 )
 def test_cluster_that_cannot_be_used_is_a_user_error(folder, options):
-    done = toy(folder, "-m", "x=1,2", *options)
+    done = run_toy(folder, "-m", "x=1,2", *options)
     assert done.stderr.startswith(f"sweep checkpoints/toy/x-1-2: 2 jobs\nerror: {options[0]}: ")
     assert done.stderr.endswith("[cluster-refused]\n")
-
-
-@pytest.mark.slow
-def test_search_logs_the_best_by_its_metric(searched):
-    table = rows(searched / "checkpoints/toy/s")
-    lowest = min(table, key=lambda row: float(row["loss"]))
-    assert f"best: #{lowest['job']} x={lowest['x']}, loss" in (searched / "stderr").read_text()
-    assert all(0.5 <= float(row["x"]) <= 3 for row in table)
 
 
 @pytest.mark.slow
@@ -203,11 +178,11 @@ def test_killed_search_repeats_its_trials_and_finished_search_adds_none(searched
     wait_for(runs / "0/job.json")
     killed.send_signal(signal.SIGTERM)
     assert killed.wait(timeout=60) == 130
-    resumed = toy(searched, *search)
+    resumed = run_toy(searched, *search)
     assert "#0 x=" in resumed.stderr.partition("already finished")[0]
     undisturbed = rows(searched / "checkpoints/toy/s")
     assert rows(runs) == undisturbed
-    again = toy(searched, *search)
+    again = run_toy(searched, *search)
     assert again.stderr.count("already finished, skipped") == len(undisturbed) == 2
     assert ": started" not in again.stderr
     assert rows(runs) == undisturbed
@@ -219,10 +194,10 @@ def test_failed_trial_is_repeated(folder):
     # With this seed, the search tries both values.
     seed = "hydra.sweeper.seed=2"
     search = ("-m", "x=range(0,2)", *SEARCH[2:], BY_LOSS, seed, "run=s")
-    assert toy(folder, *search).returncode == 1
+    assert run_toy(folder, *search).returncode == 1
     table = rows(folder / "checkpoints/toy/s")
     assert sorted((row["x"], row["status"]) for row in table) == [("0", "failed"), ("1", "done")]
-    again = toy(folder, *search).stderr
+    again = run_toy(folder, *search).stderr
     assert again.count(": started") == 1
     assert " x=0: started" in again
     assert " x=1: already finished, skipped" in again
@@ -230,10 +205,10 @@ def test_failed_trial_is_repeated(folder):
 
 @pytest.mark.slow
 def test_unknown_metric_can_be_corrected(folder):
-    wrong = toy(folder, *SEARCH, "hydra.sweeper.metric=los", "run=s")
+    wrong = run_toy(folder, *SEARCH, "hydra.sweeper.metric=los", "run=s")
     assert wrong.returncode == 1
     assert wrong.stderr.endswith("the options are accuracy, loss  [unknown-metric]\n")
-    right = toy(folder, *SEARCH, BY_LOSS, "run=s")
+    right = run_toy(folder, *SEARCH, BY_LOSS, "run=s")
     assert right.returncode == 0
     assert right.stderr.count("already finished, skipped") == 1
 
@@ -242,7 +217,7 @@ def test_unknown_metric_can_be_corrected(folder):
 @pytest.mark.parametrize("changed", ["x=interval(0.5,4.0)", "end=bug"])
 def test_other_search_in_the_same_folder_is_refused(searched, changed):
     table = rows(searched / "checkpoints/toy/s")
-    done = toy(searched, *SEARCH, BY_LOSS, "run=s", changed)
+    done = run_toy(searched, *SEARCH, BY_LOSS, "run=s", changed)
     assert done.returncode == 2
     assert f"{changed.partition('=')[0]} was " in done.stderr
     assert done.stderr.endswith("[other-settings]\n")
@@ -253,14 +228,13 @@ def test_other_search_in_the_same_folder_is_refused(searched, changed):
 @pytest.mark.parametrize(
     ("arguments", "code"),
     [
-        (["x=interval(0,1)"], "needs-search"),
         (["x=interval(0,1)", "hydra/sweeper=optuna"], "missing-metric"),
         ([*SEARCH[2:], "x=1", BY_LOSS], "nothing-to-search"),
         ([*SEARCH[2:], "x=interval(3,1)", BY_LOSS], "invalid-interval"),
     ],
 )
 def test_invalid_search_is_one_sentence(folder, arguments, code):
-    done = toy(folder, "-m", *arguments)
+    done = run_toy(folder, "-m", *arguments)
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert done.stderr.endswith(f"[{code}]\n")
@@ -300,48 +274,28 @@ def test_table_has_columns_for_varying_overrides_only():
     assert varying_overrides(jobs) == [{"x": "1"}, {"x": "2"}]
 
 
-def parse_preset(name: str) -> tuple[str, type, str]:
-    """The command, its schema and the model override in the comment of a sweep preset."""
-    line = (PRESETS / f"{name}.yaml").read_text().splitlines()[1]
-    _, _, _, command, _, _, model = line.split()
-    return command, SCHEMAS[command], model
-
-
-def preset_jobs(name: str) -> list[SftCommand | ContrastiveCommand]:
-    """The settings of each job of a sweep preset."""
-    command, schema, model = parse_preset(name)
-    params = OmegaConf.load(PRESETS / f"{name}.yaml").hydra.sweeper.params
-    overrides = [f"{key}={value}" for key, value in params.items()]
-    [jobs] = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(overrides), None)
-    return [compose(command, schema, [model, *job]) for job in jobs]
-
-
-def test_regimes_preset_has_every_student_regime():
-    assert {job.train.regime for job in preset_jobs("regimes")} == set(REGIMES) - {"describe"}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["lr_rank", "retriever_lr_rank"])
-def test_adapter_scale_is_the_papers_at_every_rank(name):
-    command, schema, model = parse_preset(name)
-    swept, [paper] = (
-        [(cfg.train.lr, getattr(cfg, model.partition("=")[0]).lora) for cfg in settings]
-        for settings in (preset_jobs(name), [compose(command, schema, [model])])
-    )
-    assert len({(lr, lora.rank) for lr, lora in swept}) == len(swept) == 9
-    assert {lora.alpha / lora.rank for _, lora in swept} == {paper[1].alpha / paper[1].rank}
-    assert paper in swept
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(path.stem for path in PRESETS.glob("*.yaml")))
-def test_preset_composes_and_needs_multirun(name):
-    command, schema, model = parse_preset(name)
-    preflight(command, schema, [f"+sweep={name}", model], sweep=True)
-    with raises_user_error("needs-multirun", contains=f"+sweep={name}"):
-        preflight(command, schema, [f"+sweep={name}", model], sweep=False)
-
-
-def test_preset_of_another_command_is_refused():
-    with raises_user_error("unknown-key", contains="student"):
-        preflight("train.contrastive", ContrastiveCommand, ["+sweep=lr_rank"], sweep=True)
+@pytest.mark.parametrize(
+    ("preset", "command", "schema", "model"),
+    [
+        ("regimes", "train.sft", SftCommand, "student=qwen3_vl_8b"),
+        ("lr_rank", "train.sft", SftCommand, "student=qwen3_vl_8b"),
+        ("retriever_lr_rank", "train.contrastive", ContrastiveCommand, "retriever=qwen3_vl_emb_8b"),
+    ],
+)
+def test_presets_compose_around_the_papers_values(preset, command, schema, model):
+    preflight(command, schema, [f"+sweep={preset}", model], sweep=True)
+    paper = compose(command, schema, [model])
+    params = OmegaConf.load(PRESETS / f"{preset}.yaml").hydra.sweeper.params
+    parsed = OverridesParser.create().parse_overrides([f"{k}={v}" for k, v in params.items()])
+    values = {o.key_or_group: list(o.sweep_iterator()) for o in parsed}
+    if preset == "regimes":
+        assert set(values["train.regime"]) == set(REGIMES) - {"describe"}
+        return
+    group = model.partition("=")[0]
+    lora = getattr(paper, group).lora
+    assert paper.train.lr in values["train.lr"]
+    scales = {value["rank"]: value["alpha"] / value["rank"] for value in values[f"{group}.lora"]}
+    assert set(scales.values()) == {lora.alpha / lora.rank}
+    assert lora.rank in scales
+    assert len(scales) == 3
