@@ -16,17 +16,14 @@ from typing import Any
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_module
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-import conf.multirun.plugins  # noqa: F401  registers the launcher that run_folder.yaml names
 from conf.errors import SettingsError
 from conf.runs import flatten
 
@@ -63,62 +60,23 @@ def config_name(command: str) -> str:
 
 def compose(command: str, schema: type, overrides: list[str]) -> Any:
     """Compose the settings of one run as an instance of `schema`. Raises SettingsError."""
-    with _hydra(command, schema), _settings_errors(command, schema):
-        return validate_settings(_compose(command, overrides), schema)
+    with open_hydra(command, schema):
+        cfg = compose_config(command, overrides)
+        with open_dict(cfg):
+            del cfg["hydra"]
+        return validate_settings(cfg, schema)
 
 
-def preflight(command: str, schema: type, overrides: list[str], sweep: bool) -> None:
-    """Compose and check the settings of one run, or of each job of a sweep. Raises SettingsError.
-
-    A search only tries some of the combinations, so that each value is checked once.
-    """
-    with _hydra(command, schema) as loader, _settings_errors(command, schema):
-        parser = OverridesParser.create(config_loader=loader)
-        parsed = parser.parse_overrides(overrides)
-        first = _jobs_with_each_value(parsed)[0] if sweep else overrides
-        hydra = _compose(command, first, return_hydra_config=True).hydra
-        params = hydra.sweeper.get("params") or {}
-        if params and not sweep:
-            overlays = " ".join(o for o in overrides if o.startswith("+sweep="))
-            raise SettingsError(f"{overlays} is a sweep: run it with -m", code="needs-multirun")
-        parsed = parser.parse_overrides([f"{k}={v}" for k, v in params.items()]) + parsed
-        is_search = hydra.runtime.choices["hydra/sweeper"] != "basic"
-        intervals = [o.input_line for o in parsed if o.is_interval_sweep()]
-        if sweep and intervals and not is_search:
-            raise SettingsError(
-                f"{intervals[0]}: add hydra/sweeper=optuna to sample from an interval",
-                code="needs-search",
-            )
-    if not sweep:
-        jobs = [overrides]
-    elif is_search:
-        jobs = _jobs_with_each_value(parsed)
-    else:
-        [jobs] = BasicSweeper.split_arguments(parsed, None)
-    for job in jobs:
-        compose(command, schema, job)
-
-
-def _jobs_with_each_value(parsed: list[Override]) -> list[list[str]]:
-    """The shortest list of jobs that has each value of a sweep and both ends of each interval."""
-    values = {override.get_key_element(): _values(override) for override in parsed}
-    count = max(map(len, values.values()), default=1)
-    return [[lines[job % len(lines)] for lines in values.values()] for job in range(count)]
-
-
-def _values(override: Override) -> list[str]:
-    key = override.get_key_element()
-    if override.is_interval_sweep():
-        interval = override.value()
-        return [f"{key}={interval.start}", f"{key}={interval.end}"]
-    if override.is_sweep_override():
-        return [f"{key}={value}" for value in override.sweep_string_iterator()]
-    return [str(override.input_line)]
+def preflight(command: str, schema: type, overrides: list[str]) -> None:
+    """Check the settings of a run that is not a sweep. Raises SettingsError."""
+    if presets := [o for o in overrides if o.startswith("+sweep=")]:
+        raise SettingsError(f"{presets[0]} is a sweep: run it with -m", code="needs-multirun")
+    compose(command, schema, overrides)
 
 
 def options(command: str, schema: type) -> dict[str, list[str]]:
     """The presets of each group of a command, and the overlays whose comment names the command."""
-    with _hydra(command, schema) as loader:
+    with open_hydra(command, schema) as loader:
         groups = {g: loader.get_group_options(g) for g in loader.list_groups("")}
     for group in OVERLAYS:
         paths = {name: files("conf") / group / f"{name}.yaml" for name in groups[group]}
@@ -146,16 +104,21 @@ def validate_settings(cfg: DictConfig, schema: type) -> Any:
 
 
 @contextmanager
-def _hydra(command: str, schema: type) -> Iterator[ConfigLoader]:
+def open_hydra(command: str, schema: type) -> Iterator[ConfigLoader]:
+    """Initialise Hydra for a command, and turn its errors into a SettingsError of one sentence."""
     register(command, schema)
     with initialize_config_module("conf", job_name=config_name(command), version_base="1.3"):
-        yield GlobalHydra.instance().config_loader()
+        try:
+            yield GlobalHydra.instance().config_loader()
+        except (HydraException, OmegaConfBaseException) as error:
+            raise _settings_error(command, schema, error) from error
 
 
-def _compose(command: str, overrides: list[str], **options: Any) -> DictConfig:
-    """Hydra's compose, with the two errors that do not name the override."""
+def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.RUN) -> DictConfig:
+    """Compose settings and Hydra's own, with the two errors that do not name the override."""
+    hydra = GlobalHydra.instance().hydra
     try:
-        return hydra_compose(config_name(command), overrides, **options)
+        return hydra.compose_config(config_name(command), overrides, mode, from_shell=False)
     except ValueError as error:
         typed = " ".join(o for o in overrides if o.endswith("=null"))
         raise SettingsError(f"{typed}: give the name of a preset instead of null") from error
@@ -164,15 +127,6 @@ def _compose(command: str, overrides: list[str], **options: Any) -> DictConfig:
         raise SettingsError(
             f"{typed}: the group above one of these keys is null; choose a preset that sets it"
         ) from error
-
-
-@contextmanager
-def _settings_errors(command: str, schema: type) -> Iterator[None]:
-    """Turn the errors of Hydra and OmegaConf into a SettingsError of one sentence."""
-    try:
-        yield
-    except (HydraException, OmegaConfBaseException) as error:
-        raise _settings_error(command, schema, error) from error
 
 
 def _settings_error(command: str, schema: type, error: Exception) -> SettingsError:

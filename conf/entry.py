@@ -20,6 +20,7 @@ from conf.compose import config_name, preflight, register, validate_settings
 from conf.errors import SettingsError, UserError
 from conf.failures import report_failures
 from conf.help import help_text
+from conf.multirun.sweep import run_sweep
 from conf.runs import Run, lock_folder, open_run, rank, run_name, world_size, write_json
 
 Metrics = dict[str, float]
@@ -49,7 +50,7 @@ def command(name: str, schema: type) -> Callable[[Main], Callable[[], None]]:
 
 
 def _start(name: str, schema: type, main: Main) -> None:
-    """Read the command line: print the help, or check all settings and hand over to Hydra."""
+    """Read the command line: print the help, run a sweep, or check all settings and start Hydra."""
     register(name, schema)
     args = get_args_parser().parse_args()
     if args.help:
@@ -60,21 +61,23 @@ def _start(name: str, schema: type, main: Main) -> None:
         raise SettingsError(f"{modes[0]} with {modes[1]}: give one of them", "conflicting-options")
     if args.resolve and not args.cfg:
         raise SettingsError("--resolve: add --cfg job to print settings", "conflicting-options")
-    if not (args.hydra_help or args.info or args.shell_completion):
-        sweep = args.multirun or "hydra.mode=MULTIRUN" in args.overrides
-        if sweep and world_size() > 1:
+    if args.multirun or "hydra.mode=MULTIRUN" in args.overrides:
+        if world_size() > 1:
             raise UserError(
                 "a sweep starts its own processes: run it with python, not with torchrun or "
                 "another launcher of several ranks",
                 code="sweep-with-ranks",
             )
-        preflight(name, schema, args.overrides, sweep)
+        run_sweep(name, schema, args.overrides)
+        return
+    if not (args.hydra_help or args.info or args.shell_completion):
+        preflight(name, schema, args.overrides)
 
     def task(cfg: DictConfig) -> Metrics | None:
         with report_failures(HydraConfig.get().run.dir):
             return _run(name, schema, main, cfg)
 
-    # Hydra names the job after this module, and ProcessLauncher runs the module in a child process.
+    # Hydra names the job after this module.
     task.__module__ = name
     # Without this variable Hydra catches exceptions and prints its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"

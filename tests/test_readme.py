@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from conf.compose import preflight
+from conf.multirun.sweep import Sweep
 from conf.runs import run_name
 from tests.conf.test_presets import SCHEMAS
 
@@ -29,10 +30,10 @@ def run_folder(command: str, overrides: list[str]) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize(("command", "overrides"), COMMANDS, ids=lambda v: str(v).replace("/", "-"))
 def test_a_command_composes(command: str, overrides: list[str]) -> None:
-    sweep = "-m" in overrides
+    check = Sweep if "-m" in overrides else preflight
     settings = [o.replace("=RUN", "=checkpoints/sft/exp-cot") for o in overrides if o != "-m"]
     if command in SCHEMAS:
-        preflight(command, SCHEMAS[command], settings, sweep)
+        check(command, SCHEMAS[command], settings)
 
 
 def test_named_runs_are_produced_by_other_commands() -> None:

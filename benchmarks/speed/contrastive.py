@@ -82,12 +82,14 @@ VARIANTS = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--batch", type=int, nargs="+", default=[128], help="queries a step")
+    parser.add_argument("--benchmark", default="small")
     comparison.add_arguments(parser, steps=3, variants=VARIANTS)
     args = parser.parse_args()
     overrides = [
         *(TINY if args.preset == "tiny" else [f"retriever={args.preset}"]),
-        "benchmark=small", f"store={args.store}", f"retriever.quantization={args.quantization}",
-        "train.hard_negatives=1", f"train.precision={resolve_precision(args.precision)}",
+        f"benchmark={args.benchmark}", f"store={args.store}", "train.hard_negatives=1",
+        f"retriever.quantization={args.quantization}",
+        f"train.precision={resolve_precision(args.precision)}",
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         if args.preset != "tiny":

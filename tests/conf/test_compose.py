@@ -4,6 +4,7 @@ import pytest
 
 from conf.compose import REMOVED_KEYS, compose, preflight
 from conf.errors import SettingsError
+from conf.multirun.sweep import Sweep
 from conf.schema import BuildCommand, ContrastiveCommand, Quota, SftCommand
 from tests.user_errors import raises_user_error
 
@@ -67,7 +68,7 @@ def test_removed_key_names_its_replacement(monkeypatch):
 )
 def test_invalid_value_is_named(override, code, contains):
     with raises_user_error(code, contains):
-        preflight("train.sft", SftCommand, [override], sweep=False)
+        preflight("train.sft", SftCommand, [override])
 
 
 def test_all_failed_checks_are_reported_together():
@@ -123,9 +124,10 @@ def test_hydra_keys_pass():
 )
 def test_each_job_of_a_sweep_is_checked(overrides, code, contains):
     with raises_user_error(code, contains):
-        preflight("train.sft", SftCommand, overrides, sweep=True)
+        Sweep("train.sft", SftCommand, overrides)
 
 
 def test_valid_sweep_passes():
     sweep = ["student=tiny,qwen3_vl_8b", "+exp=cot,answer_only", "seed=range(0,2)"]
-    preflight("train.sft", SftCommand, sweep, sweep=True)
+    jobs = Sweep("train.sft", SftCommand, sweep).jobs
+    assert len(jobs) == 8

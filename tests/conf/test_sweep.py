@@ -16,9 +16,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-from conf.compose import compose, preflight
+from conf.compose import compose
 from conf.gpus import visible_gpus
-from conf.multirun.optuna_sweeper import STUDY_FILE, _import_optuna, distribution
+from conf.multirun.search import STUDY_FILE, _import_optuna, distribution
+from conf.multirun.sweep import Sweep
 from conf.multirun.table import is_lower_better, varying_overrides
 from conf.schema import ContrastiveCommand, SftCommand
 from conf.schema.training import REGIMES
@@ -284,7 +285,7 @@ def test_table_has_columns_for_varying_overrides_only():
     ],
 )
 def test_presets_compose_around_the_papers_values(preset, command, schema, model):
-    preflight(command, schema, [f"+sweep={preset}", model], sweep=True)
+    Sweep(command, schema, [f"+sweep={preset}", model])
     paper = compose(command, schema, [model])
     params = OmegaConf.load(PRESETS / f"{preset}.yaml").hydra.sweeper.params
     parsed = OverridesParser.create().parse_overrides([f"{k}={v}" for k, v in params.items()])

@@ -11,16 +11,12 @@ import json
 import logging
 import math
 import random
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, RangeSweep
-from hydra.core.plugins import Plugins
-from hydra.plugins.sweeper import Sweeper
-from hydra.types import HydraContext, TaskFunction
-from omegaconf import DictConfig
 
 from conf.errors import SettingsError, UserError
 from conf.gpus import visible_gpus
@@ -28,7 +24,6 @@ from conf.multirun.table import is_lower_better
 from conf.runs import other_settings_error, setting_differences, write_json
 
 if TYPE_CHECKING:
-    from optuna import Study
     from optuna.distributions import BaseDistribution
 
 log = logging.getLogger(__name__)
@@ -38,56 +33,71 @@ METRICS = {"train.sft": "answer_letter_accuracy", "train.contrastive": "mrr"}
 """Default of hydra.sweeper.metric for each command."""
 
 
-@dataclass
-class OptunaSweeper(Sweeper):
-    """A sweeper whose fields are the keys of conf/hydra/sweeper/optuna.yaml."""
+@dataclass(frozen=True)
+class Search:
+    """A search, with the keys of conf/hydra/sweeper/optuna.yaml."""
 
     metric: str | None
     n_trials: int
     n_jobs: int | None
     seed: int
     params: dict[str, str] | None
+    """Sweeps of a preset, which `conf.compose.plan_sweep` adds to the overrides."""
 
-    def setup(
-        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
+    def run(
+        self,
+        command: str,
+        overrides: dict[str, Override],
+        folder: Path,
+        run_jobs: Callable[[list[list[str]], int], list[dict[str, Any]]],
     ) -> None:
-        self.loader = hydra_context.config_loader
-        self.folder = Path(config.hydra.sweep.dir)
-        self.metric = self.metric or METRICS.get(task_function.__module__)
-        self.launcher = Plugins.instance().instantiate_launcher(
-            hydra_context=hydra_context, task_function=task_function, config=config
-        )
+        """Run trials until the study has `n_trials`.
 
-    def sweep(self, arguments: list[str]) -> None:
-        """Run trials until the study has `n_trials`."""
-        # Overrides of the command line replace the parameters of a sweep preset.
-        lines = [*(f"{key}={value}" for key, value in (self.params or {}).items()), *arguments]
-        parsed = OverridesParser.create(config_loader=self.loader).parse_overrides(lines)
-        overrides = {override.get_key_element(): override for override in parsed}
-        swept = {key: o for key, o in overrides.items() if o.is_sweep_override()}
-        self.fixed = [str(o.input_line) for key, o in overrides.items() if key not in swept]
-        if self.metric is None:
+        Args:
+            overrides: The swept and the fixed overrides of the jobs, by key.
+            folder: The sweep's folder.
+            run_jobs: Runs the jobs with these overrides, numbered from a first number, and returns
+                their records.
+        """
+        metric = self.metric or METRICS.get(command)
+        if metric is None:
             raise SettingsError(
                 "this command has no default metric to search by: give "
                 "hydra.sweeper.metric=NAME, with a name in a run's metrics.json",
                 code="missing-metric",
             )
+        swept = {key: o for key, o in overrides.items() if o.is_sweep_override()}
         if not swept:
             raise SettingsError(
                 "the search has no parameters: give a key several values, or an interval such as "
                 "'train.lr=tag(log,interval(1e-5,1e-3))'",
                 code="nothing-to-search",
             )
+        fixed = [str(o.input_line) for key, o in overrides.items() if key not in swept]
         optuna = _import_optuna()
         space = {key: distribution(override) for key, override in swept.items()}
-        direction = "minimize" if is_lower_better(self.metric) else "maximize"
+        direction = "minimize" if is_lower_better(metric) else "maximize"
         study = optuna.create_study(direction=direction)
+
+        def run_trials(first: int) -> None:
+            # A finished job is skipped. A failed job has no result, so that a restart repeats it.
+            trials = study.trials[first:]
+            jobs = [[*fixed, *(f"{k}={v}" for k, v in t.params.items())] for t in trials]
+            for trial, job in zip(trials, run_jobs(jobs, first) if jobs else [], strict=True):
+                if job["status"] == "failed":
+                    continue
+                value = _read_metric(job["metrics"], metric)
+                if math.isfinite(value):
+                    study.tell(trial.number, value)
+                else:
+                    study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+
         settings = {key: str(o.input_line).partition("=")[2] for key, o in overrides.items()}
-        for params in self._recorded_trials(settings):
+        for params in _recorded_trials(folder, settings):
             study.enqueue_trial(params)
             study.ask(space)
-        log.info("search by %s: %d jobs", self.metric, self.n_trials)
-        self._run_trials(study, first=0)
+        log.info("search by %s: %d jobs", metric, self.n_trials)
+        run_trials(first=0)
         batch = max(1, self.n_jobs or len(visible_gpus()))
         while (first := len(study.trials)) < self.n_trials:
             for number in range(first, min(first + batch, self.n_trials)):
@@ -95,49 +105,35 @@ class OptunaSweeper(Sweeper):
                 seed = random.Random(f"{self.seed}/{number}").getrandbits(32)
                 study.sampler = optuna.samplers.TPESampler(seed=seed, constant_liar=True)
                 study.ask(space)
-            trials = [trial.params for trial in study.trials]
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_json(self.folder / STUDY_FILE, {"settings": settings, "trials": trials})
-            self._run_trials(study, first)
+            folder.mkdir(parents=True, exist_ok=True)
+            record = {"settings": settings, "trials": [trial.params for trial in study.trials]}
+            write_json(folder / STUDY_FILE, record)
+            run_trials(first)
         if any(trial.value is not None for trial in study.trials):
             best = study.best_trial
             params = " ".join(f"{key.lstrip('+')}={value}" for key, value in best.params.items())
-            log.info("best: #%d %s, %s %.4g", best.number, params, self.metric, best.value)
+            log.info("best: #%d %s, %s %.4g", best.number, params, metric, best.value)
 
-    def _recorded_trials(self, settings: dict[str, str]) -> list[dict[str, Any]]:
-        """Settings of the trials of an earlier start. Raises SettingsError for another search."""
-        path = self.folder / STUDY_FILE
-        if not path.exists():
-            return []
-        record = json.loads(path.read_text(encoding="utf-8"))
-        if other := setting_differences(record["settings"], settings):
-            raise other_settings_error(f"{self.folder} contains a search", other)
-        return record["trials"]
 
-    def _run_trials(self, study: Study, first: int) -> None:
-        """Run the jobs of the trials from number `first`, and report their results to the study.
+def _recorded_trials(folder: Path, settings: dict[str, str]) -> list[dict[str, Any]]:
+    """Settings of the trials of an earlier start. Raises SettingsError for another search."""
+    path = folder / STUDY_FILE
+    if not path.exists():
+        return []
+    record = json.loads(path.read_text(encoding="utf-8"))
+    if other := setting_differences(record["settings"], settings):
+        raise other_settings_error(f"{folder} contains a search", other)
+    return record["trials"]
 
-        The launcher skips finished jobs. A failed job has no result, so that a restart repeats it.
-        """
-        trials = study.trials[first:]
-        jobs = [[*self.fixed, *(f"{k}={v}" for k, v in trial.params.items())] for trial in trials]
-        for trial, job in zip(
-            trials, self.launcher.launch(jobs, first) if jobs else [], strict=True
-        ):
-            if job.return_value is None:
-                continue
-            metrics = job.return_value
-            if self.metric not in metrics:
-                raise UserError(
-                    f"hydra.sweeper.metric={self.metric} is not a metric of this command; the "
-                    f"options are {', '.join(sorted(metrics)) or 'none'}",
-                    code="unknown-metric",
-                )
-            value = metrics[self.metric]
-            if math.isfinite(value):
-                study.tell(trial.number, value)
-            else:
-                study.tell(trial.number, state=type(trial.state).FAIL)
+
+def _read_metric(metrics: dict[str, float], name: str) -> float:
+    if name not in metrics:
+        raise UserError(
+            f"hydra.sweeper.metric={name} is not a metric of this command; the options are "
+            f"{', '.join(sorted(metrics)) or 'none'}",
+            code="unknown-metric",
+        )
+    return metrics[name]
 
 
 def distribution(override: Override) -> BaseDistribution:

@@ -1,0 +1,162 @@
+"""Launchers of the jobs of a sweep: child processes of this machine, or jobs of a cluster."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from conf.errors import UserError
+from conf.gpus import visible_gpus
+
+log = logging.getLogger(__name__)
+
+POLL = 0.05
+"""Time (s) between two looks at the child processes."""
+CLUSTER_POLL = 0.5
+"""Time (s) between two looks at submitit's jobs; it queries the cluster less often."""
+GRACE = 10.0
+"""Time (s) for a terminated child process to end before it is killed."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A job of a sweep: its run folder and the command that runs it."""
+
+    folder: Path
+    title: str
+    overrides: list[str]
+    command: list[str]
+
+    @property
+    def output(self) -> Path:
+        """File with the job's stdout and stderr."""
+        return self.folder / "output.log"
+
+
+class ProcessLauncher:
+    """Runs one job at a time on each visible GPU, or one job at a time without a GPU.
+
+    Each job is a child process, so that failures and memory leaks stay in it.
+    """
+
+    def run(self, jobs: list[Job]) -> Iterator[tuple[Job, bool]]:
+        """Run jobs, and yield each as it ends with whether it succeeded.
+
+        Closing the iterator ends the jobs that still run.
+        """
+        waiting, free = jobs[::-1], visible_gpus() or [None]
+        running: dict[subprocess.Popen, tuple[Job, str | None]] = {}
+        try:
+            while waiting or running:
+                while waiting and free:
+                    job, gpu = waiting.pop(), free.pop(0)
+                    log.info("%s: started%s", job.title, f" on GPU {gpu}" if gpu else "")
+                    running[start_process(job.command, job.output, gpu)] = job, gpu
+                time.sleep(POLL)
+                for process in [process for process in running if process.poll() is not None]:
+                    job, gpu = running.pop(process)
+                    free.append(gpu)
+                    yield job, process.returncode == 0
+        finally:
+            end_processes(list(running))
+
+
+class SubmititLauncher:
+    """Submits all jobs to a cluster and waits for them; leaving early cancels them.
+
+    Args:
+        cluster: slurm, or local for processes of this machine.
+        submitit_folder: Folder of submitit's own files.
+        parameters: Parameters of submitit.
+    """
+
+    def __init__(self, cluster: str, submitit_folder: str, **parameters: Any) -> None:
+        self.cluster = cluster
+        self.folder = submitit_folder
+        self.parameters = {name: v for name, v in parameters.items() if v is not None}
+
+    def run(self, jobs: list[Job]) -> Iterator[tuple[Job, bool]]:
+        """Run jobs like `ProcessLauncher.run`."""
+        if not jobs:
+            return
+        handles = dict(zip(self._submit(jobs), jobs, strict=True))
+        try:
+            from submitit.core.utils import UncompletedJobError
+            from submitit.helpers import as_completed
+
+            for handle, job in handles.items():
+                log.info("%s: submitted to %s as job %s", job.title, self.cluster, handle.job_id)
+            for handle in as_completed(list(handles), poll_frequency=CLUSTER_POLL):
+                job = handles.pop(handle)
+                try:
+                    yield job, handle.result() == 0
+                except UncompletedJobError as error:
+                    log.error("%s", str(error).strip())
+                    yield job, False
+        finally:
+            for handle in handles:
+                handle.cancel(check=False)
+
+    def _submit(self, jobs: list[Job]) -> list[Any]:
+        typed = f"hydra/launcher=submitit_{self.cluster}"
+        try:
+            import submitit
+        except ImportError as error:
+            raise UserError(
+                f"{typed} needs submitit: pip install -e '.[submitit]'", code="missing-package"
+            ) from error
+        try:
+            executor = submitit.AutoExecutor(folder=self.folder, cluster=self.cluster)
+            executor.update_parameters(**self.parameters)
+            return executor.map_array(
+                run_command, [job.command for job in jobs], [job.output for job in jobs]
+            )
+        # No cluster on this machine, an unknown parameter, or one that the cluster refuses.
+        except (RuntimeError, NameError) as error:
+            raise UserError(f"{typed}: {error}", code="cluster-refused") from error
+
+
+def run_command(command: list[str], output: Path) -> int:
+    """Run a job on its node of the cluster; returns its exit status."""
+    process = start_process(command, output)
+    try:
+        return process.wait()
+    finally:
+        end_processes([process])
+
+
+def start_process(command: list[str], output: Path, gpu: str | None = None) -> subprocess.Popen:
+    """Start a process that writes to a file and sees one GPU, if any is given."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    visible = {} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu}
+    with output.open("wb") as out:
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=subprocess.STDOUT,
+            env=os.environ | visible,
+        )
+
+
+def end_processes(processes: list[subprocess.Popen]) -> None:
+    """Terminate processes, and kill those that are still running after GRACE seconds."""
+    for process in processes:
+        process.terminate()
+    deadline = time.monotonic() + GRACE
+    try:
+        for process in processes:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(max(0.0, deadline - time.monotonic()))
+    finally:
+        # A second Ctrl-C arrives here too.
+        for process in processes:
+            process.kill()
+            process.wait()

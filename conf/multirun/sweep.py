@@ -1,0 +1,169 @@
+"""Runs the jobs of a sweep that are not finished, and prints their table."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from contextlib import closing
+from dataclasses import asdict
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.utils import configure_log
+from hydra.types import RunMode
+from hydra.utils import instantiate
+
+from conf.compose import compose, compose_config, open_hydra
+from conf.errors import SettingsError
+from conf.multirun.launchers import Job
+from conf.multirun.search import Search
+from conf.multirun.table import JOB_FILE, read_job, read_jobs, write_sweep_table
+from conf.runs import differences, run_name, write_json
+
+log = logging.getLogger(__name__)
+
+LAUNCHERS = ("process", "submitit_local", "submitit_slurm")
+PARENT_ONLY = ("hydra.mode", "hydra.sweep", "hydra.launcher", "hydra/sweeper", "hydra/launcher")
+"""Hydra overrides that are not passed on to the jobs."""
+
+
+def run_sweep(command: str, schema: type, overrides: list[str]) -> None:
+    """Run a sweep or a search, print its table, and exit with status 1 if a job failed."""
+    sweep = Sweep(command, schema, overrides)
+    configure_log(sweep.hydra.hydra_logging, sweep.hydra.verbose)
+    # On SIGTERM, as on Ctrl-C, the sweep ends its child processes.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if sweep.is_search:
+        search: Search = instantiate(sweep.hydra.sweeper)
+        search.run(command, sweep.overrides, sweep.folder, sweep.run_jobs)
+    else:
+        sweep.run_jobs(sweep.jobs)
+    if jobs := read_jobs(sweep.folder):
+        print(write_sweep_table(sweep.folder))
+        if any(job["status"] == "failed" for job in jobs):
+            sys.exit(1)
+
+
+class Sweep:
+    """The jobs of a sweep or a search, in numbered folders below the sweep's own.
+
+    Raises:
+        SettingsError: The settings of a job are invalid.
+
+    Attributes:
+        hydra: Hydra's settings.
+        overrides: The swept and the fixed overrides of the jobs, by key.
+        jobs: The overrides of each job. A search has other jobs; these have each of its values.
+    """
+
+    def __init__(self, command: str, schema: type, overrides: list[str]) -> None:
+        self.command, self.schema = command, schema
+        with open_hydra(command, schema) as loader:
+            cfg = compose_config(command, overrides, RunMode.MULTIRUN)
+            self.hydra, self.typed = cfg.hydra, cfg.hydra.overrides.task
+            # Overrides of the command line replace the parameters of a sweep preset.
+            lines = [f"{key}={value}" for key, value in (cfg.hydra.sweeper.params or {}).items()]
+            lines += [line for line in self.typed if not line.startswith("+sweep=")]
+            parsed = OverridesParser.create(config_loader=loader).parse_overrides(lines)
+        self.overrides = {override.get_key_element(): override for override in parsed}
+        choices = self.hydra.runtime.choices
+        if (launcher := choices["hydra/launcher"]) not in LAUNCHERS:
+            raise SettingsError(
+                f"hydra/launcher={launcher}: the options are {', '.join(LAUNCHERS)}"
+            )
+        self.is_search = choices["hydra/sweeper"] != "basic"
+        self.folder = Path(cfg.hydra.sweep.dir)
+        self.name = run_name(cfg.run, self.typed)
+        self.jobs = self._list_jobs()
+        for job in self.jobs:
+            compose(command, schema, job)
+
+    def _list_jobs(self) -> list[list[str]]:
+        values = [list_values(override) for override in self.overrides.values()]
+        if self.is_search:
+            count = max(map(len, values), default=1)
+            return [[lines[job % len(lines)] for lines in values] for job in range(count)]
+        if intervals := [o.input_line for o in self.overrides.values() if o.is_interval_sweep()]:
+            raise SettingsError(
+                f"{intervals[0]}: add hydra/sweeper=optuna to sample from an interval",
+                code="needs-search",
+            )
+        return [list(job) for job in product(*values)]
+
+    def run_jobs(self, overrides: list[list[str]], first: int = 0) -> list[dict[str, Any]]:
+        """Run the jobs that are not finished, and log each as it ends.
+
+        A failed job does not stop the others.
+
+        Args:
+            overrides: The overrides of each job.
+            first: Number of the first job.
+
+        Returns:
+            The record of each job (`conf.multirun.table.read_job`).
+        """
+        jobs = [self._job(number, o) for number, o in enumerate(overrides, first)]
+        if len(jobs) > 1:
+            log.info("sweep %s: %d jobs", self.folder, len(jobs))
+        if first == 0:
+            # Jobs of an earlier, longer sweep are not part of this sweep's table.
+            for number in [old["job"] for old in read_jobs(self.folder) if old["job"] >= len(jobs)]:
+                (self.folder / str(number) / JOB_FILE).unlink()
+        unfinished = [job for job in jobs if not self._is_finished(job)]
+        launcher = instantiate(self.hydra.launcher, _convert_="all")
+        with closing(launcher.run(unfinished)) as ended:
+            for job, succeeded in ended:
+                _record_end(job, succeeded)
+        return [read_job(job.folder) for job in jobs]
+
+    def _job(self, number: int, overrides: list[str]) -> Job:
+        title = " ".join(o.lstrip("+") for o in overrides if o not in self.typed)
+        hydra = self.hydra.overrides.hydra
+        passed_on = [o for o in hydra if not o.lstrip("+").startswith(PARENT_ONLY)]
+        run = f"run='{self.name}/{number}'"
+        command = [sys.executable, "-m", self.command, *overrides, run, *passed_on]
+        return Job(self.folder / str(number), f"#{number} {title}", overrides, command)
+
+    def _is_finished(self, job: Job) -> bool:
+        """Whether the job has run to its end before, with the settings of this sweep."""
+        if not (job.folder / "metrics.json").exists():
+            return False
+        settings = compose(self.command, self.schema, job.overrides)
+        if differences(job.folder, asdict(settings)):
+            return False
+        log.info("%s: already finished, skipped", job.title)
+        _record(job, "done")
+        return True
+
+
+def list_values(override: Override) -> list[str]:
+    """The override with each value of a sweep, or with both ends of an interval."""
+    key = override.get_key_element()
+    if override.is_interval_sweep():
+        interval = override.value()
+        return [f"{key}={interval.start}", f"{key}={interval.end}"]
+    if override.is_sweep_override():
+        return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    return [str(override.input_line)]
+
+
+def _record_end(job: Job, succeeded: bool) -> None:
+    """Record and log how a job ended."""
+    _record(job, "done" if succeeded else "failed")
+    if succeeded:
+        values = list(read_job(job.folder)["metrics"].items())[:3]
+        log.info("%s: done%s", job.title, "".join(f", {name} {v:.4g}" for name, v in values))
+        return
+    output = job.output.read_text(errors="replace") if job.output.exists() else ""
+    lines = "".join(f"\n    {line}" for line in output.splitlines()[-5:])
+    log.error("%s: failed, last lines of %s:%s", job.title, job.output, lines)
+
+
+def _record(job: Job, status: str) -> None:
+    # A job that the cluster did not start has no folder.
+    job.folder.mkdir(parents=True, exist_ok=True)
+    write_json(job.folder / JOB_FILE, {"overrides": job.overrides, "status": status})
