@@ -1,4 +1,4 @@
-"""A small real server on this machine that speaks JSON."""
+"""A small HTTP server on this machine with JSON requests and responses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 class LocalServer(ThreadingHTTPServer):
-    """Serves from the moment it is made; what its handler reads is set before."""
+    """A server that starts when it is created. Set the attributes of its handler before."""
 
     daemon_threads = True
 
@@ -22,7 +22,7 @@ class LocalServer(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_port}/v1"
 
     def handle_error(self, *_: object) -> None:
-        """A client that hangs up is nothing to tell."""
+        """Ignore clients that close the connection."""
 
     def stop(self) -> None:
         self.shutdown()
@@ -30,7 +30,7 @@ class LocalServer(ThreadingHTTPServer):
 
 
 class JsonHandler(BaseHTTPRequestHandler):
-    """`get` answers a GET and `post` what was posted, both with `say`."""
+    """Subclasses define `get()` and `post(body)`, which call `respond`."""
 
     def log_message(self, *_: object) -> None:
         pass
@@ -41,7 +41,9 @@ class JsonHandler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         self.post(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
 
-    def say(self, status: int, body: dict[str, Any], headers: dict[str, str] | None = None) -> None:
+    def respond(
+        self, status: int, body: dict[str, Any], headers: dict[str, str] | None = None
+    ) -> None:
         content = json.dumps(body).encode()
         self.send_response(status)
         self.send_header("Content-Type", "application/json")

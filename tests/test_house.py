@@ -1,4 +1,4 @@
-"""Laws of the whole tree: imports, commands, folders, errors."""
+"""Rules for the whole tree: imports, commands, folders, errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("conf", "data", "teacher", "models", "train", "evaluation")
-"""In the direction of the data: a package imports from itself and from those before it."""
+"""In the order of the data flow: a package imports only from itself and from those before it."""
 HEAVY = {"torch", "transformers", "sentence_transformers", "pybullet", "matplotlib", "datasets"}
 MODULES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 COMMANDS = sorted(

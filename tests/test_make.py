@@ -1,4 +1,4 @@
-"""The commands of `make paper-tiny` and `make paper` compose and stand in a valid order."""
+"""The commands of `make paper-tiny` and `make paper` compose and have a valid order."""
 
 from __future__ import annotations
 

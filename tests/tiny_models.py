@@ -1,4 +1,4 @@
-"""A student and a retriever of a few thousand weights, built by the project's own means."""
+"""Fixtures of a student and a retriever with a few thousand weights."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def model(processor: ProcessorMixin) -> PreTrainedModel:
 
 @pytest.fixture(scope="session")
 def saved_base(tmp_path_factory: pytest.TempPathFactory, processor: ProcessorMixin) -> str:
-    """A base on disk, as a preset's `model` names one."""
+    """The folder of a saved base."""
     folder = tmp_path_factory.mktemp("base")
     build_model(SMALL, len(processor.tokenizer)).save_pretrained(folder)
     processor.save_pretrained(folder)
@@ -97,7 +97,7 @@ def frames(micro_store: Store) -> FrameReader:
 def few_steps(
     micro: BenchmarkConfig, micro_store: Store, nf4_cfg: StudentConfig
 ) -> Callable[..., SftCommand]:
-    """Settings of `train.sft` for a few steps over the small base, some of train's others."""
+    """A function from overrides of `train` to settings of `train.sft` for a few steps."""
 
     def settings(**train: object) -> SftCommand:
         few = SftTrainConfig(
@@ -136,16 +136,16 @@ def contrastive_settings(
 
 @pytest.fixture(scope="session")
 def queries(micro_store: Store) -> list[RetrievalQuery]:
-    """Ten of several lengths, some of one prefix and some that name one frame."""
-    asked = micro_store.retrieval("train")[:6]
-    again = [
+    """Ten queries; some share a prefix, some share a frame."""
+    queries = micro_store.retrieval("train")[:6]
+    longer = [
         replace(
             q,
-            query_id=f"{q.query_id} again",
+            query_id=f"{q.query_id} longer",
             question=f"{q.question} Or else, which frame comes before that?",
             target=q.hard_negatives[0],
-            hard_negatives=(q.target, asked[0].target),
+            hard_negatives=(q.target, queries[0].target),
         )
-        for q in asked[1:5]
+        for q in queries[1:5]
     ]
-    return [*asked, *again]
+    return [*queries, *longer]

@@ -20,7 +20,22 @@ ROUTES = ("cot_text", "predict_caption", "predict_image", "predict_generated_ima
 
 
 @dataclass
-class SelectCommand(CommandConfig):
+class ItemsCommand(CommandConfig):
+    """Settings of the commands that measure selection items."""
+
+    limit: int | None = setting(None, least=1)
+    """Maximum number of test items, spread evenly over the families; null uses all."""
+    suite: str | None = setting(None, ("matched_anchor", None))
+    """matched_anchor measures the pairs of items that differ only in the question's anchor (event
+    or time); null measures the benchmark's standard items."""
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        if self.suite == "matched_anchor" and self.limit == 1:
+            yield "limit=1 with suite=matched_anchor: a pair has two items; give limit=2 or more"
+
+
+@dataclass
+class SelectCommand(ItemsCommand):
     benchmark: BenchmarkConfig = MISSING
     student: StudentConfig = MISSING
     server: ServerConfig = field(default_factory=ServerConfig)
@@ -36,19 +51,15 @@ class SelectCommand(CommandConfig):
     constrained."""
     batch: int = setting(16, least=1)
     """Items per forward pass."""
-    limit: int | None = setting(None, least=1)
-    """Maximum number of test items, spread evenly over the families; null uses all."""
     seed: int = setting(0, least=0)
     """Seed of the items that `limit` samples, of sampled responses and of the bootstrap."""
-    suite: str | None = setting(None, ("matched_anchor", None))
-    """matched_anchor measures the pairs of items that differ only in the question's anchor (event
-    or time); null measures the benchmark's standard items."""
     control: str | None = setting(None, ("candidate_only", "shuffled_prefix", None))
     """candidate_only leaves out the prefix, shuffled_prefix shuffles its frames; each control is
     measured beside the unchanged items. null measures only the unchanged items."""
 
-    def find_problems(self, group: str) -> list[str]:
-        return check_suite(self) + check_choices("modes", self.modes, RESPONSE_MODES)
+    def find_problems(self, group: str) -> Iterator[str]:
+        yield from super().find_problems(group)
+        yield from check_choices("modes", self.modes, RESPONSE_MODES)
 
 
 @dataclass
@@ -78,15 +89,8 @@ class RetrieveCommand(EmbeddingCommand):
 
 
 @dataclass
-class SimilarityCommand(EmbeddingCommand):
-    limit: int | None = setting(None, least=1)
-    """Maximum number of test items, spread evenly over the families; null uses all."""
-    suite: str | None = setting(None, ("matched_anchor", None))
-    """matched_anchor measures the pairs of items that differ only in the question's anchor (event
-    or time); null measures the benchmark's standard items."""
-
-    def find_problems(self, group: str) -> list[str]:
-        return check_suite(self)
+class SimilarityCommand(ItemsCommand, EmbeddingCommand):
+    """Settings of evaluation.similarity."""
 
 
 @dataclass
@@ -212,10 +216,3 @@ class ExportStudyCommand(CommandConfig):
 
     def find_problems(self, group: str) -> list[str]:
         return check_run(self.run, f"{self.checkpoints}/study")
-
-
-def check_suite(cfg: SelectCommand | SimilarityCommand) -> list[str]:
-    """A limit that leaves no pair of a suite of pairs."""
-    if cfg.suite == "matched_anchor" and cfg.limit == 1:
-        return ["limit=1 with suite=matched_anchor: a pair has two items; give limit=2 or more"]
-    return []

@@ -34,7 +34,7 @@ class Handler(JsonHandler):
             return
         model = {"id": "served", "object": "model", "root": self.server.root, "parent": None}
         adapter = {"id": "adapter", "object": "model", "root": "lora", "parent": "served"}
-        self.say(200, {"object": "list", "data": [model, adapter]})
+        self.respond(200, {"object": "list", "data": [model, adapter]})
 
     def post(self, request: dict[str, Any]) -> None:
         if self.locked():
@@ -47,10 +47,10 @@ class Handler(JsonHandler):
             said = {"content": said}
         elif isinstance(said, bytes):
             image = {"b64_json": base64.b64encode(said).decode()}
-            self.say(200, {"created": 0, "data": [image]})
+            self.respond(200, {"created": 0, "data": [image]})
             return
         if status := said.get("status"):
-            self.say(status, {"error": {"message": said.get("message", "fault")}})
+            self.respond(status, {"error": {"message": said.get("message", "fault")}})
             return
         message = {"role": "assistant", "content": said.get("content")}
         if "reasoning" in said:
@@ -58,11 +58,11 @@ class Handler(JsonHandler):
         finish = said.get("finish_reason", "stop")
         choice = {"index": 0, "finish_reason": finish, "message": message}
         body = {"id": "x", "object": "chat.completion", "created": 0, "model": "served"}
-        self.say(200, {**body, "choices": [choice]})
+        self.respond(200, {**body, "choices": [choice]})
 
     def locked(self) -> bool:
         """Whether the key is another, which is told."""
         wanted = self.server.key
         if wrong := wanted is not None and self.headers["Authorization"] != f"Bearer {wanted}":
-            self.say(401, {"error": {"message": "no such key"}})
+            self.respond(401, {"error": {"message": "no such key"}})
         return wrong

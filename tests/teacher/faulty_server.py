@@ -57,9 +57,9 @@ class Handler(JsonHandler):
 
     def get(self) -> None:
         if self.path == "/health":
-            self.say(200, {})
+            self.respond(200, {})
         else:
-            self.say(200, {"object": "list", "data": [{"id": "other", "object": "model"}]})
+            self.respond(200, {"object": "list", "data": [{"id": "other", "object": "model"}]})
 
     def post(self, request: dict[str, Any]) -> None:
         server, prompt = self.server, request["messages"][-1]["content"]
@@ -80,9 +80,9 @@ class Handler(JsonHandler):
 
     def respond(self, request: dict[str, Any], text: str, fault: Fault | None) -> None:
         if isinstance(fault, int):
-            self.say(fault, {"error": {"message": "fault", "type": "t", "code": fault}})
+            self.respond(fault, {"error": {"message": "fault", "type": "t", "code": fault}})
         elif isinstance(fault, dict):
-            self.say(429, {"error": {"message": "slow down"}}, fault)
+            self.respond(429, {"error": {"message": "slow down"}}, fault)
         elif isinstance(fault, bytes):
             self.send_response(200)
             kind = "application/json" if fault[:1] in b"{[" else "text/html"
@@ -102,7 +102,7 @@ class Handler(JsonHandler):
             self.connection.close()
         else:
             text, finish_reason = spoil_text(fault, text) if fault else (text, "stop")
-            self.say(200, completion(text, finish_reason, request.get("n") or 1))
+            self.respond(200, completion(text, finish_reason, request.get("n") or 1))
 
 
 def completion(text: str, finish_reason: str, n: int) -> dict[str, Any]:
