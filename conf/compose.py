@@ -32,6 +32,7 @@ CONFIG_NAMES = {"train.export": "export_model", "evaluation.study.export": "expo
 OVERLAYS = ("exp", "sweep")
 """Groups that are added to a command's presets, as in `+exp=cot`."""
 REMOVED_KEYS: dict[str, str] = {
+    "format": "leave it out: data.export writes a Hugging Face dataset",
     "shown": "use examples instead",
     "cards": "use gpus instead",
     "train.keep": "use train.keep_checkpoints instead",

@@ -24,7 +24,7 @@ def main(cfg: GalleryCommand, run: Run) -> dict[str, float]:
     sheets = []
     for sheet in tqdm(draw_sheets(store, cfg.examples, cfg.seed), desc="drawing", unit="sheet"):
         write_atomically(run.folder / sheet.file, sheet.png)
-        sheets.append((sheet.section, sheet.title, sheet.file))
+        sheets.append(sheet)
     page = run.folder / "index.html"
     write_text(page, render_page(store, sheets))
     log.info("%d sheets: open %s", len(sheets), page)

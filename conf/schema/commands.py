@@ -53,9 +53,6 @@ class StatisticsCommand(CommandConfig):
 @dataclass
 class ExportCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
-    format: str = setting("huggingface", ("huggingface", "clevrer"))
-    """huggingface writes items, queries and databases as a dataset; clevrer writes scenes as videos
-    and annotations in the layout of CLEVRER's release."""
     folder: str = MISSING
     """Folder to write; it must not contain an earlier export."""
     images: bool = True
@@ -70,8 +67,7 @@ class ExportCommand(CommandConfig):
 class GalleryCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     examples: int = setting(3, least=1)
-    """Items per subtype and queries per builder; twice as many counterfactual pairs and object
-    paths."""
+    """Items per subtype, queries per builder, counterfactual queries and matched pairs."""
     seed: int = setting(0, least=0)
     """Seed of the sample of examples."""
 

@@ -9,9 +9,14 @@ from typing import TYPE_CHECKING
 
 from PIL import Image
 
+from data.records import LETTERS, FrameRef, RetrievalQuery, SelectionItem, sample_prefix_frames
+from data.render.frame_cache import FrameReader
+from data.store import Store
+from data.tracks.retrieval.counterfactual import removal_displacement
+from data.world.displacement import cross_scene_displacement
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 INK, GREEN, PINK = "#222222", "#1a7f37", "#ff00aa"
 CELL_WIDTH, CAPTION_HEIGHT, HEADING_HEIGHT = 2.3, 0.5, 0.6
@@ -21,6 +26,10 @@ GAP = 0.12
 RING = 28
 """Diameter of a ring in points."""
 DPI = 100
+PREFIX_FRAMES = 4
+"""Number of frames that represent a prefix on a sheet."""
+AXES = ("framing", "gap", "horizon", "group", "window_family", "difficulty")
+"""Construction axes of selection items that a heading states."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +87,10 @@ def draw_sheet(rows: Sequence[Row]) -> bytes:
         for axes, cell in zip(grid, [*row.prefix, *padding, *row.candidates], strict=False):
             if cell:
                 draw_cell(axes, cell)
-    return encode_figure(figure)
+    buffer = io.BytesIO()
+    # Without the version of matplotlib, equal sheets have equal bytes.
+    figure.savefig(buffer, metadata={"Software": None})
+    return buffer.getvalue()
 
 
 def draw_cell(axes: Axes, cell: Cell) -> None:
@@ -95,10 +107,85 @@ def draw_cell(axes: Axes, cell: Cell) -> None:
         axes.plot(*cell.ring, "o", mfc="none", mec=PINK, markersize=RING, mew=3)
 
 
-def encode_figure(figure: Figure) -> bytes:
-    """Return a figure as the bytes of a PNG, which depend on the drawing alone."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+class ExampleRows:
+    """Turns the items and queries of a store into rows of a contact sheet."""
 
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
-    return buffer.getvalue()
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._frames = FrameReader(store)
+
+    def item(self, item: SelectionItem) -> Row:
+        """Return the prefix and the candidates of a selection item, with the answer marked."""
+        values = {name.replace("_", " "): getattr(item, name) for name in AXES}
+        axes = [f"{name} {value}" for name, value in values.items() if value is not None]
+        details = [item.split, *axes, f"least displacement {item.min_displacement:.0f} px"]
+        candidates = [self._candidate(item, k) for k in range(len(item.candidates))]
+        return Row(item.item_id, ", ".join(details), item.question, self._prefix(item), candidates)
+
+    def query(self, query: RetrievalQuery) -> Row:
+        """Return the prefix, the target and the hard negatives of a query.
+
+        The first hard negative of a counterfactual query is the factual frame: the query's own
+        scene at the target's moment. A ring marks the object that the counterfactual scene lacks.
+        """
+        target = self._cell(query.target, "target", _moment(query, query.target), is_answer=True)
+        cells, negatives, removed = [target], list(query.hard_negatives), None
+        if query.removed_object is not None:
+            scene = self._store.scene(query.scene_id)
+            without = self._store.scene(query.target.scene_id)
+            removed = [look.phrase for look in scene.objects].index(query.removed_object)
+            shift = removal_displacement(scene, without, removed)[query.target.frame]
+            caption = f"others differ by {shift:.0f} px"
+            cells.insert(0, self._cell(negatives.pop(0), "factual", caption, ring_on=removed))
+        for frame in negatives:
+            caption = (
+                f"{_moment(query, frame)}, {self._displacement(query.target, frame):.0f} px away"
+            )
+            cells.append(self._cell(frame, "wrong time", caption))
+        details = f"{query.split}, anchor {query.anchor}"
+        return Row(query.query_id, details, query.question, self._prefix(query, removed), cells)
+
+    def _prefix(
+        self, record: SelectionItem | RetrievalQuery, ring_on: int | None = None
+    ) -> list[Cell]:
+        frames = sample_prefix_frames(record.prefix_start, record.prefix_stop, PREFIX_FRAMES)
+        return [
+            self._cell(FrameRef(record.scene_id, f), f"frame {f}", ring_on=ring_on) for f in frames
+        ]
+
+    def _candidate(self, item: SelectionItem, position: int) -> Cell:
+        candidate = item.candidates[position]
+        distance, nearest = min(
+            (self._displacement(candidate, other), letter)
+            for letter, other in zip(LETTERS, item.candidates, strict=True)
+            if other != candidate
+        )
+        return self._cell(
+            candidate,
+            f"{LETTERS[position]}: {candidate.source}",
+            f"{_moment(item, candidate)}, {distance:.0f} px from {nearest}",
+            is_answer=position == item.answer,
+        )
+
+    def _cell(
+        self, frame: FrameRef, *caption: str, is_answer: bool = False, ring_on: int | None = None
+    ) -> Cell:
+        image, ring = self._frames.image(frame.scene_id, frame.frame), None
+        if ring_on is not None:
+            scene = self._store.scene(frame.scene_id)
+            x, y = scene.image_positions[frame.frame, ring_on] / scene.image_size
+            ring = (x * image.width, y * image.height)
+        return Cell(image, caption, is_answer, ring)
+
+    def _displacement(self, one: FrameRef, two: FrameRef) -> float:
+        scenes = self._store.scene(one.scene_id), self._store.scene(two.scene_id)
+        return cross_scene_displacement(scenes[0], one.frame, scenes[1], two.frame)
+
+
+def _moment(record: SelectionItem | RetrievalQuery, frame: FrameRef) -> str:
+    """Describe when a frame occurs: its index and its offset in frames from the end of the prefix.
+
+    The offset is omitted unless the frame is of the record's scene or of its counterfactual scene.
+    """
+    own = frame.scene_id.partition("-without-")[0] == record.scene_id
+    return f"frame {frame.frame}" + (f" ({frame.frame - record.prefix_stop:+d})" if own else "")

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
-from data.publish.contact_sheets import draw_sheet
-from data.publish.examples import ExampleRows
-from data.publish.trajectories import draw_trajectories
-from data.records import FAMILIES, SPLITS
+from data.publish.contact_sheets import ExampleRows, Row, draw_sheet
+from data.records import SPLITS
 from data.store import Store
 from data.tracks.controls import MATCHED_ANCHOR, pair_items
 from data.tracks.quota import named_rng
 
-TEMPLATE = "templates/gallery.html"
-
 
 @dataclass(frozen=True)
 class Sheet:
-    """A picture of some items, queries or scenes, and its section and title on the page."""
+    """A picture of some items or queries, and its section and title on the page."""
 
     section: str
     title: str
@@ -31,64 +27,45 @@ class Sheet:
 
 
 def draw_sheets(store: Store, examples: int, seed: int) -> Iterator[Sheet]:
-    """Draw every sheet, with `examples` of each subtype and builder sampled by `seed`."""
+    """Draw a sheet for each subtype, builder and control, with `examples` sampled by `seed`."""
     rows = ExampleRows(store)
-    for family in FAMILIES:
-        items = [i for i in store.selection() if i.family == family]
-        for subtype, group in _group(items, "subtype").items():
-            png = draw_sheet([rows.item(i) for i in _sample(group, examples, seed, subtype)])
-            title = f"{subtype} ({len(group):,} items)"
-            yield Sheet(f"Selection: {family}", title, f"{family}-{subtype}.png", png)
-    for builder, group in sorted(_group(store.retrieval(), "builder").items()):
-        sample = _sample(group, examples, seed, f"builder {builder}")
-        title = f"builder {builder} ({len(group):,} queries)"
-        png = draw_sheet([rows.query(q) for q in sample])
-        yield Sheet("Retrieval: future", title, f"retrieval-builder-{builder}.png", png)
-    if queries := store.retrieval(pool="counterfactual"):
-        sample = _sample(queries, 2 * examples, seed, "counterfactual")
-        title = f"the scene with and without an object ({len(queries):,} queries)"
-        png = draw_sheet([rows.counterfactual(q) for q in sample])
-        yield Sheet("Retrieval: counterfactual", title, "counterfactual.png", png)
-    if pairs := pair_items(store.selection(suite=MATCHED_ANCHOR)):
-        sample = _sample(pairs, examples, seed, MATCHED_ANCHOR)
-        title = f"pairs that differ only in the question's anchor ({len(pairs):,} pairs)"
-        png = draw_sheet([rows.item(item) for pair in sample for item in pair])
-        yield Sheet("Controls", title, f"controls-{MATCHED_ANCHOR}.png", png)
-    # The floor is drawn as the standard camera sees it: other suites have other cameras.
-    if store.suite == "dynapix" and store.manifest["config"]["simulator"] == "bullet":
-        names = [name for split in SPLITS for name in store.scene_ids(split)]
-        scenes = [store.scene(name) for name in _sample(names, 2 * examples, seed, "paths")]
-        title = "from start (hollow) to end (full), a dot each second, a cross at each collision"
-        png = draw_trajectories(scenes)
-        yield Sheet("Trajectories on the floor", title, "trajectories.png", png)
+    groups: dict[tuple[str, str, str], list[list[Callable[[], Row]]]] = defaultdict(list)
+    for item in store.selection():
+        group = f"Selection: {item.family}", item.subtype, f"{item.family}-{item.subtype}"
+        groups[group].append([partial(rows.item, item)])
+    for query in sorted(store.retrieval(), key=lambda query: query.builder):
+        name = f"builder {query.builder}"
+        group = "Retrieval: future", name, f"retrieval-{name.replace(' ', '-')}"
+        groups[group].append([partial(rows.query, query)])
+    for query in store.retrieval(pool="counterfactual"):
+        group = "Retrieval: counterfactual", "with and without an object", "counterfactual"
+        groups[group].append([partial(rows.query, query)])
+    for pair in pair_items(store.selection(suite=MATCHED_ANCHOR)):
+        group = "Controls", "differing only in the anchor", f"controls-{MATCHED_ANCHOR}"
+        groups[group].append([partial(rows.item, item) for item in pair])
+    for (section, title, name), records in groups.items():
+        order = named_rng(seed, "gallery", name).permutation(len(records))[:examples]
+        png = draw_sheet([make_row() for k in sorted(order) for make_row in records[k]])
+        yield Sheet(section, f"{title} ({len(records):,})", f"{name}.png", png)
 
 
-def _group(records: Iterable[Any], field: str) -> dict[Any, list[Any]]:
-    groups = defaultdict(list)
-    for record in records:
-        groups[getattr(record, field)].append(record)
-    return groups
-
-
-def _sample(population: Sequence[Any], count: int, seed: int, name: str) -> list[Any]:
-    sample = named_rng(seed, "gallery", name).permutation(len(population))[:count]
-    return [population[k] for k in sorted(sample)]
-
-
-def render_page(store: Store, sheets: Sequence[tuple[str, str, str]]) -> str:
-    """Return the HTML page of sheets in its folder, each a (section, title, file)."""
+def render_page(store: Store, sheets: Sequence[Sheet]) -> str:
+    """Return the HTML page of sheets that are in its folder."""
     from jinja2 import Environment
 
     sections = defaultdict(list)
-    for section, title, file in sheets:
-        anchor = Path(file).stem
-        sections[section].append((anchor, anchor.partition("-")[2] or anchor, title, file))
-    template = Environment(autoescape=True).from_string(
-        (files("data.publish") / TEMPLATE).read_text()
-    )
-    return template.render(
-        store=store,
-        sections=sections,
-        fps=store.scene(store.scene_ids("test")[0]).fps,
-        scenes=sum(len(store.scene_ids(split)) for split in SPLITS),
+    for sheet in sheets:
+        anchor = Path(sheet.file).stem
+        name = anchor.partition("-")[2] or anchor
+        sections[sheet.section].append((anchor, name, sheet.title, sheet.file))
+    text = (files("data.publish") / "templates/gallery.html").read_text()
+    return (
+        Environment(autoescape=True)
+        .from_string(text)
+        .render(
+            store=store,
+            sections=sections,
+            fps=store.scene(store.scene_ids("test")[0]).fps,
+            scenes=sum(len(store.scene_ids(split)) for split in SPLITS),
+        )
     )

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from data.publish.baselines import BASELINES, score_baselines
-from data.records import LETTERS, SPLITS, SelectionItem
+from data.records import FAMILIES, LETTERS, SPLITS, SelectionItem
 from data.store import Store
 from data.world.displacement import cross_scene_displacement
 
@@ -59,25 +59,20 @@ def count_cells(
     items: list[SelectionItem], quotas: dict[str, dict[str, dict[str, int]]]
 ) -> dict[str, dict[str, int]]:
     """Return items and quotas by split, for each family, window group and subtype."""
-    counts: dict[str, dict[str, int]] = {}
-
-    def add(family: str, subtype: str, column: str, count: int) -> None:
-        names = [family, f"{family}/{subtype}"]
-        if family == "window":
-            names.append(f"window/{subtype.partition('_')[0]}")
-        for name in names:
-            row = counts.setdefault(
-                name, dict.fromkeys((*SPLITS, *(f"{split} quota" for split in SPLITS)), 0)
-            )
-            row[column] += count
-
-    for item in items:
-        add(item.family, item.subtype, item.split, 1)
-    for family in ("event", "time", "window"):
-        for subtype, quota in quotas[family].items():
-            for split in SPLITS:
-                add(family, subtype, f"{split} quota", quota[split])
-    return dict(sorted(counts.items()))
+    counts = [(item.family, item.subtype, item.split, 1) for item in items]
+    counts += [
+        (family, subtype, f"{split} quota", quotas[family][subtype][split])
+        for family in FAMILIES
+        for subtype in quotas[family]
+        for split in SPLITS
+    ]
+    rows = pd.DataFrame(counts, columns=["family", "subtype", "column", "count"])
+    group = rows["subtype"].str.partition("_")[0].where(rows["family"] == "window")
+    names = rows["family"], rows["family"] + "/" + rows["subtype"], rows["family"] + "/" + group
+    cells = pd.concat([rows.assign(cell=name) for name in names])
+    table = cells.pivot_table("count", "cell", "column", aggfunc="sum", fill_value=0)
+    columns = [*SPLITS, *(f"{split} quota" for split in SPLITS)]
+    return table.reindex(columns=columns, fill_value=0).to_dict("index")
 
 
 def _describe_item(item: SelectionItem, store: Store) -> dict[str, Any]:
@@ -123,20 +118,7 @@ def format_statistics(statistics: dict[str, Any]) -> str:
         + candidates.to_string(),
         "Items and quotas\n" + cells.to_string(),
     ]
-    margin = hard_margin(statistics["baselines"])
-    if margin is not None:
-        sections[1] += (
-            f"\nThe candidate nearest to the prefix is the target {100 * margin:.1f} points less "
-            "often in\nhard window items than in easy ones."
-        )
     return "\n\n".join(sections)
-
-
-def hard_margin(baselines: dict[str, dict[str, float]]) -> float | None:
-    """Return by how much the nearest candidate is more often right in easy than in hard window
-    items, or None without such items."""
-    easy, hard = (baselines.get(f"window, {difficulty}") for difficulty in ("easy", "hard"))
-    return easy["nearest"] - hard["nearest"] if easy and hard else None
 
 
 def _join(counts: dict[str, int]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,22 +27,10 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    # h5py raises a KeyError for a damaged object, with the message of the HDF5 library. A missing
-    # key of our own dictionaries is a bug, not a damaged file.
-    except (OSError, RuntimeError, KeyError) as error:
-        if isinstance(error, KeyError) and not _is_raised_by_h5py(error):
-            raise
+    except (OSError, RuntimeError) as error:
         raise RecordError(
             f"{path} is damaged, cut off or not HDF5: {error}", "damaged-file"
         ) from error
-
-
-def _is_raised_by_h5py(error: BaseException) -> bool:
-    """Whether the innermost frame of a traceback is h5py's."""
-    trace = error.__traceback__
-    while trace.tb_next is not None:
-        trace = trace.tb_next
-    return trace.tb_frame.f_globals.get("__name__", "").startswith("h5py")
 
 
 def locate(parent: h5py.Group, *keys: str) -> str:
@@ -51,33 +39,33 @@ def locate(parent: h5py.Group, *keys: str) -> str:
 
 
 def get_group(parent: h5py.Group, key: str) -> h5py.Group:
-    """Return a group of `parent`. Raises RecordError if it is missing."""
-    if key not in parent or not hasattr(parent[key], "keys"):
-        raise RecordError(f"{locate(parent, key)} is missing, expected a group")
-    return parent[key]
+    """Return a group of `parent`. Raises RecordError if it is missing or damaged."""
+    return _get(parent, (key,), "keys")
 
 
-def get_dataset(parent: h5py.Group, *names: str) -> h5py.Dataset:
-    """Return the first dataset of `names` that exists. Raises RecordError if none does."""
-    for name in names:
-        if name in parent and hasattr(parent[name], "dtype"):
-            return parent[name]
-    raise RecordError(f"{locate(parent, names[0])} is missing, expected a dataset")
+def get_dataset(parent: h5py.Group, key: str) -> h5py.Dataset:
+    """Return a dataset of `parent`. Raises RecordError if it is missing or damaged.
+
+    Later versions of Physion add a suffix to the names of datasets of a camera.
+    """
+    return _get(parent, (key, f"{key}_cam0"), "dtype")
 
 
-def read_floats(parent: h5py.Group, *names: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Return a dataset as float32 of `shape`, in which None is any length."""
-    dataset = get_dataset(parent, *names)
-    return finite_array(dataset[()], shape, locate(dataset))
+def _get(parent: h5py.Group, keys: tuple[str, ...], attribute: str) -> Any:
+    """The first of `keys` in `parent`, which must have an attribute."""
+    for key in keys:
+        # None if it is missing or its header is damaged.
+        child = parent.get(key)
+        if hasattr(child, attribute):
+            return child
+    if any(key in parent for key in keys):
+        raise RecordError(f"{locate(parent, keys[0])} is damaged", "damaged-file")
+    raise RecordError(f"{locate(parent, keys[0])} is missing")
 
 
-def read_integers(parent: h5py.Group, name: str, *tail: int) -> np.ndarray:
-    """Return a dataset as int64 of shape (any, *tail); an empty one may have another shape."""
-    dataset = get_dataset(parent, name)
-    values = np.asarray(dataset[()])
-    if values.dtype.kind not in "iuf" or values.size % int(np.prod(tail)):
-        raise RecordError(
-            f"{locate(dataset)}: {values.dtype} of shape {values.shape}, expected integers of "
-            f"shape (any{''.join(f', {n}' for n in tail)})"
-        )
-    return values.reshape(-1, *tail).astype(np.int64)
+def read_array(
+    parent: h5py.Group, key: str, shape: tuple[int, ...], dtype: type = np.float32
+) -> np.ndarray:
+    """Return a dataset as an array of `shape`, in which -1 is any length."""
+    dataset = get_dataset(parent, key)
+    return finite_array(dataset[()], shape, locate(dataset), dtype)

@@ -17,12 +17,12 @@ import numpy as np
 from PIL import Image
 
 from data.records import Landing, Scene
-from data.releases.movi_a_formats import FPS, FRAMES, MoviExample, read_folder, read_record
-from data.releases.tfrecord import feature_values, read_example, record_offsets
+from data.releases.movi_a_formats import FPS, FRAMES, read_folder, read_record
+from data.releases.tfrecord import feature_values, read_example, record_ranges
 from data.releases.validation import RecordError, check_unique_scenes, decode_image, scene_id
 from data.world.events import first_contacts
 
-LAYOUT = (
+FOLDERS = (
     "a folder per scene with metadata.json, events.json and rgba_00000.png and so on, or "
     "movi_a-train.tfrecord-00000-of-00512 and so on"
 )
@@ -35,9 +35,6 @@ UPRIGHT = 0.7
 def list_scenes(folder: Path) -> list[Path]:
     """Return one path per scene, in order: its metadata.json, or a shard's path and the record's
     number (`movi_a-train.tfrecord-00000-of-00512/00003`).
-
-    Raises:
-        UserError: The folder contains no scene, or a scene twice.
     """
     # TensorFlow Datasets may write a metadata.json too, beside dataset_info.json.
     folders = [
@@ -48,10 +45,10 @@ def list_scenes(folder: Path) -> list[Path]:
     records = [
         shard / f"{number:05d}"
         for shard in folder.rglob("movi_a-*.tfrecord-*")
-        for number in range(len(record_offsets(shard)))
+        for number in range(len(record_ranges(shard)))
     ]
     id_of = partial(_scene_id, folder=folder)
-    return check_unique_scenes(folder, sorted(folders) + sorted(records), id_of, LAYOUT)
+    return check_unique_scenes(folder, sorted(folders) + sorted(records), id_of, FOLDERS)
 
 
 def _scene_id(path: Path, folder: Path) -> str:
@@ -65,94 +62,73 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     """Return the scene at a path of `list_scenes`.
 
     Visible fractions are unknown (NaN); an object is in view if it has a visible pixel.
-
-    Raises:
-        RecordError: The scene does not have the layout of MoVi-A's release.
     """
     is_folder = path.name == "metadata.json"
-    example = read_folder(path.parent) if is_folder else read_record(path)
+    footage = path.parent if is_folder else path
+    example = read_folder(footage) if is_folder else read_record(footage)
+    _list_images(footage)
     count = len(example.objects)
-    is_object = (example.pairs >= 0) & (example.pairs < count)
-    between = is_object.all(axis=1) & (example.frames < FRAMES)
-    contacts = zip(example.frames[between], example.pairs[between], strict=True)
-    arrays = {key: array.swapaxes(0, 1) for key, array in example.arrays.items()}
-    visibility = arrays.pop("visibility")
-    # w x y z to x y z w.
-    arrays["quaternions"] = np.roll(arrays["quaternions"], -1, axis=-1)
-    arrays["image_positions"] = arrays["image_positions"] * np.float32(example.image_size)
-    scene = Scene(
+    pairs, frames = (example.contacts[key].astype(int) for key in ("instances", "frame"))
+    is_object = (pairs >= 0) & (pairs < count)
+    collides = is_object.all(axis=1) & (frames < FRAMES)
+    states = {key: array.swapaxes(0, 1) for key, array in example.states.items()}
+    return Scene(
         scene_id=_scene_id(path, folder),
         split=split,
         objects=example.objects,
-        collisions=first_contacts((int(frame), (int(a), int(b))) for frame, (a, b) in contacts),
-        **arrays,
-        in_view=visibility > 0,
+        collisions=first_contacts(
+            zip(frames[collides].tolist(), pairs[collides].tolist(), strict=True)
+        ),
+        positions=states["positions"],
+        # From w x y z to x y z w.
+        quaternions=np.roll(states["quaternions"], -1, axis=-1),
+        velocities=states["velocities"],
+        angular_velocities=states["angular_velocities"],
+        image_positions=states["image_positions"] * np.float32(example.image_size),
+        in_view=states["visibility"] > 0,
         visible_fraction=np.full((FRAMES, count), np.nan, np.float32),
         image_size=example.image_size,
         fps=FPS,
-        landings=_find_landings(example, is_object),
-        footage=(path.parent if is_folder else path).relative_to(folder).as_posix(),
+        landings=_find_landings(example.contacts, pairs, frames, is_object),
+        footage=footage.relative_to(folder).as_posix(),
     )
-    check_frames(scene, folder)
-    return scene
 
 
-def _find_landings(example: MoviExample, is_object: np.ndarray) -> tuple[Landing, ...]:
+def _find_landings(
+    contacts: dict[str, np.ndarray], pairs: np.ndarray, frames: np.ndarray, is_object: np.ndarray
+) -> tuple[Landing, ...]:
     """Each object's first contact with the floor. All objects start in the air; an object on
     the floor in the first frame does not land."""
     on_floor = (
         (is_object.sum(axis=1) == 1)
-        & (np.abs(example.contact_positions[:, 2]) < FLOOR)
-        & (np.abs(example.normals[:, 2]) > UPRIGHT)
+        & (np.abs(contacts["position"][:, 2]) < FLOOR)
+        & (np.abs(contacts["contact_normal"][:, 2]) > UPRIGHT)
     )
-    frames, objects = example.frames[on_floor], example.pairs[on_floor][is_object[on_floor]]
-    landings = [Landing(int(frames[objects == k].min()), int(k)) for k in np.unique(objects)]
-    in_video = [landing for landing in landings if 0 < landing.frame < FRAMES]
-    return tuple(sorted(in_video, key=lambda landing: (landing.frame, landing.object)))
-
-
-def check_frames(scene: Scene, folder: Path) -> None:
-    """Check that all frames of a scene exist, without decoding them.
-
-    Raises:
-        RecordError: A frame is missing.
-    """
-    footage = folder / str(scene.footage)
-    if footage.is_dir():
-        files = [_frame_file(footage, frame) for frame in range(scene.frames)]
-        if missing := [file for file in files if not file.exists()]:
-            raise RecordError(
-                f"{missing[0]} is missing, as are {len(missing)} of {scene.frames} frames",
-                "missing-file",
-            )
-        return
-    count = len(_read_video(footage))
-    if count != scene.frames:
-        raise RecordError(f"{footage} has {count} frames, expected {scene.frames}")
+    first: dict[int, int] = {}
+    for frame, k in sorted(
+        zip(frames[on_floor], pairs[on_floor][is_object[on_floor]], strict=True)
+    ):
+        first.setdefault(int(k), int(frame))
+    return tuple(Landing(frame, k) for k, frame in first.items() if 0 < frame < FRAMES)
 
 
 def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
-    """Return frames of a scene as RGB images, by frame index.
-
-    Raises:
-        RecordError: A frame is missing or cannot be decoded.
-    """
+    """Return frames of a scene as RGB images, by frame index."""
     footage = folder / str(scene.footage)
-    check_frames(scene, folder)
-    if footage.is_dir():
-        files = {frame: _frame_file(footage, frame) for frame in frames}
-        return {frame: decode_image(file.read_bytes(), str(file)) for frame, file in files.items()}
-    video = _read_video(footage)
-    return {frame: decode_image(video[frame], f"{footage}: frame {frame}") for frame in frames}
+    images = _list_images(footage)
+    return {frame: decode_image(images[frame], f"{footage}: frame {frame}") for frame in frames}
 
 
-def _frame_file(folder: Path, frame: int) -> Path:
-    return folder / f"rgba_{frame:05d}.png"
-
-
-def _read_video(footage: Path) -> list[bytes]:
-    """The encoded frames of a record, by a shard's path and the record's number."""
-    if not footage.parent.is_file():
-        raise RecordError(f"{footage} is missing", "missing-file")
-    features = read_example(footage.parent, int(footage.name))
-    return list(feature_values(features["video"])) if "video" in features else []
+def _list_images(footage: Path) -> list[Path] | list[bytes]:
+    """The image files of a scene's folder, or the encoded images of its record."""
+    if footage.parent.is_file():
+        features = read_example(footage.parent, int(footage.name))
+        images = list(feature_values(features["video"])) if "video" in features else []
+        if len(images) != FRAMES:
+            raise RecordError(f"{footage} has {len(images)} frames, expected {FRAMES}")
+        return images
+    files = [footage / f"rgba_{frame:05d}.png" for frame in range(FRAMES)]
+    for file in files:
+        if not file.exists():
+            raise RecordError(f"{file} is missing", "missing-file")
+    return files

@@ -10,58 +10,91 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BeforeValidator, Field
 
 from data.records import SceneObject
 from data.releases.tfrecord import feature_values, read_example
-from data.releases.validation import RecordError, check_choice, finite_array, get_field, load_json
+from data.releases.validation import Layout, RecordError, finite_array, read_json
 
 FRAMES, FPS = 24, 12
-APPEARANCE = {
-    "shape": ("cube", "cylinder", "sphere"),
-    "material": ("metal", "rubber"),
-    "color": ("blue", "brown", "cyan", "gray", "green", "purple", "red", "yellow"),
-    "size": ("small", "large"),
-}
+SHAPES = ("cube", "cylinder", "sphere")
+MATERIALS = ("metal", "rubber")
+COLORS = ("blue", "brown", "cyan", "gray", "green", "purple", "red", "yellow")
+SIZES = ("small", "large")
+APPEARANCE = {"shape": SHAPES, "material": MATERIALS, "color": COLORS, "size": SIZES}
 """Words of each attribute, in the order in which TensorFlow Datasets numbers them."""
-KUBRIC_KEYS = {
-    "shape": "shape",
-    "material": "material",
-    "color": "color_label",
-    "size": "size_label",
+STATES = {
+    "positions": (FRAMES, 3),
+    "quaternions": (FRAMES, 4),
+    "velocities": (FRAMES, 3),
+    "angular_velocities": (FRAMES, 3),
+    "image_positions": (FRAMES, 2),
+    "visibility": (FRAMES,),
 }
-ARRAYS = {
-    "positions": (3,),
-    "quaternions": (4,),
-    "velocities": (3,),
-    "angular_velocities": (3,),
-    "image_positions": (2,),
-    "visibility": (),
-}
-"""Shape of each array per object and frame."""
+"""Shape of each array per object."""
+CONTACTS = {"instances": (2,), "frame": (), "position": (3,), "contact_normal": (3,)}
+"""Shape of each array per contact point."""
+
+
+def _check_float(value: object) -> object:
+    if not isinstance(value, float):
+        raise ValueError(f"{value!r} is truncated, expected a float")
+    return value
+
+
+class Instance(Layout):
+    shape: Literal[SHAPES]
+    material: Literal[MATERIALS]
+    color: Literal[COLORS] = Field(alias="color_label")
+    size: Literal[SIZES] = Field(alias="size_label")
+    positions: list
+    quaternions: list
+    velocities: list
+    angular_velocities: list
+    image_positions: list
+    visibility: list
+
+
+class Video(Layout):
+    resolution: tuple[int, int]
+    num_frames: Literal[FRAMES]
+    frame_rate: Literal[FPS]
+
+
+class Metadata(Layout):
+    metadata: Video
+    instances: list[Instance]
+
+
+class Contact(Layout):
+    instances: list
+    frame: Annotated[float, BeforeValidator(_check_float)]
+    position: list
+    contact_normal: list
+
+
+class Events(Layout):
+    collisions: list[Contact]
 
 
 @dataclass(frozen=True)
 class MoviExample:
-    """The content of a scene of N objects and M contact points.
+    """The content of a scene.
 
     Attributes:
-        arrays: (N, F, ...) by the names of `ARRAYS`.
-        pairs: (M, 2) indices of the objects in contact; other indices are the floor or an object
-            that is never visible.
-        frames: (M,) the first frame of the video at or after each contact.
-        contact_positions: (M, 3).
-        normals: (M, 3).
+        states: Arrays by the names of `STATES`, each (objects, ...).
+        contacts: Arrays by the names of `CONTACTS`, each (contact points, ...). `instances` are
+            indices of the objects in contact; other indices are the floor or an object that is
+            never visible. `frame` is the first frame of the video at or after the contact.
     """
 
     objects: tuple[SceneObject, ...]
     image_size: tuple[int, int]
-    arrays: dict[str, np.ndarray]
-    pairs: np.ndarray
-    frames: np.ndarray
-    contact_positions: np.ndarray
-    normals: np.ndarray
+    states: dict[str, np.ndarray]
+    contacts: dict[str, np.ndarray]
 
 
 def read_folder(folder: Path) -> MoviExample:
@@ -70,47 +103,21 @@ def read_folder(folder: Path) -> MoviExample:
     Raises:
         RecordError: A file is missing, damaged or does not have the published layout.
     """
-    where, where_events = str(folder / "metadata.json"), str(folder / "events.json")
-    metadata, events = load_json(where), load_json(where_events)
-    video = get_field(metadata, "metadata", dict, where)
-    frames, rate = (get_field(video, key, int, where) for key in ("num_frames", "frame_rate"))
-    _check_clock(frames, rate, where)
-    instances = get_field(metadata, "instances", list, where)
-    contacts = get_field(events, "collisions", list, where_events)
-    objects = []
-    for instance in instances:
-        look = {name: get_field(instance, key, str, where) for name, key in KUBRIC_KEYS.items()}
-        for name, word in look.items():
-            check_choice(word, APPEARANCE[name], f"{where}: {name}")
-        objects.append(SceneObject(**look))
+    metadata = read_json(folder / "metadata.json", Metadata)
+    events = read_json(folder / "events.json", Events)
 
-    def contact_array(key: str, *tail: int) -> np.ndarray:
-        kind = list if tail else float
-        values = [get_field(contact, key, kind, where_events) for contact in contacts]
-        return finite_array(values, (len(contacts), *tail), f"{where_events}: {key}")
+    def array(rows: list[Instance] | list[Contact], key: str, *shape: int) -> np.ndarray:
+        values = [getattr(row, key) for row in rows]
+        return finite_array(values, (len(rows), *shape), f"{folder}: {key}")
 
-    size = finite_array(get_field(video, "resolution", list, where), (2,), f"{where}: resolution")
+    contacts = {key: array(events.collisions, key, *shape) for key, shape in CONTACTS.items()}
+    contacts["frame"] = np.maximum(np.ceil(contacts["frame"]) - 1, 0)
     return MoviExample(
-        objects=tuple(objects),
-        image_size=(int(size[0]), int(size[1])),
-        arrays={
-            key: finite_array(
-                [get_field(instance, key, list, where) for instance in instances],
-                (len(instances), FRAMES, *tail),
-                f"{where}: {key}",
-            )
-            for key, tail in ARRAYS.items()
-        },
-        pairs=contact_array("instances", 2).astype(int),
-        frames=np.maximum(np.ceil(contact_array("frame")).astype(int) - 1, 0),
-        contact_positions=contact_array("position", 3),
-        normals=contact_array("contact_normal", 3),
+        tuple(SceneObject(i.shape, i.material, i.color, i.size) for i in metadata.instances),
+        metadata.metadata.resolution,
+        {key: array(metadata.instances, key, *shape) for key, shape in STATES.items()},
+        contacts,
     )
-
-
-def _check_clock(frames: int, rate: int, where: str) -> None:
-    if (frames, rate) != (FRAMES, FPS):
-        raise RecordError(f"{where} has {frames} frames at {rate} fps, expected {FRAMES} at {FPS}")
 
 
 def read_record(path: Path) -> MoviExample:
@@ -122,36 +129,26 @@ def read_record(path: Path) -> MoviExample:
     features = read_example(path.parent, int(path.name))
     where = f"{path.parent}: record {int(path.name)}"
 
-    def values(name: str) -> list[bytes] | np.ndarray:
-        return feature_values(get_field(features, name, object, where))
-
     def array(name: str, *shape: int) -> np.ndarray:
-        flat, size = values(name), int(np.prod(shape))
-        if len(flat) != size:
-            raise RecordError(f"{where} has {len(flat)} values of {name!r}, expected {size}")
-        return finite_array(np.reshape(flat, shape), shape, f"{where}: {name}")
+        if name not in features:
+            raise RecordError(f"{where} has no feature {name!r}, which the published layout has")
+        return finite_array(feature_values(features[name]), shape, f"{where}: {name}")
 
     frames, count, width, height = (
         int(array(f"metadata/{key}")) for key in ("num_frames", "num_instances", "width", "height")
     )
-    _check_clock(frames, FPS, where)
-    looks = {}
+    if frames != FRAMES:
+        raise RecordError(f"{where} has {frames} frames, expected {FRAMES}")
+    looks = []
     for name, words in APPEARANCE.items():
         numbers = array(f"instances/{name}_label", count).astype(int)
-        if not ((numbers >= 0) & (numbers < len(words))).all():
-            raise RecordError(
-                f"{where}: {name}_label has {numbers.max()}, expected 0 to {len(words) - 1}"
-            )
-        looks[name] = [words[n] for n in numbers]
-    rows = len(values("events/collisions/frame"))
+        if not set(numbers) <= set(range(len(words))):
+            raise RecordError(f"{where}: {name}_label is {numbers}, expected 0 to {len(words) - 1}")
+        looks.append([words[n] for n in numbers])
+    points = len(array("events/collisions/frame", -1))
     return MoviExample(
-        objects=tuple(
-            SceneObject(**{name: words[k] for name, words in looks.items()}) for k in range(count)
-        ),
-        image_size=(width, height),
-        arrays={k: array(f"instances/{k}", count, FRAMES, *tail) for k, tail in ARRAYS.items()},
-        pairs=array("events/collisions/instances", rows, 2).astype(int),
-        frames=array("events/collisions/frame", rows).astype(int),
-        contact_positions=array("events/collisions/position", rows, 3),
-        normals=array("events/collisions/contact_normal", rows, 3),
+        tuple(map(SceneObject, *looks)),
+        (width, height),
+        {key: array(f"instances/{key}", count, *shape) for key, shape in STATES.items()},
+        {key: array(f"events/collisions/{key}", points, *shape) for key, shape in CONTACTS.items()},
     )

@@ -7,6 +7,11 @@ vector parts of quaternions and the angular velocities.
 The frame rate is not recorded: it was 30 fps in some versions and 100 in others, so this module
 counts frames, and the caller sets `Scene.fps`. Later versions add a suffix to the names of
 per-camera datasets (`_img_cam0`) and start at frame 0001.
+
+Events are found from the contacts that each frame lists. Early files have no `states` of
+collisions, and `env_collisions` mixes walls and floor. The `labels` are not used:
+`target_on_ground` is set when the contacts with the floor change, and `target_delta_position`
+accumulates.
 """
 
 from __future__ import annotations
@@ -20,25 +25,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from data.records import Scene, SceneObject
-from data.releases.hdf5 import (
-    get_dataset,
-    get_group,
-    locate,
-    open_hdf5,
-    read_floats,
-    read_integers,
-)
-from data.releases.physion_contacts import find_collisions, find_landings
+from data.records import Collision, Landing, Scene, SceneObject
+from data.releases.hdf5 import get_dataset, get_group, locate, open_hdf5, read_array
 from data.releases.validation import RecordError, check_unique_scenes, decode_image, scene_id
+from data.world.events import first_contacts
 
 if TYPE_CHECKING:
     import h5py
 
-LAYOUT = "an HDF5 file per trial, such as Collide/pilot_it2_collision/0000.hdf5"
+FOLDERS = "an HDF5 file per trial, such as Collide/pilot_it2_collision/0000.hdf5"
 FPS = 30
-CAMERA_SUFFIXES = ("", "_cam0")
-"""Suffixes of per-camera datasets, by version."""
+AXES = [0, 2, 1]
+"""Order of TDW's axes that gives z up."""
 SCENARIOS = {
     "domino": "Dominoes",
     "support": "Support",
@@ -52,17 +50,21 @@ SCENARIOS = {
     "cloth": "Drape",
 }
 """Scenarios by the first letters of words in the names of folders and stimuli."""
+ABSENT_FRAMES = 5
+"""Without states, a pair that is first listed before this frame is in contact from the start."""
+AIR_FRAMES = 5
+"""Least number of frames without contact before a landing."""
+UPRIGHT = 0.7
+"""Least upward share of a floor contact's normal."""
+FLOOR = 0.05
+"""Greatest height of a contact with the floor, metres."""
 VECTORS = {"positions": 3, "rotations": 4, "velocities": 3, "angular_velocities": 3}
 
 
 def list_scenes(folder: Path) -> list[Path]:
-    """Return the trials below a folder, in order of their path.
-
-    Raises:
-        UserError: The folder contains no trial.
-    """
+    """Return the trials below a folder, in order of their path."""
     paths = sorted(path for end in ("hdf5", "h5") for path in folder.rglob(f"*.{end}"))
-    return check_unique_scenes(folder, paths, partial(_stimulus, folder=folder), LAYOUT)
+    return check_unique_scenes(folder, paths, partial(_stimulus, folder=folder), FOLDERS)
 
 
 def _stimulus(path: Path, folder: Path) -> str:
@@ -75,58 +77,46 @@ def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
 
     An object's shape is the name of its model. Visible fractions are unknown (NaN); an object is in
     view if the segmentation image contains its colour.
-
-    Raises:
-        RecordError: The file is damaged or does not have the layout of Physion's trials.
     """
     with open_hdf5(path) as file:
-        static, frames = get_group(file, "static"), _frame_groups(file)
-        ids = read_integers(static, "object_ids").tolist()
-        models = [_text(name) for name in get_dataset(static, "model_names")[()]]
+        static, frames = get_group(file, "static"), _list_frames(file)
+        ids = read_array(static, "object_ids", (-1,), np.int64).tolist()
+        models = [_decode(name) for name in get_dataset(static, "model_names")[()]]
         if len(models) != len(ids):
             raise RecordError(f"{path} names {len(models)} models of {len(ids)} objects")
-        colors = read_floats(static, "object_segmentation_colors", shape=(len(ids), 3))
-        vectors = {
-            key: np.stack([_read_vectors(frame, key, (len(ids), n)) for frame in frames])
-            for key, n in VECTORS.items()
-        }
-        stimulus = _stimulus(path, folder)
-        recorded = _text(static["stimulus_name"][()]) if "stimulus_name" in static else ""
-        scenario = _find_scenario(f"{stimulus} {recorded}", path)
+        colors = read_array(static, "object_segmentation_colors", (len(ids), 3))
+        objects = [get_group(frame, "objects") for frame in frames]
+        positions, rotations, velocities, angular_velocities = (
+            np.stack([read_array(group, key, (len(ids), size)) for group in objects])
+            for key, size in VECTORS.items()
+        )
+        names = stimulus = _stimulus(path, folder)
+        if "stimulus_name" in static:
+            names += f" {_decode(get_dataset(static, 'stimulus_name')[()])}"
+        scenario = _find_scenario(names, path)
         size = _read_image(frames[0], "_img").size
-        projected = [
-            _project(*pair, size) for pair in zip(frames, vectors["positions"], strict=True)
-        ]
-        scene = Scene(
+        for frame in frames:
+            get_dataset(get_group(frame, "images"), "_img")
+        return Scene(
             scene_id=scene_id("physion", scenario, stimulus),
             split=split,
-            objects=tuple(SceneObject(model) for model in models),
-            collisions=find_collisions(frames, ids),
-            positions=swap_axes(vectors["positions"]),
-            quaternions=swap_quaternion_axes(vectors["rotations"]),
-            velocities=swap_axes(vectors["velocities"]),
-            angular_velocities=-swap_axes(vectors["angular_velocities"]),
-            image_positions=np.stack(projected),
+            objects=tuple(map(SceneObject, models)),
+            collisions=_find_collisions(frames, ids),
+            positions=positions[..., AXES],
+            quaternions=rotations[..., [*AXES, 3]] * np.float32([-1, -1, -1, 1]),
+            velocities=velocities[..., AXES],
+            angular_velocities=-angular_velocities[..., AXES],
+            image_positions=np.stack(
+                [_project(*pair, size) for pair in zip(frames, positions, strict=True)]
+            ),
             in_view=np.stack([_read_in_view(frame, colors) for frame in frames]),
             visible_fraction=np.full((len(frames), len(ids)), np.nan, np.float32),
             image_size=size,
             fps=fps,
-            landings=find_landings(frames, ids, vectors["positions"]),
+            landings=_find_landings(frames, ids, positions),
             scenario=scenario,
             footage=path.relative_to(folder).as_posix(),
         )
-    check_frames(scene, folder)
-    return scene
-
-
-def swap_axes(vectors: np.ndarray) -> np.ndarray:
-    """Convert (..., 3) vectors from y up, left-handed, to z up, right-handed."""
-    return vectors[..., [0, 2, 1]]
-
-
-def swap_quaternion_axes(quaternions: np.ndarray) -> np.ndarray:
-    """Convert (..., 4) quaternions in x y z w order as `swap_axes` converts vectors."""
-    return quaternions[..., [0, 2, 1, 3]] * np.float32([-1, -1, -1, 1])
 
 
 def _find_scenario(names: str, path: Path) -> str:
@@ -138,29 +128,24 @@ def _find_scenario(names: str, path: Path) -> str:
     return SCENARIOS[match.group().lower()]
 
 
-def _frame_groups(file: h5py.File) -> list[h5py.Group]:
+def _list_frames(file: h5py.File) -> list[h5py.Group]:
     """The groups of all frames in order."""
     frames = get_group(file, "frames")
     names = sorted(frames)
-    if names[:1] not in (["0000"], ["0001"]):
-        raise RecordError(f"{locate(frames)} starts with {names[:1]}, expected 0000 or 0001")
-    first = int(names[0])
-    for k, name in enumerate(names):
-        if name != f"{first + k:04d}":
-            raise RecordError(f"{locate(frames)} has {name}, expected {first + k:04d}")
-    return [frames[name] for name in names]
+    first = 1 if names[:1] == ["0001"] else 0
+    for k, name in enumerate(names or [""], first):
+        if name != f"{k:04d}":
+            raise RecordError(f"{locate(frames)} has frame {name!r}, expected '{k:04d}'")
+    return [get_group(frames, name) for name in names]
 
 
 def _project(frame: h5py.Group, positions: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """(N, 2) px of the (N, 3) centres, in TDW's axes, by the frame's camera."""
     cameras = get_group(frame, "camera_matrices")
-    matrices = [
-        get_dataset(cameras, *_camera_names(key))[()].reshape(-1).astype(np.float64)
+    projection, view = (
+        read_array(cameras, key, (4, 4), np.float64)
         for key in ("projection_matrix", "camera_matrix")
-    ]
-    if [matrix.size for matrix in matrices] != [16, 16]:
-        raise RecordError(f"{locate(cameras)}: expected two matrices of 16 numbers")
-    projection, view = (matrix.reshape(4, 4) for matrix in matrices)
+    )
     homogeneous = np.concatenate([positions, np.ones((len(positions), 1))], axis=1)
     clip = homogeneous @ (projection @ view).T
     # A point beside or behind the camera has no image; keep it finite and far outside.
@@ -175,46 +160,86 @@ def _read_in_view(frame: h5py.Group, colors: np.ndarray) -> np.ndarray:
     return np.isin(colors.astype(np.int32) @ weights, pixels)
 
 
-def check_frames(scene: Scene, folder: Path) -> None:
-    """Check that a trial has an image of each frame, without decoding them.
+def _find_collisions(frames: list[h5py.Group], ids: list[int]) -> tuple[Collision, ...]:
+    """Return the first contacts of pairs that are not in contact from the start.
 
-    Raises:
-        RecordError: An image is missing.
+    A contact begins at the first frame at which a pair enters it or, without states, is listed."""
+    entered, from_start = [], set()
+    for k, frame in enumerate(frames):
+        for pair, state in _read_pairs(frame):
+            if not set(pair) <= set(ids) or pair[0] == pair[1]:
+                continue
+            first, second = sorted(ids.index(name) for name in pair)
+            if state in (b"enter", None):
+                entered.append((k, (first, second)))
+            if k == 0 or (state is None and k < ABSENT_FRAMES):
+                from_start.add((first, second))
+    return first_contacts((k, pair) for k, pair in entered if pair not in from_start)
+
+
+def _read_pairs(frame: h5py.Group) -> list[tuple[list[int], bytes | None]]:
+    """The pairs of object ids that a frame lists, each with its state, None if not recorded."""
+    collisions = get_group(frame, "collisions")
+    pairs = read_array(collisions, "object_ids", (-1, 2), np.int64).tolist()
+    if "states" not in collisions:
+        return [(pair, None) for pair in pairs]
+    states = [bytes(state) for state in get_dataset(collisions, "states")[()].reshape(-1)]
+    if len(states) != len(pairs):
+        raise RecordError(f"{locate(collisions)} has {len(states)} states of {len(pairs)} pairs")
+    return list(zip(pairs, states, strict=True))
+
+
+def _find_landings(
+    frames: list[h5py.Group], ids: list[int], positions: np.ndarray
+) -> tuple[Landing, ...]:
+    """Return each object's first contact with the floor after some frames without any contact.
+
+    Args:
+        positions: (F, N, 3) centres in TDW's axes."""
+    in_air = np.zeros(len(ids), int)
+    landed: dict[int, int] = {}
+    for k, frame in enumerate(frames):
+        environment = get_group(frame, "env_collisions")
+        listed = read_array(environment, "object_ids", (-1,), np.int64)
+        touching = [n for n, name in enumerate(ids) if name in listed]
+        for n in _find_on_floor(environment, touching, positions[k]):
+            if in_air[n] >= AIR_FRAMES:
+                landed.setdefault(n, k)
+        in_contact = [
+            name for pair, state in _read_pairs(frame) if state != b"exit" for name in pair
+        ]
+        in_air = np.where(np.isin(ids, [*in_contact, *listed]), 0, in_air + 1)
+    return tuple(Landing(k, n) for k, n in sorted((k, n) for n, k in landed.items()))
+
+
+def _find_on_floor(environment: h5py.Group, touching: list[int], positions: np.ndarray) -> set[int]:
+    """Those of the objects touching walls or floor that touch the floor.
+
+    Points are not listed by object: each is assigned to the nearest object, seen from above.
     """
-    path = folder / str(scene.footage)
-    with open_hdf5(path) as file:
-        frames = _frame_groups(file)
-        if len(frames) != scene.frames:
-            raise RecordError(f"{path} has {len(frames)} frames, expected {scene.frames}")
-        for frame in frames:
-            get_dataset(get_group(frame, "images"), *_camera_names("_img"))
+    contacts = read_array(environment, "contacts", (-1, 2, 3))
+    normals, points = contacts[:, 0], contacts[:, 1]
+    floor = points[(normals[:, 1] > UPRIGHT) & (np.abs(points[:, 1]) < FLOOR)]
+    if not touching:
+        return set()
+    distances = np.linalg.norm((floor[:, None] - positions[touching])[..., [0, 2]], axis=-1)
+    return {touching[n] for n in distances.argmin(axis=1)}
 
 
 def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
-    """Return frames of a trial as RGB images, by frame index from 0 in every version.
-
-    Raises:
-        RecordError: An image is missing or cannot be decoded.
-    """
-    check_frames(scene, folder)
-    with open_hdf5(folder / str(scene.footage)) as file:
-        groups = _frame_groups(file)
+    """Return frames of a trial as RGB images, by frame index from 0 in every version."""
+    path = folder / str(scene.footage)
+    with open_hdf5(path) as file:
+        groups = _list_frames(file)
+        if len(groups) != scene.frames:
+            raise RecordError(f"{path} has {len(groups)} frames, expected {scene.frames}")
         return {frame: _read_image(groups[frame], "_img") for frame in frames}
 
 
 def _read_image(frame: h5py.Group, key: str) -> Image.Image:
-    dataset = get_dataset(get_group(frame, "images"), *_camera_names(key))
+    dataset = get_dataset(get_group(frame, "images"), key)
     return decode_image(dataset[()].tobytes(), locate(dataset))
 
 
-def _read_vectors(frame: h5py.Group, key: str, shape: tuple[int, int]) -> np.ndarray:
-    return read_floats(get_group(frame, "objects"), *_camera_names(key), shape=shape)
-
-
-def _camera_names(key: str) -> list[str]:
-    """The names of a per-camera dataset, by version."""
-    return [key + suffix for suffix in CAMERA_SUFFIXES]
-
-
-def _text(value: Any) -> str:
-    return value.decode() if isinstance(value, bytes) else str(value)
+def _decode(text: Any) -> str:
+    return text.decode() if isinstance(text, bytes) else str(text)

@@ -13,7 +13,7 @@ CLEVRER needs no suite here: its scenes have the items of the dynapix suite.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
@@ -113,14 +113,22 @@ def cross_scene_candidates(
         yield Candidate(other.scene_id, target, "cross_scene")
 
 
-def event_cell(events: Callable[[Scene], list[int]], step: int, gap: int) -> TransferCell:
+EVENTS: dict[str, Callable[[Scene], list[int]]] = {
+    "contact": lambda scene: [collision.frame for collision in scene.collisions],
+    "motion": lambda scene: [frame for frame, _ in find_motion_onsets(scene)],
+    "landing": lambda scene: [landing.frame for landing in scene.landings],
+}
+"""Frames of each kind of event in a scene."""
+
+
+def event_cell(event_name: str, step: int, gap: int) -> TransferCell:
     """Return a cell whose target is the frame of an event.
 
     The prefix ends `gap` frames before the event and starts `step` frames before its end.
     """
 
     def timings(scene: Scene) -> list[EventTiming]:
-        stops = [frame - gap for frame in sorted(set(events(scene)))]
+        stops = [frame - gap for frame in sorted(set(EVENTS[event_name](scene)))]
         return [
             EventTiming(stop + gap, max(stop - step, 0), stop, stop + gap)
             for stop in stops
@@ -141,50 +149,35 @@ def time_cell(seconds: int) -> TransferCell:
     return TransferCell(time.question(seconds), timings)
 
 
-def contact_frames(scene: Scene) -> list[int]:
-    """Return the frames at which two objects first touch."""
-    return [collision.frame for collision in scene.collisions]
-
-
-def onset_frames(scene: Scene) -> list[int]:
-    """Return the frames at which an object at rest starts to move."""
-    return [frame for frame, _ in find_motion_onsets(scene)]
-
-
-def landing_frames(scene: Scene) -> list[int]:
-    """Return the frames at which an object lands on the ground."""
-    return [landing.frame for landing in scene.landings]
-
-
-# At MoVi-A's 12 fps, these steps and gaps last nearly as long as those of the dynapix suite at
-# 25 fps. A scene lasts two seconds, so there is no in_2s.
-MOVI_A_CELLS = {
-    "event": {"contact": event_cell(contact_frames, step=10, gap=5)},
-    "time": {"in_1s": time_cell(1)},
-}
-# Physion's steps and gaps are numbers of frames, whatever the frame rate.
-PHYSION_CELLS = {
-    "event": {
-        "A1_contact": event_cell(contact_frames, step=20, gap=10),
-        "A2_motion": event_cell(onset_frames, step=20, gap=10),
-        "A3_landing": event_cell(landing_frames, step=20, gap=10),
-    },
-    "time": {"in_1s": time_cell(1), "in_2s": time_cell(2)},
-}
-TRANSFER_SUITES = {
+CELLS = {
+    # At MoVi-A's 12 fps, these steps and gaps last nearly as long as those of the dynapix suite at
+    # 25 fps. A scene lasts two seconds, so there is no in_2s.
     "movi_a": {
-        family: TransferFamily("movi_a", family, same=1, later=False, CELLS=cells)
-        for family, cells in MOVI_A_CELLS.items()
+        "event": {"contact": event_cell("contact", step=10, gap=5)},
+        "time": {"in_1s": time_cell(1)},
     },
+    # Physion's steps and gaps are numbers of frames, whatever the frame rate.
     "physion": {
-        family: TransferFamily("physion", family, same=2, later=True, CELLS=cells)
-        for family, cells in PHYSION_CELLS.items()
+        "event": {
+            "A1_contact": event_cell("contact", step=20, gap=10),
+            "A2_motion": event_cell("motion", step=20, gap=10),
+            "A3_landing": event_cell("landing", step=20, gap=10),
+        },
+        "time": {"in_1s": time_cell(1), "in_2s": time_cell(2)},
     },
 }
 # The items of a stand-in are built as those of its suite, but name the stand-in as their suite.
-TRANSFER_SUITES |= {
-    f"standin_{suite}": {
-        name: replace(family, suite=f"standin_{suite}") for name, family in families.items()
+TRANSFER_SUITES = {
+    f"{prefix}{suite}": {
+        family: TransferFamily(
+            f"{prefix}{suite}",
+            family,
+            same=1 if suite == "movi_a" else 2,
+            later=suite == "physion",
+            CELLS=cells,
+        )
+        for family, cells in families.items()
     }
-    for suite, families in TRANSFER_SUITES.items()
+    for prefix in ("", "standin_")
+    for suite, families in CELLS.items()
 }

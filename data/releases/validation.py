@@ -1,19 +1,16 @@
-"""Checks that the readers of other simulators' releases share.
-
-A record that does not have the published layout raises `RecordError`.
-"""
+"""Checks that the readers of other simulators' releases share."""
 
 from __future__ import annotations
 
 import io
-import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from PIL import Image
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from conf.errors import UserError
 
@@ -27,6 +24,35 @@ class RecordError(UserError):
 
     def __init__(self, message: str, code: str = "invalid-record") -> None:
         super().__init__(message, code)
+
+
+class Layout(BaseModel):
+    """The keys of a JSON object that a reader uses; other keys are ignored."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+AnyLayout = TypeVar("AnyLayout", bound=Layout)
+
+
+def read_json(path: Path, layout: type[AnyLayout]) -> AnyLayout:
+    """Return the content of a JSON file.
+
+    Raises:
+        RecordError: The file is missing or damaged, or does not have the layout.
+    """
+    try:
+        return layout.model_validate_json(path.read_bytes())
+    except FileNotFoundError as error:
+        raise RecordError(f"{path} is missing", "missing-file") from error
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        if first["type"] == "json_invalid":
+            raise RecordError(f"{path} is cut off: {first['msg']}", "damaged-file") from error
+        where = ".".join(map(str, first["loc"])) or "the file"
+        raise RecordError(
+            f"{path} does not have the published layout: {where}: {first['msg']}"
+        ) from error
 
 
 def scene_id(suite: str, *parts: str) -> str:
@@ -67,82 +93,31 @@ def check_unique_scenes(
     return list(paths)
 
 
-def load_json(path: str | Path) -> dict[str, Any]:
-    """Return the JSON object that a file contains.
+def finite_array(
+    values: Any, shape: tuple[int, ...], where: str, dtype: type = np.float32
+) -> np.ndarray:
+    """Return numbers as an array of `shape`, in which -1 stands for any length.
 
     Raises:
-        RecordError: The file is missing or damaged, or contains another JSON value.
+        RecordError: There are fewer or more values, or not all are finite numbers.
     """
     try:
-        record = json.loads(Path(path).read_bytes())
-    except FileNotFoundError as error:
-        raise RecordError(f"{path} is missing", "missing-file") from error
-    except ValueError as error:
-        raise RecordError(f"{path} is cut off or not JSON: {error}", "damaged-file") from error
-    if not isinstance(record, dict):
-        raise RecordError(f"{path} contains a {type(record).__name__}, expected an object")
-    return record
-
-
-def get_field(record: Any, key: str, kind: type, where: str) -> Any:
-    """Return `record[key]`, which must be of type `kind`; `where` names the record in errors.
-
-    Raises:
-        RecordError: The key is missing or its value has another type.
-    """
-    if not isinstance(record, dict) or key not in record:
-        raise RecordError(f"{where} has no key {key!r}, which the published layout requires")
-    if not isinstance(record[key], kind):
-        raise RecordError(
-            f"{where} has a {type(record[key]).__name__} at {key!r}, expected a {kind.__name__}"
-        )
-    return record[key]
-
-
-def check_choice(value: str, choices: Sequence[str], where: str) -> str:
-    """Return `value`, which must be one of `choices`.
-
-    Raises:
-        RecordError: `value` is not in `choices`.
-    """
-    if value not in choices:
-        raise RecordError(f"{where} is {value!r}, expected {', '.join(choices)}")
-    return value
-
-
-def finite_array(values: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
-    """Return `values` as a float32 array of `shape`, where None stands for any length.
-
-    Raises:
-        RecordError: The values have another shape or are not all finite numbers.
-    """
-    try:
-        array = np.asarray(values, np.float64)
+        array = np.asarray(values, np.float64).reshape(shape)
     except (TypeError, ValueError) as error:
-        raise RecordError(f"{where}: expected numbers of shape {_format(shape)}") from error
-    if array.shape == (0,) and shape[0] in (None, 0):
-        array = array.reshape(0, *(n or 0 for n in shape[1:]))
-    if array.ndim != len(shape) or any(
-        n not in (None, size) for n, size in zip(shape, array.shape, strict=True)
-    ):
-        raise RecordError(f"{where}: shape {_format(array.shape)}, expected {_format(shape)}")
+        raise RecordError(f"{where}: expected numbers of shape {shape}: {error}") from error
     if not np.isfinite(array).all():
         raise RecordError(f"{where}: non-finite values (NaN or Inf)")
-    return array.astype(np.float32)
+    return array.astype(dtype)
 
 
-def _format(shape: Sequence[int | None]) -> str:
-    return f"({', '.join('any' if n is None else str(n) for n in shape)})"
-
-
-def decode_image(data: bytes, where: str) -> Image.Image:
-    """Decode an image to RGB. An alpha channel is discarded, not blended.
+def decode_image(image: bytes | Path, where: str) -> Image.Image:
+    """Decode an encoded image or a file to RGB. An alpha channel is discarded, not blended.
 
     Raises:
         RecordError: The image cannot be decoded.
     """
     try:
-        return Image.open(io.BytesIO(data)).convert("RGB")
+        return Image.open(io.BytesIO(image) if isinstance(image, bytes) else image).convert("RGB")
     except (OSError, SyntaxError, ValueError) as error:
         raise RecordError(
             f"{where} cannot be decoded as an image: {error}", "damaged-file"

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from conf.runs import write_text
-from data.publish.contact_sheets import draw_sheet
-from data.publish.examples import ExampleRows
+from data.publish.contact_sheets import ExampleRows, draw_sheet
 from data.records import Rationale
 from data.store import Store, write_atomically
 from teacher.predicates import extract_predicates

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,7 @@ import pytest
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from data.build import ensure_benchmark, ensure_items
 from data.parallel import Workers
-from data.publish.clevrer_format import export_clevrer
-from data.render.frame_cache import FrameCache, FrameReader
+from data.render.frame_cache import FrameReader
 from tests.data.releases.clevrer_files import clevrer_annotation, write_clevrer_scene
 from tests.data.releases.movi_a_files import movi_example, write_movi_folder
 from tests.data.releases.pictures import picture
@@ -113,34 +111,3 @@ def test_clevrers_scenes_have_the_items_of_dynapix(tmp_path) -> None:
     assert {i.suite for i in store.selection()} == {"dynapix"}
     assert {q.split for q in store.retrieval()} == {"train", "test"}
     assert len(store.scene_ids("train") + store.scene_ids("test")) == 8
-
-
-def test_an_exported_benchmark_is_read_as_a_release_with_the_same_items(tmp_path) -> None:
-    """Scenes are exported in the layout of CLEVRER's release and read back unchanged."""
-    few = Quota(train=2, test=1)
-    cfg = BenchmarkConfig(
-        name="ours",
-        scenes=5,
-        width=96,
-        height=64,
-        selection=SelectionConfig(time={"in_1s": few}, event={"contact_offset": few}),
-        retrieval=RetrievalTrackConfig(),
-    )
-    ours = ensure_items(cfg, tmp_path, Workers(2))
-    assert export_clevrer(ours, tmp_path / "release", Workers(2)) == 5
-    release = replace(cfg, name="theirs", simulator="clevrer", folder=str(tmp_path / "release"))
-    theirs = ensure_items(release, tmp_path, Workers(2))
-    names = [*ours.scene_ids("train"), *ours.scene_ids("test")]
-    read = sorted([*theirs.scene_ids("train"), *theirs.scene_ids("test")])
-    for name, other in zip(names, read, strict=True):
-        scene, back = ours.scene(name), theirs.scene(other)
-        assert back.objects == scene.objects
-        assert back.collisions == scene.collisions
-        for array in ("positions", "velocities", "angular_velocities"):
-            np.testing.assert_allclose(getattr(back, array), getattr(scene, array), atol=1e-6)
-        places = [s.image_positions[scene.in_view] for s in (back, scene)]
-        np.testing.assert_allclose(*places, atol=1e-2)
-        np.testing.assert_array_equal(back.in_view, scene.in_view)
-        exported = FrameCache.of(theirs).render(other, [60])[60].astype(float)
-        rendered = FrameCache.of(ours).render(name, [60])[60].astype(float)
-        assert np.abs(exported - rendered).mean() < 3

@@ -52,38 +52,22 @@ def test_a_scene_has_the_published_values(read_format, tmp_path: Path) -> None:
     fallen = 5 - 9.81 / 2 * (np.arange(1, 25) / 12) ** 2
     np.testing.assert_allclose(scene.positions[:, 0, 2], fallen, rtol=1e-5)
     np.testing.assert_allclose(scene.positions[:, 1, 0], 1 + np.arange(1, 25) / 12, rtol=1e-5)
-    assert np.isnan(scene.visible_fraction).all()
-    assert scene.in_view.all(axis=0).tolist() == [True, True, False]
-
-
-def test_quaternions_are_converted_from_w_first(read_format, tmp_path: Path) -> None:
-    scene = read_format(tmp_path, [])
-    angle = 12 / 12
-    turn = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    turn = [[np.cos(1), -np.sin(1), 0], [np.sin(1), np.cos(1), 0], [0, 0, 1]]
     np.testing.assert_allclose(rotation_matrix(scene.quaternions[11, 0]), turn, atol=1e-6)
-
-
-def test_image_positions_become_pixels(read_format, tmp_path: Path) -> None:
-    scene = read_format(tmp_path, [])
     np.testing.assert_allclose(scene.image_positions[:, 0, 0], 128, rtol=1e-6)
     assert scene.image_positions[11, 1, 0] == pytest.approx(256 * (0.5 + 2 / 20))
-    assert (np.diff(scene.image_positions[:, 0, 1]) > 0).all()
+    assert np.isnan(scene.visible_fraction).all()
+    assert scene.in_view.all(axis=0).tolist() == [True, True, False]
 
 
 def test_images_are_the_requested_frames_without_transparency(read_format, tmp_path: Path) -> None:
     scene = read_format(tmp_path, [])
     images = movi_a.load_images(scene, tmp_path, [17, 2])
-    assert {f: image.getpixel((9, 9)) for f, image in images.items()} == {
-        2: (62,) * 3,
-        17: (77,) * 3,
-    }
-
-
-SUBSTEP = 0.05
+    assert {f: image.getpixel((9, 9))[0] for f, image in images.items()} == {2: 62, 17: 77}
 
 
 def test_contact_points_become_one_contact_of_a_pair(read_format, tmp_path: Path) -> None:
-    many = [(9.1 + SUBSTEP * k, *pair, 0.5, 0.0) for k in range(200) for pair in ((1, 0), (0, 1))]
+    many = [(9.1 + 0.05 * k, *pair, 0.5, 0.0) for k in range(200) for pair in ((1, 0), (0, 1))]
     assert read_format(tmp_path, many).collisions == (Collision(9, (0, 1)),)
 
 
@@ -94,13 +78,6 @@ def test_a_contact_is_at_the_first_frame_after_it(tmp_path: Path, time, raw, cut
     contact = [(time, 0, 1, 0.5, 0.0)]
     assert from_folder(tmp_path / "a", contact).collisions == (Collision(raw, (0, 1)),)
     assert from_record(tmp_path / "b", contact).collisions == (Collision(cut, (0, 1)),)
-
-
-def test_events_past_the_last_frame_are_dropped(read_format, tmp_path: Path) -> None:
-    late = [(24.05, 0, 1, 0.5, 0.0), (24.3, 0, -1, 0.0, 1.0), (23.2, 1, 2, 0.5, 0.0)]
-    scene = read_format(tmp_path, late)
-    assert scene.collisions == (Collision(23, (1, 2)),)
-    assert scene.landings == ()
 
 
 def test_contacts_with_the_floor_are_landings_not_collisions(read_format, tmp_path: Path) -> None:
@@ -118,11 +95,14 @@ def test_contacts_with_the_floor_are_landings_not_collisions(read_format, tmp_pa
     assert scene.landings == (Landing(12, 0), Landing(16, 1))
 
 
-def test_an_object_on_the_floor_in_the_first_frame_does_not_land(
-    read_format, tmp_path: Path
+@pytest.mark.parametrize("frame", [0.5, 24.3])
+def test_events_before_the_second_and_past_the_last_frame_are_dropped(
+    read_format, tmp_path: Path, frame: float
 ) -> None:
-    contacts = [(0.5, 2, -1, 0.0, 1.0), (9.5, 2, -1, 0.0, 1.0), (9.5, 1, -1, 0.0, 1.0)]
-    assert read_format(tmp_path, contacts).landings == (Landing(9, 1),)
+    """An object that is on the floor in the first frame does not land."""
+    contacts = [(frame, 0, -1, 0.0, 1.0), (9.5, 1, -1, 0.0, 1.0), (frame + 24, 0, 1, 0.5, 0.0)]
+    scene = read_format(tmp_path, contacts)
+    assert (scene.collisions, scene.landings) == ((), (Landing(9, 1),))
 
 
 def test_scenes_of_both_formats_are_listed_in_order(tmp_path: Path) -> None:
@@ -149,27 +129,27 @@ def edit(path: Path, change: Callable[[dict], object]) -> None:
 FOLDER_DEFECTS: dict[str, tuple[Callable[[Path], object], str, str]] = {
     "no velocities": (
         lambda p: edit(p, lambda r: r["instances"][1].pop("velocities")),
-        "invalid-record", "'velocities'",
+        "invalid-record", "velocities",
     ),
     "fewer frames": (
-        lambda p: edit(p, lambda r: r["metadata"].update(num_frames=12)), "invalid-record", "12"
+        lambda p: edit(p, lambda r: r["metadata"].update(num_frames=12)), "invalid-record", "24"
     ),
     "another frame rate": (
-        lambda p: edit(p, lambda r: r["metadata"].update(frame_rate=24)), "invalid-record", "24"
+        lambda p: edit(p, lambda r: r["metadata"].update(frame_rate=24)), "invalid-record", "12"
     ),
     "an array of 23 frames": (
         lambda p: edit(p, lambda r: [i["positions"].pop() for i in r["instances"]]),
-        "invalid-record", "(3, 23, 3)",
+        "invalid-record", "(3,24,3)",
     ),
     "MoVi-B's shapes": (
         lambda p: edit(p, lambda r: r["instances"][0].update(shape="teapot")),
-        "invalid-record", "'teapot'",
+        "invalid-record", "instances.0.shape",
     ),
     "truncated times": (
         lambda p: edit(
             p.with_name("events.json"), lambda r: r["collisions"][0].update(frame=9)
         ),
-        "invalid-record", "'frame'",
+        "invalid-record", "collisions.0.frame",
     ),
     "no events": (lambda p: p.with_name("events.json").unlink(), "missing-file", "events.json"),
     "broken JSON": (lambda p: p.write_text(p.read_text()[:500]), "damaged-file", "metadata.json"),
@@ -192,8 +172,6 @@ def test_a_deleted_folder_is_named(tmp_path: Path) -> None:
     path = write_movi_folder(tmp_path / "00012", movi_example([(9.5, 0, 1, 0.5, 0.0)]))
     scene = movi_a.read_scene(path, tmp_path, "test")
     shutil.rmtree(tmp_path / "00012")
-    with raises_user_error("missing-file", contains="00012"):
-        movi_a.check_frames(scene, tmp_path)
     with raises_user_error("missing-file", contains="00012"):
         movi_a.load_images(scene, tmp_path, [0])
 
@@ -229,22 +207,16 @@ def test_records_before_a_cut_or_damage_are_read(tmp_path: Path) -> None:
         assert [movi_a.read_scene(path, tmp_path, "test").frames for path in good] == [24, 24]
         with raises_user_error("damaged-file", contains=f"{SHARD}: record 2"):
             movi_a.read_scene(bad, tmp_path, "test")
-    for byte in (0, tfrecord.HEADER):
-        # The length, whose checksum no longer matches, and the first tag of the protocol buffer.
+    for byte in (5, tfrecord.HEADER):
+        # The length of the first record, and the first tag of its protocol buffer.
         shard.write_bytes(whole[:byte] + bytes([whole[byte] ^ 1]) + whole[byte + 1 :])
         with raises_user_error("damaged-file", contains=f"{SHARD}: record 0"):
             movi_a.read_scene(movi_a.list_scenes(tmp_path)[0], tmp_path, "test")
 
 
-def test_the_checksum_is_crc_32c() -> None:
-    """The check value of the Castagnoli polynomial, masked."""
-    crc = 0xE3069283
-    assert tfrecord.masked_crc(b"123456789") == ((crc >> 15 | crc << 17) + 0xA282EAD8) % 2**32
-
-
 def test_features_have_their_types(tmp_path: Path) -> None:
     write_tfrecord(tmp_path / "x", [{"a": [-1, 2**40, 0], "b": [0.5, -2.0], "c": [b"", b"\xff"]}])
-    features = {k: tfrecord.feature_values(v) for k, v in read_example(tmp_path / "x", 0).items()}
-    assert features["a"].tolist() == [-1, 2**40, 0]
-    assert features["c"] == [b"", b"\xff"]
-    assert features["b"].tolist() == [0.5, -2.0]
+    features = {
+        k: list(tfrecord.feature_values(v)) for k, v in read_example(tmp_path / "x", 0).items()
+    }
+    assert features == {"a": [-1, 2**40, 0], "b": [0.5, -2.0], "c": [b"", b"\xff"]}
