@@ -14,18 +14,26 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from omegaconf import OmegaConf
 from tqdm import tqdm
 
 from conf.errors import UserError
 from conf.runs import lock_folder
-from data.publish.columns import Record, RowBuilder, dataset_features
-from data.publish.dataset_card import render_card
-from data.records import POOLS, SPLITS
-from data.store import DATABASES, Store, hash_file, write_atomically
+from data.publish.columns import (
+    DESCRIPTIONS,
+    Record,
+    RowBuilder,
+    dataset_features,
+    list_columns,
+)
+from data.records import POOLS, SPLITS, RetrievalQuery, SelectionItem
+from data.store import DATABASES, Store, component_versions, hash_file, write_atomically
 from data.tracks.controls import MATCHED_ANCHOR
 
 if TYPE_CHECKING:
@@ -43,6 +51,8 @@ GROUP_ROWS = 5_000
 """Rows of a row group without images."""
 SHARD_GROUPS = 10
 """Row groups of a shard."""
+SIZES = {1e3: "n<1K", 1e4: "1K<n<10K", 1e5: "10K<n<100K", 1e6: "100K<n<1M"}
+"""The Hub's words for fewer rows than these numbers."""
 
 
 Shard = dict[str, Any]
@@ -145,6 +155,44 @@ def _write_table(
             "bytes": path.stat().st_size,
             "sha256": hash_file(path),
         }
+
+
+def render_card(store: Store, shards: Sequence[Shard], images: bool) -> str:
+    """Return the README.md of an export that was written as `shards`."""
+    from jinja2 import Template
+
+    settings = store.manifest["config"]
+    rows: dict[str, Counter[str]] = {}
+    for shard in shards:
+        rows.setdefault(shard["configuration"], Counter())[shard["split"]] += shard["rows"]
+    total = sum(shard["rows"] for shard in shards)
+    items = store.selection()
+    queries = [q for pool in POOLS for q in store.retrieval(pool=pool)]
+    text = (files("data.publish") / "templates/dataset_card.md").read_text()
+    return Template(text).render(
+        store=store,
+        images=images,
+        size=next((name for size, name in SIZES.items() if total < size), "1M<n<10M"),
+        scene=store.scene(store.scene_ids("test")[0]),
+        scenes={split: len(store.scene_ids(split)) for split in SPLITS},
+        families=_count_rows(items, "family"),
+        subtypes=_count_rows(items, "family", "subtype"),
+        queries=_count_rows(queries, "pool", "builder", "anchor"),
+        rows=rows,
+        columns=list_columns(images),
+        descriptions=DESCRIPTIONS,
+        versions=component_versions(
+            settings["simulator"], settings["renderer"], settings.get("standin")
+        ),
+        settings=OmegaConf.to_yaml(OmegaConf.create(settings)),
+    )
+
+
+def _count_rows(records: Iterable[SelectionItem | RetrievalQuery], *axes: str) -> list[tuple]:
+    """Count records by the values of some fields: a tuple (value, ..., train, test) for each."""
+    counts = Counter((*(getattr(r, axis) for axis in axes), r.split) for r in records)
+    keys = dict.fromkeys(key[:-1] for key in counts)
+    return [(*key, *(counts[*key, split] for split in SPLITS)) for key in keys]
 
 
 def _write_record(folder: Path, record: dict[str, Any]) -> None:

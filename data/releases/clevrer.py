@@ -30,7 +30,7 @@ from data.world.visibility import compute_visibility
 if TYPE_CHECKING:
     from av.container import InputContainer
 
-FOLDERS = (
+FOLDER_CONTENTS = (
     "annotation_train/annotation_00000-01000/annotation_00000.json and so on beside "
     "video_train/video_00000-01000/video_00000.mp4"
 )
@@ -73,7 +73,7 @@ class Annotation(Layout):
 def list_scenes(folder: Path) -> list[Path]:
     """Return the annotations below a folder, in order of their number."""
     paths = sorted(folder.rglob("annotation_*.json"), key=lambda path: (path.stem, path))
-    return check_unique_scenes(folder, paths, _scene_id, FOLDERS)
+    return check_unique_scenes(folder, paths, _scene_id, FOLDER_CONTENTS)
 
 
 def _scene_id(path: Path) -> str:
@@ -89,25 +89,25 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     from scipy.spatial.transform import Rotation
 
     annotation = read_json(path, Annotation)
-    looks = {
+    appearances = {
         o.object_id: SceneObject(o.shape, o.material, o.color) for o in annotation.object_property
     }
-    ids, objects = list(looks), tuple(looks.values())
+    ids, objects = list(appearances), tuple(appearances.values())
     for contact in annotation.collision:
-        if not looks.keys() >= set(contact.object_ids):
+        if not set(contact.object_ids) <= set(ids):
             raise RecordError(f"{path}: collision of {contact.object_ids}, expected two of {ids}")
     states = []
-    for frame, moment in enumerate(annotation.motion_trajectory):
-        by_id = {state.object_id: state for state in moment.objects}
-        if moment.frame_id != frame or by_id.keys() != looks.keys():
+    for index, frame in enumerate(annotation.motion_trajectory):
+        by_id = {state.object_id: state for state in frame.objects}
+        if frame.frame_id != index or by_id.keys() != set(ids):
             raise RecordError(
-                f"{path}: frame {moment.frame_id} lists objects {sorted(by_id)}, expected frame "
-                f"{frame} with objects {sorted(ids)}"
+                f"{path}: frame {frame.frame_id} lists objects {sorted(by_id)}, expected frame "
+                f"{index} with objects {sorted(ids)}"
             )
         states.append([by_id[k] for k in ids])
 
-    def array(key: str, kind: type = np.float32) -> np.ndarray:
-        return np.array([[getattr(state, key) for state in row] for row in states], kind)
+    def array(key: str, dtype: type = np.float32) -> np.ndarray:
+        return np.array([[getattr(state, key) for state in row] for row in states], dtype)
 
     footage = Path(str(path.relative_to(folder)).replace("annotation", "video"))
     footage = footage.with_name(annotation.video_filename)
@@ -160,14 +160,11 @@ def _open_video(path: Path) -> Iterator[InputContainer]:
     import av
 
     if not path.is_file():
-        raise RecordError(
-            f"{path} is missing: the annotation names it as its video", "missing-file"
-        )
+        raise RecordError(f"{path}, the video of an annotation, is missing", "missing-file")
     try:
         with av.open(str(path)) as video:
             if not video.streams.video:
                 raise RecordError(f"{path} contains no video")
             yield video
     except av.FFmpegError as error:
-        reason = error.strerror or error
-        raise RecordError(f"{path} cannot be decoded: {reason}", "damaged-file") from error
+        raise RecordError(f"{path} cannot be decoded: {error.strerror}", "damaged-file") from error

@@ -3,6 +3,11 @@
     <folder>/00012/metadata.json events.json rgba_00000.png ...   Kubric's own, a folder per scene
     <folder>/movi_a-train.tfrecord-00000-of-00512 ...             that of TensorFlow Datasets
 
+Both are read into the same arrays. The physics starts at scene frame 0 and the rendering at scene
+frame 1: frame i of the video, and of every array, is scene frame i + 1. The time of a contact
+counts scene frames from 0. It is a float in Kubric's format; TensorFlow Datasets truncates it, so
+that the next frame is the first that is certainly at or after the contact.
+
 Contacts are listed for every point and substep. An index of no object (-1, or 65535 if unsigned) is
 the floor, or an object that is never visible.
 """
@@ -10,19 +15,29 @@ the floor, or an object that is never visible.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 from PIL import Image
+from pydantic import BeforeValidator, Field
 
-from data.records import Landing, Scene
-from data.releases.movi_a_formats import FPS, FRAMES, read_folder, read_record
+from data.records import Landing, Scene, SceneObject
 from data.releases.tfrecord import feature_values, read_example, record_ranges
-from data.releases.validation import RecordError, check_unique_scenes, decode_image, scene_id
+from data.releases.validation import (
+    Layout,
+    RecordError,
+    check_unique_scenes,
+    decode_image,
+    finite_array,
+    read_json,
+    scene_id,
+)
 from data.world.events import first_contacts
 
-FOLDERS = (
+FOLDER_CONTENTS = (
     "a folder per scene with metadata.json, events.json and rgba_00000.png and so on, or "
     "movi_a-train.tfrecord-00000-of-00512 and so on"
 )
@@ -30,6 +45,82 @@ FLOOR = 0.05
 """Greatest height of a contact with the floor, simulator units."""
 UPRIGHT = 0.7
 """Least vertical share of a floor contact's normal."""
+FRAMES, FPS = 24, 12
+SHAPES = ("cube", "cylinder", "sphere")
+MATERIALS = ("metal", "rubber")
+COLORS = ("blue", "brown", "cyan", "gray", "green", "purple", "red", "yellow")
+SIZES = ("small", "large")
+APPEARANCE = {"shape": SHAPES, "material": MATERIALS, "color": COLORS, "size": SIZES}
+"""Words of each attribute, in the order in which TensorFlow Datasets numbers them."""
+STATES = {
+    "positions": (FRAMES, 3),
+    "quaternions": (FRAMES, 4),
+    "velocities": (FRAMES, 3),
+    "angular_velocities": (FRAMES, 3),
+    "image_positions": (FRAMES, 2),
+    "visibility": (FRAMES,),
+}
+"""Shape of each array per object."""
+CONTACTS = {"instances": (2,), "frame": (), "position": (3,), "contact_normal": (3,)}
+"""Shape of each array per contact point."""
+
+
+def _check_float(value: object) -> object:
+    if not isinstance(value, float):
+        raise ValueError(f"{value!r} is truncated, expected a float")
+    return value
+
+
+class Instance(Layout):
+    shape: Literal[SHAPES]
+    material: Literal[MATERIALS]
+    color: Literal[COLORS] = Field(alias="color_label")
+    size: Literal[SIZES] = Field(alias="size_label")
+    positions: list
+    quaternions: list
+    velocities: list
+    angular_velocities: list
+    image_positions: list
+    visibility: list
+
+
+class Video(Layout):
+    resolution: tuple[int, int]
+    num_frames: Literal[FRAMES]
+    frame_rate: Literal[FPS]
+
+
+class Metadata(Layout):
+    metadata: Video
+    instances: list[Instance]
+
+
+class Contact(Layout):
+    instances: list
+    frame: Annotated[float, BeforeValidator(_check_float)]
+    position: list
+    contact_normal: list
+
+
+class Events(Layout):
+    collisions: list[Contact]
+
+
+@dataclass(frozen=True)
+class MoviExample:
+    """The content of a scene.
+
+    Attributes:
+        states: Arrays by the names of `STATES`, each (objects, ...).
+        contacts: Arrays by the names of `CONTACTS`, each (contact points, ...). `instances` are
+            indices of the objects in contact; other indices are the floor or an object that is
+            never visible. `frame` is the first frame of the video at or after the contact.
+    """
+
+    objects: tuple[SceneObject, ...]
+    image_size: tuple[int, int]
+    states: dict[str, np.ndarray]
+    contacts: dict[str, np.ndarray]
 
 
 def list_scenes(folder: Path) -> list[Path]:
@@ -48,7 +139,7 @@ def list_scenes(folder: Path) -> list[Path]:
         for number in range(len(record_ranges(shard)))
     ]
     id_of = partial(_scene_id, folder=folder)
-    return check_unique_scenes(folder, sorted(folders) + sorted(records), id_of, FOLDERS)
+    return check_unique_scenes(folder, sorted(folders) + sorted(records), id_of, FOLDER_CONTENTS)
 
 
 def _scene_id(path: Path, folder: Path) -> str:
@@ -65,7 +156,7 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     """
     is_folder = path.name == "metadata.json"
     footage = path.parent if is_folder else path
-    example = read_folder(footage) if is_folder else read_record(footage)
+    example = _read_folder(footage) if is_folder else _read_record(footage)
     _list_images(footage)
     count = len(example.objects)
     pairs, frames = (example.contacts[key].astype(int) for key in ("instances", "frame"))
@@ -91,6 +182,55 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
         fps=FPS,
         landings=_find_landings(example.contacts, pairs, frames, is_object),
         footage=footage.relative_to(folder).as_posix(),
+    )
+
+
+def _read_folder(folder: Path) -> MoviExample:
+    """Read Kubric's format, a folder with metadata.json and events.json."""
+    metadata = read_json(folder / "metadata.json", Metadata)
+    events = read_json(folder / "events.json", Events)
+
+    def array(rows: list[Instance] | list[Contact], key: str, *shape: int) -> np.ndarray:
+        values = [getattr(row, key) for row in rows]
+        return finite_array(values, (len(rows), *shape), f"{folder}: {key}")
+
+    contacts = {key: array(events.collisions, key, *shape) for key, shape in CONTACTS.items()}
+    contacts["frame"] = np.maximum(np.ceil(contacts["frame"]) - 1, 0)
+    return MoviExample(
+        tuple(SceneObject(i.shape, i.material, i.color, i.size) for i in metadata.instances),
+        metadata.metadata.resolution,
+        {key: array(metadata.instances, key, *shape) for key, shape in STATES.items()},
+        contacts,
+    )
+
+
+def _read_record(path: Path) -> MoviExample:
+    """Read the format of TensorFlow Datasets; `path` is a shard's path and a record's number."""
+    features = read_example(path.parent, int(path.name))
+    where = f"{path.parent}: record {int(path.name)}"
+
+    def array(name: str, *shape: int) -> np.ndarray:
+        if name not in features:
+            raise RecordError(f"{where} has no feature {name!r}, which the published layout has")
+        return finite_array(feature_values(features[name]), shape, f"{where}: {name}")
+
+    frames, count, width, height = (
+        int(array(f"metadata/{key}")) for key in ("num_frames", "num_instances", "width", "height")
+    )
+    if frames != FRAMES:
+        raise RecordError(f"{where} has {frames} frames, expected {FRAMES}")
+    appearances = []
+    for name, words in APPEARANCE.items():
+        numbers = array(f"instances/{name}_label", count).astype(int)
+        if not set(numbers) <= set(range(len(words))):
+            raise RecordError(f"{where}: {name}_label is {numbers}, expected 0 to {len(words) - 1}")
+        appearances.append([words[n] for n in numbers])
+    points = len(array("events/collisions/frame", -1))
+    return MoviExample(
+        tuple(map(SceneObject, *appearances)),
+        (width, height),
+        {key: array(f"instances/{key}", count, *shape) for key, shape in STATES.items()},
+        {key: array(f"events/collisions/{key}", points, *shape) for key, shape in CONTACTS.items()},
     )
 
 

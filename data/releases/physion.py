@@ -33,7 +33,7 @@ from data.world.events import first_contacts
 if TYPE_CHECKING:
     import h5py
 
-FOLDERS = "an HDF5 file per trial, such as Collide/pilot_it2_collision/0000.hdf5"
+FOLDER_CONTENTS = "an HDF5 file per trial, such as Collide/pilot_it2_collision/0000.hdf5"
 FPS = 30
 AXES = [0, 2, 1]
 """Order of TDW's axes that gives z up."""
@@ -64,7 +64,7 @@ VECTORS = {"positions": 3, "rotations": 4, "velocities": 3, "angular_velocities"
 def list_scenes(folder: Path) -> list[Path]:
     """Return the trials below a folder, in order of their path."""
     paths = sorted(path for end in ("hdf5", "h5") for path in folder.rglob(f"*.{end}"))
-    return check_unique_scenes(folder, paths, partial(_stimulus, folder=folder), FOLDERS)
+    return check_unique_scenes(folder, paths, partial(_stimulus, folder=folder), FOLDER_CONTENTS)
 
 
 def _stimulus(path: Path, folder: Path) -> str:

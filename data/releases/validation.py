@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -61,7 +61,7 @@ def scene_id(suite: str, *parts: str) -> str:
 
 
 def check_unique_scenes(
-    folder: Path, paths: Sequence[Path], id_of: Callable[[Path], str], layout: str
+    folder: Path, paths: list[Path], id_of: Callable[[Path], str], contents: str
 ) -> list[Path]:
     """Return `paths`, one path per scene, after checking that there is one and no scene repeats.
 
@@ -69,18 +69,18 @@ def check_unique_scenes(
         folder: The folder of the release.
         paths: The paths of its scenes.
         id_of: Returns the scene id of a path.
-        layout: The expected content of the folder, in words for error messages.
+        contents: The expected contents of the folder, in words for error messages.
 
     Raises:
         UserError: The folder does not exist, contains no scene, or contains a scene twice.
     """
     if not folder.is_dir():
         raise UserError(
-            f"folder {folder} does not exist: give the folder that contains {layout}",
+            f"folder {folder} does not exist: give the folder that contains {contents}",
             code="missing-folder",
         )
     if not paths:
-        raise UserError(f"{folder} contains no scene: expected {layout}", code="empty-release")
+        raise UserError(f"{folder} contains no scene: expected {contents}", code="empty-release")
     first: dict[str, Path] = {}
     for path in paths:
         other = first.setdefault(id_of(path), path)
@@ -90,7 +90,7 @@ def check_unique_scenes(
                 "folder that contains each scene once",
                 code="duplicate-scene",
             )
-    return list(paths)
+    return paths
 
 
 def finite_array(

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import io
 import shutil
 from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
-import PIL.Image
 import pyarrow.parquet as pq
 import pytest
 from datasets import load_dataset
 from huggingface_hub import DatasetCard
 
 from data.publish import huggingface
-from data.publish.columns import CONFIGURATIONS, DESCRIPTIONS, RowBuilder, dataset_features
+from data.publish.columns import CONFIGURATIONS, DESCRIPTIONS, dataset_features
 from data.publish.huggingface import ensure_export
 from data.records import POOLS, RetrievalQuery, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
@@ -90,14 +88,6 @@ def test_images_are_the_frames_that_their_row_names(micro_store, loaded) -> None
         same(row["prefix_images"][-1], row["scene_id"], row["prefix_stop"])
     for row in some("database"):
         same(row["image"], row["scene_id"], row["frame"])
-
-
-def test_a_missing_frame_is_rendered_on_demand(micro_store, tmp_path) -> None:
-    (tmp_path / "scenes").symlink_to(micro_store.folder / "scenes")
-    builder = RowBuilder(Store(tmp_path, micro_store.manifest), images=True)
-    frame = micro_store.database("test")[0]
-    image = PIL.Image.open(io.BytesIO(builder.row(frame, "test")["image"]["bytes"]))
-    assert np.array_equal(image, FrameReader(micro_store).array(frame.scene_id, frame.frame))
 
 
 def test_without_images_the_columns_are_the_records_fields(micro_store, tmp_path) -> None:

@@ -7,8 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from data.publish.baselines import BASELINES, score_baselines
-from data.publish.statistics import compute_statistics, count_cells, format_statistics
+from data.publish.statistics import (
+    BASELINES,
+    compute_statistics,
+    count_cells,
+    format_statistics,
+    score_baselines,
+)
 from tests.teacher import synthetic
 
 STANDARD = {"config": {"simulator": "bullet"}}
