@@ -25,13 +25,7 @@ from tqdm import tqdm
 
 from conf.errors import UserError
 from conf.runs import lock_folder
-from data.publish.columns import (
-    DESCRIPTIONS,
-    Record,
-    RowBuilder,
-    dataset_features,
-    list_columns,
-)
+from data.publish.columns import DESCRIPTIONS, Record, RowBuilder, dataset_features, list_columns
 from data.records import POOLS, SPLITS, RetrievalQuery, SelectionItem
 from data.store import DATABASES, Store, component_versions, hash_file, write_atomically
 from data.tracks.controls import MATCHED_ANCHOR
@@ -53,8 +47,6 @@ SHARD_GROUPS = 10
 """Row groups of a shard."""
 SIZES = {1e3: "n<1K", 1e4: "1K<n<10K", 1e5: "10K<n<100K", 1e6: "100K<n<1M"}
 """The Hub's words for fewer rows than these numbers."""
-
-
 Shard = dict[str, Any]
 """A written file, as export.json describes it: configuration, split, path relative to the export's
 folder, rows, bytes and sha256."""

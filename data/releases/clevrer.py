@@ -37,6 +37,7 @@ FOLDER_CONTENTS = (
 Vector = conlist(float, min_length=3, max_length=3)
 
 
+# The layout of an annotation.
 class ObjectProperty(Layout):
     object_id: int
     shape: Literal[SHAPES]

@@ -71,6 +71,7 @@ def _check_float(value: object) -> object:
     return value
 
 
+# The layout of metadata.json and events.json.
 class Instance(Layout):
     shape: Literal[SHAPES]
     material: Literal[MATERIALS]
@@ -125,8 +126,7 @@ class MoviExample:
 
 def list_scenes(folder: Path) -> list[Path]:
     """Return one path per scene, in order: its metadata.json, or a shard's path and the record's
-    number (`movi_a-train.tfrecord-00000-of-00512/00003`).
-    """
+    number (`movi_a-train.tfrecord-00000-of-00512/00003`)."""
     # TensorFlow Datasets may write a metadata.json too, beside dataset_info.json.
     folders = [
         path
