@@ -64,10 +64,10 @@ class Sweep:
         self.command, self.schema = command, schema
         with open_hydra(command, schema) as loader:
             cfg = compose_config(command, overrides, RunMode.MULTIRUN)
-            self.hydra, self.typed = cfg.hydra, cfg.hydra.overrides.task
+            self.hydra, self.task_overrides = cfg.hydra, cfg.hydra.overrides.task
             # Overrides of the command line replace the parameters of a sweep preset.
             lines = [f"{key}={value}" for key, value in (cfg.hydra.sweeper.params or {}).items()]
-            lines += [line for line in self.typed if not line.startswith("+sweep=")]
+            lines += [line for line in self.task_overrides if not line.startswith("+sweep=")]
             parsed = OverridesParser.create(config_loader=loader).parse_overrides(lines)
         self.overrides = {override.get_key_element(): override for override in parsed}
         choices = self.hydra.runtime.choices
@@ -77,7 +77,7 @@ class Sweep:
             )
         self.is_search = choices["hydra/sweeper"] != "basic"
         self.folder = Path(cfg.hydra.sweep.dir)
-        self.name = run_name(cfg.run, self.typed)
+        self.name = run_name(cfg.run, self.task_overrides)
         self.jobs = self._list_jobs()
         for job in self.jobs:
             compose(command, schema, job)
@@ -121,7 +121,7 @@ class Sweep:
         return [read_job(job.folder) for job in jobs]
 
     def _job(self, number: int, overrides: list[str]) -> Job:
-        title = " ".join(o.lstrip("+") for o in overrides if o not in self.typed)
+        title = " ".join(o.lstrip("+") for o in overrides if o not in self.task_overrides)
         hydra = self.hydra.overrides.hydra
         passed_on = [o for o in hydra if not o.lstrip("+").startswith(PARENT_ONLY)]
         run = f"run='{self.name}/{number}'"
