@@ -10,7 +10,7 @@ import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -97,19 +97,14 @@ def timing_arguments(train: TrainConfig, folder: Path) -> dict[str, Any]:
 
 
 def run_in_process(
-    measure: Callable[..., Measurements], *arguments: Any, environment: dict[str, str]
-) -> Measurements | str:
-    """Call a function in a new process; returns its result, or why it could not train."""
+    function: Callable[..., Any], *arguments: Any, environment: Mapping[str, str] = {}
+) -> Any:
+    """Call a function in a new process with further environment variables; returns its result."""
     with (
         patch.dict(os.environ, {"HF_HUB_OFFLINE": "1", **environment}),
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
     ):
-        try:
-            return pool.submit(measure, *arguments).result()
-        except torch.OutOfMemoryError:
-            return "out of memory"
-        except UserError as error:
-            return str(error)
+        return pool.submit(function, *arguments).result()
 
 
 def add_arguments(parser: argparse.ArgumentParser, steps: int, variants: Sequence[str]) -> None:
@@ -124,7 +119,7 @@ def add_arguments(parser: argparse.ArgumentParser, steps: int, variants: Sequenc
 
 
 def compare(
-    measure: Callable[[str], Measurements | str],
+    measure: Callable[[str], Measurements],
     names: Sequence[str],
     reference: str,
     unit: str,
@@ -133,7 +128,8 @@ def compare(
     """Measure variants in turns, and print medians and the medians of their ratios.
 
     Args:
-        measure: Measures the variant of a name, or returns why it cannot be measured.
+        measure: Measures the variant of a name. One that has too little memory or cannot be
+            trained with its settings is left out.
         reference: Variant that all others are compared with.
         unit: What a rate counts, such as samples.
 
@@ -143,7 +139,12 @@ def compare(
     turns = [name for _ in range(rounds) for name in names]
     results: dict[str, list[Measurements | str]] = {name: [] for name in names}
     for name in tqdm(turns, unit="training"):
-        results[name].append(measure(name))
+        try:
+            results[name].append(measure(name))
+        except torch.OutOfMemoryError:
+            results[name].append("out of memory")
+        except UserError as error:
+            results[name].append(str(error))
     print(f"{'':<44}{unit + '/s':>11}{'ratio':>8}{'peak GiB':>10}{'ratio':>8}{'loss':>10}")
     measured = {}
     for name, found in results.items():

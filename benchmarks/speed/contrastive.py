@@ -93,11 +93,7 @@ def main() -> None:
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         if args.preset != "tiny":
-            cfg = compose("train.contrastive", ContrastiveCommand, overrides)
-            store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
-            texts = embedder.tokenizer_texts(store.retrieval("train"), cfg.retriever)
-            size = args.preset.replace("emb_", "")
-            comparison.write_random_base(size, texts, cfg.retriever.image_size, Path(folder))
+            comparison.run_in_process(write_base, overrides, args.preset, Path(folder))
             overrides.append(f"retriever.model={folder}")
         for batch in args.batch:
             print(f"\nbatches of {batch} queries")
@@ -106,9 +102,7 @@ def main() -> None:
 
 def compare_speed(overrides: list[str], args: argparse.Namespace) -> None:
     results = comparison.compare(
-        lambda name: comparison.run_in_process(
-            measure, overrides, VARIANTS[name], args.steps, environment={}
-        ),
+        lambda name: comparison.run_in_process(measure, overrides, VARIANTS[name], args.steps),
         args.only or list(VARIANTS),
         PLAIN,
         "queries",
@@ -218,6 +212,15 @@ class FrameCollator(SentenceTransformerDataCollator):
 
     def __call__(self, rows: list[dict[str, int]]) -> dict[str, Any]:
         return super().__call__([self.load(row[NUMBER]) for row in rows])
+
+
+def write_base(overrides: list[str], preset: str, folder: Path) -> None:
+    """Save a random base of a preset's size with a tokenizer for the benchmark's texts."""
+    cfg = compose("train.contrastive", ContrastiveCommand, overrides)
+    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    texts = embedder.tokenizer_texts(store.retrieval("train"), cfg.retriever)
+    size = preset.replace("emb_", "")
+    comparison.write_random_base(size, texts, cfg.retriever.image_size, folder)
 
 
 if __name__ == "__main__":

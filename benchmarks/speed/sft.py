@@ -113,7 +113,7 @@ def main() -> None:
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         if args.preset != "tiny":
-            write_base(overrides, args.preset, Path(folder))
+            comparison.run_in_process(write_base, overrides, args.preset, Path(folder))
             overrides.append(f"student.model={folder}")
         if args.losses:
             compare_losses(overrides, args.steps)
@@ -146,7 +146,7 @@ def compare_losses(overrides: list[str], steps: int) -> None:
 
 def measure_in_process(
     overrides: list[str], variant: Variant, steps: int, trl_loss: bool = False
-) -> Measurements | str:
+) -> Measurements:
     return comparison.run_in_process(
         measure, overrides, variant, steps, trl_loss, environment=variant.environment
     )

@@ -57,7 +57,8 @@ class Sweep:
     Attributes:
         hydra: Hydra's settings.
         overrides: The swept and the fixed overrides of the jobs, by key.
-        jobs: The overrides of each job. A search has other jobs; these have each of its values.
+        jobs: The overrides of each job. A search chooses its own jobs; for the check, these contain
+            each of its values.
     """
 
     def __init__(self, command: str, schema: type, overrides: list[str]) -> None:

@@ -20,18 +20,18 @@ BOUNDS = {
 
 
 def setting(default: Any, options: Sequence[str | None] = (), **bounds: float) -> Any:
-    """Return a dataclass field that has only certain values.
+    """Return the dataclass field of a setting whose values are restricted.
 
     Args:
         default: The default value.
-        options: All values that the setting may have.
-        bounds: Any of BOUNDS, such as `least=1`. They do not apply to null.
+        options: The valid values; empty allows any value.
+        bounds: Bounds by their name in BOUNDS, such as `least=1`. null is always within them.
     """
     return field(default=default, metadata={"options": options, "bounds": bounds})
 
 
 class Settings:
-    """A group of settings, which is a dataclass with settings and nested groups as its fields."""
+    """Base of a group of settings: a dataclass whose fields are settings or nested groups."""
 
     def check(self, group: str = "") -> list[str]:
         """Return one sentence per invalid setting of this group and of its nested groups.
@@ -52,7 +52,7 @@ class Settings:
         return [*problems, *self.find_problems(group)]
 
     def find_problems(self, group: str) -> Iterable[str]:
-        """Further problems of this group, such as settings that exclude each other."""
+        """One sentence per further problem, such as settings that exclude each other."""
         return ()
 
 
