@@ -87,16 +87,12 @@ def test_help_describes_every_setting(command):
 def test_student_preset_sets_its_training_recipe():
     tiny = settings("python -m train.sft")
     paper = settings("python -m train.sft student=qwen3_vl_8b")
-    assert (tiny.train.lr, tiny.train.batch, tiny.train.micro_batch) == (2e-3, 16, 4)
-    assert tiny.train.regime == "cot"
-    assert (paper.train.lr, paper.train.batch, paper.train.micro_batch) == (2e-5, 16, 1)
-    assert (paper.train.epochs, paper.train.precision) == (3, "bf16")
-    assert (paper.student.lora.rank, paper.student.lora.alpha) == (16, 32)
-    assert (paper.student.frames, paper.student.image_size, paper.student.max_length) == (
-        12,
-        336,
-        3072,
-    )
+    assert (tiny.train.lr, tiny.train.batch, tiny.train.regime) == (2e-3, 16, "cot")
+    train, student = paper.train, paper.student
+    assert (train.lr, train.epochs, train.precision) == (2e-5, 3, "bf16")
+    assert (train.batch, train.micro_batch) == (16, 1)
+    assert (student.lora.rank, student.lora.alpha) == (16, 32)
+    assert (student.frames, student.image_size, student.max_length) == (12, 336, 3072)
 
 
 def test_teacher_takes_one_server_or_several():
@@ -136,37 +132,32 @@ def test_a_window_group_quota_is_divided_among_its_cells():
     assert list(window) == list(CELLS)
 
 
+def totals(quotas: dict[str, schema.Quota], prefix: str = "") -> tuple[int, int]:
+    """The training and test quota of the cells whose names begin with a prefix."""
+    cells = [quota for name, quota in quotas.items() if name.startswith(prefix)]
+    return sum(quota.train for quota in cells), sum(quota.test for quota in cells)
+
+
 def test_quotas_add_up_to_the_papers_totals():
     benchmark = settings("python -m data.build benchmark=dynapix").benchmark
-    track = benchmark.selection
-    # (train, test) of the paper's tables; by group and family it gives the test items alone.
-    for quotas, cells, total in (
-        (track.event, 7, (1151, 249)),
-        (track.time, 2, (1619, 374)),
-        (track.window, 54, (6598, 1585)),
-    ):
-        assert len(quotas) == cells
-        assert (
-            sum(q.train for q in quotas.values()),
-            sum(q.test for q in quotas.values()),
-        ) == total
+    track, retrieval = benchmark.selection, benchmark.retrieval
+    assert (len(track.event), *totals(track.event)) == (7, 1151, 249)
+    assert (len(track.time), *totals(track.time)) == (2, 1619, 374)
+    assert (len(track.window), *totals(track.window)) == (54, 6598, 1585)
+    assert track.event["future_offset_gap10"] == schema.Quota(163, 35)
+    # The paper gives training items by group, and test items by group and family.
     groups = {"G1": 1967, "G2": 2300, "G3": 1578, "G4": 753}
     families = {
         "G1_A": 178, "G1_C": 234, "G2_A": 269, "G2_B": 266, "G2_C": 145, "G3_A": 173, "G3_C": 151,
         "G4_A": 84, "G4_B": 85,
     }  # fmt: skip
-    for name, train in groups.items():
-        assert sum(q.train for c, q in track.window.items() if c.startswith(name)) == train
-    for name, test in families.items():
-        assert sum(q.test for c, q in track.window.items() if c.startswith(name)) == test
-    builders = benchmark.retrieval.builders
-    assert sorted(builders) == ["1", "2", "3", "4", "5", "6"]
-    assert sum(q.train + q.test for q in builders.values()) == 22_500
-    retrieval = benchmark.retrieval
+    assert {name: totals(track.window, name)[0] for name in groups} == groups
+    assert {name: totals(track.window, name)[1] for name in families} == families
+    assert sorted(retrieval.builders) == ["1", "2", "3", "4", "5", "6"]
+    assert sum(totals(retrieval.builders)) == 22_500
     assert (retrieval.standard, retrieval.database, retrieval.source) == (2_002, 10_000, 30_000)
     absent = retrieval.counterfactual
     assert (absent.train + absent.test, retrieval.counterfactual_source) == (18_225, 26_995)
-    # The 80/20 division of scenes, kept in the pools.
-    for quota in (*builders.values(), absent):
+    # Queries are divided 80/20, as the scenes are.
+    for quota in (*retrieval.builders.values(), absent):
         assert quota.train == 4 * quota.test
-    assert benchmark.selection.event["future_offset_gap10"] == schema.Quota(163, 35)
