@@ -128,19 +128,19 @@ class ExampleRows:
         The first hard negative of a counterfactual query is the factual frame: the query's own
         scene at the target's moment. A ring marks the object that the counterfactual scene lacks.
         """
-        target = self._cell(query.target, "target", _moment(query, query.target), is_answer=True)
-        cells, negatives, removed = [target], list(query.hard_negatives), None
+        caption = _describe_frame(query, query.target)
+        cells = [self._cell(query.target, "target", caption, is_answer=True)]
+        negatives, removed = list(query.hard_negatives), None
         if query.removed_object is not None:
             scene = self._store.scene(query.scene_id)
             without = self._store.scene(query.target.scene_id)
-            removed = [look.phrase for look in scene.objects].index(query.removed_object)
+            removed = [o.phrase for o in scene.objects].index(query.removed_object)
             shift = removal_displacement(scene, without, removed)[query.target.frame]
             caption = f"others differ by {shift:.0f} px"
             cells.insert(0, self._cell(negatives.pop(0), "factual", caption, ring_on=removed))
         for frame in negatives:
-            caption = (
-                f"{_moment(query, frame)}, {self._displacement(query.target, frame):.0f} px away"
-            )
+            distance = f"{self._displacement(query.target, frame):.0f} px away"
+            caption = f"{_describe_frame(query, frame)}, {distance}"
             cells.append(self._cell(frame, "wrong time", caption))
         details = f"{query.split}, anchor {query.anchor}"
         return Row(query.query_id, details, query.question, self._prefix(query, removed), cells)
@@ -163,7 +163,7 @@ class ExampleRows:
         return self._cell(
             candidate,
             f"{LETTERS[position]}: {candidate.source}",
-            f"{_moment(item, candidate)}, {distance:.0f} px from {nearest}",
+            f"{_describe_frame(item, candidate)}, {distance:.0f} px from {nearest}",
             is_answer=position == item.answer,
         )
 
@@ -182,7 +182,7 @@ class ExampleRows:
         return cross_scene_displacement(scenes[0], one.frame, scenes[1], two.frame)
 
 
-def _moment(record: SelectionItem | RetrievalQuery, frame: FrameRef) -> str:
+def _describe_frame(record: SelectionItem | RetrievalQuery, frame: FrameRef) -> str:
     """Describe when a frame occurs: its index and its offset in frames from the end of the prefix.
 
     The offset is omitted unless the frame is of the record's scene or of its counterfactual scene.

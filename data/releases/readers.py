@@ -1,6 +1,6 @@
 """Readers of other simulators' releases, by simulator. Each module provides three functions:
 
-    list_scenes(folder) -> list[Path]           one path a scene, in a stable order
+    list_scenes(folder) -> list[Path]           one path per scene, in a stable order
     read_scene(path, folder, split) -> Scene    the scene at one of these paths
     load_images(scene, folder, frames) -> dict  RGB images by frame index
 

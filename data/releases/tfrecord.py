@@ -55,14 +55,15 @@ def read_example(path: Path, number: int) -> dict[str, Any]:
         file.seek(ranges[number].start)
         data = file.read(len(ranges[number]))
     try:
-        example = _example_class().FromString(data)
+        example = example_class().FromString(data)
     except DecodeError as error:
         raise RecordError(f"{where} is not a tf.train.Example: {error}", "damaged-file") from error
     return {entry.key: entry.value for entry in example.features.feature}
 
 
 @cache
-def _example_class() -> type:
+def example_class() -> type:
+    """Return the message class of tf.train.Example."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, text_format
 
     # A pool of our own cannot conflict with the tf.train.Example that TensorFlow registers.

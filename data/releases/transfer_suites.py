@@ -49,15 +49,15 @@ class TransferFamily:
     """A family of a suite's items.
 
     Attributes:
-        same: Number of distractors from the item's own scene, at frames after the prefix. The
+        same_scene: Number of distractors from the item's own scene, at frames after the prefix. The
             other distractors are targets from other scenes of the same scenario.
-        later: Whether distractors from the item's own scene must also come after the target.
+        after_target: Whether distractors from the item's own scene must also come after the target.
     """
 
     suite: str
     family: str
-    same: int
-    later: bool
+    same_scene: int
+    after_target: bool
     CELLS: dict[str, TransferCell]
 
     def make_item(
@@ -68,12 +68,14 @@ class TransferFamily:
         timings = cell.timings(scene)
         for k in rng.permutation(len(timings)):
             timing = timings[k]
-            frames = np.arange((timing.target if self.later else timing.stop) + 1, scene.frames)
+            frames = np.arange(
+                (timing.target if self.after_target else timing.stop) + 1, scene.frames
+            )
             wrong = rng.permutation(frames[frames != timing.target])
             picked = picker.pick_each(
                 FrameRef(scene.scene_id, timing.target),
-                (scene_candidates(scene, wrong, "same_time"), self.same),
-                (cross_scene_candidates(cell, scene, rng, picker), 3 - self.same),
+                (scene_candidates(scene, wrong, "same_time"), self.same_scene),
+                (cross_scene_candidates(cell, scene, rng, picker), 3 - self.same_scene),
             )
             if picked is None:
                 continue
@@ -107,9 +109,9 @@ def cross_scene_candidates(
     scenes = (picker.scene_of(str(name)) for name in rng.permutation(picker.scene_ids))
     similar = (s for s in scenes if s.scene_id != scene.scene_id and s.scenario == scene.scenario)
     targets = ((s, timings[0].target) for s in similar if (timings := cell.timings(s)))
-    looks = set(scene.objects)
+    objects = set(scene.objects)
     sample = list(islice(targets, CROSS_SCENES))
-    for other, target in sorted(sample, key=lambda pair: -len(looks & set(pair[0].objects))):
+    for other, target in sorted(sample, key=lambda pair: -len(objects & set(pair[0].objects))):
         yield Candidate(other.scene_id, target, "cross_scene")
 
 
@@ -172,8 +174,8 @@ TRANSFER_SUITES = {
         family: TransferFamily(
             f"{prefix}{suite}",
             family,
-            same=1 if suite == "movi_a" else 2,
-            later=suite == "physion",
+            same_scene=1 if suite == "movi_a" else 2,
+            after_target=suite == "physion",
             CELLS=cells,
         )
         for family, cells in families.items()

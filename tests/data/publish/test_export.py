@@ -23,12 +23,6 @@ from tests.user_errors import raises_user_error
 
 pytestmark = pytest.mark.slow
 
-SPLITS = {
-    "selection": ("train", "test"),
-    "retrieval": ("train", "test"),
-    "database": ("test", "future", "counterfactual"),
-}
-
 
 @pytest.fixture(scope="module")
 def exported(micro_store: Store, tmp_path_factory) -> Path:
@@ -145,17 +139,12 @@ def test_shards_of_an_export_with_other_settings_are_not_reused(micro_store, tmp
     assert pq.read_metadata(out / "selection" / "train-00000-of-00001.parquet").num_rows == 126 + 4
 
 
-def test_an_existing_export_is_not_written_again(micro_store, tmp_path) -> None:
+def test_an_existing_export_is_kept_and_other_content_is_refused(micro_store, tmp_path) -> None:
     out = tmp_path / "out"
     first = ensure_export(micro_store, out, images=False)
     made = {p: p.stat().st_mtime_ns for p in out.rglob("*")}
     assert ensure_export(micro_store, out, images=False) == first
     assert made == {p: p.stat().st_mtime_ns for p in out.rglob("*")}
-
-
-def test_other_content_at_the_folder_is_refused(micro_store, tmp_path) -> None:
-    out = tmp_path / "out"
-    ensure_export(micro_store, out, images=False)
     with raises_user_error("different-settings", contains=("images=False", "images=True")):
         ensure_export(micro_store, out, images=True)
     (out / "selection" / "test-00000-of-00001.parquet").write_bytes(b"")
@@ -181,8 +170,9 @@ def test_the_card_describes_the_export(micro_store, exported) -> None:
     card = DatasetCard.load(exported / "README.md")
     assert (card.data.license, card.data.size_categories) == ("apache-2.0", "n<1K")
     configs = {c["config_name"]: c for c in card.data.configs}
-    for name, splits in SPLITS.items():
-        assert [f["split"] for f in configs[name]["data_files"]] == list(splits)
+    databases = ["test", "future", "counterfactual"]
+    for name, splits in zip(CONFIGURATIONS, [["train", "test"]] * 2 + [databases], strict=True):
+        assert [f["split"] for f in configs[name]["data_files"]] == splits
     assert micro_store.identity in card.text
     counts = micro_store.manifest["counts"]
     for family in ("event", "time", "window"):

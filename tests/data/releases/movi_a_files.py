@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from data.releases.tfrecord import example_class
 from tests.data.releases.pictures import picture, png
 
 MOVI_COLORS = ["blue", "brown", "cyan", "gray", "green", "purple", "red", "yellow"]
@@ -107,31 +108,14 @@ def movi_features(example: dict) -> dict[str, Any]:
 
 def write_tfrecord(path: Path, examples: list[dict[str, Any]]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
+    kinds = {bytes: "bytes_list", float: "float_list"}
     with open(path, "wb") as file:
         for features in examples:
-            data = _message(1, b"".join(_message(1, _feature(*f)) for f in features.items()))
-            length = len(data).to_bytes(8, "little")
-            file.write(length + b"CRC." + data + b"CRC.")
+            message = example_class()()
+            for name, values in features.items():
+                entry = message.features.feature.add(key=name)
+                kind = kinds.get(type(values[0]) if values else int, "int64_list")
+                getattr(entry.value, kind).value.extend(values)
+            data = message.SerializeToString()
+            file.write(len(data).to_bytes(8, "little") + b"CRC." + data + b"CRC.")
     return path
-
-
-def _feature(name: str, values: list) -> bytes:
-    if values and isinstance(values[0], bytes):
-        kind, packed = 1, b"".join(_message(1, v) for v in values)
-    elif values and isinstance(values[0], float):
-        kind, packed = 2, _message(1, np.array(values, "<f4").tobytes())
-    else:
-        kind, packed = 3, _message(1, b"".join(_varint(v % 2**64) for v in values))
-    return _message(1, name.encode()) + _message(2, _message(kind, packed))
-
-
-def _message(number: int, data: bytes) -> bytes:
-    return _varint(number << 3 | 2) + _varint(len(data)) + data
-
-
-def _varint(n: int) -> bytes:
-    groups = []
-    while n > 0x7F:
-        groups.append(n & 0x7F | 0x80)
-        n >>= 7
-    return bytes([*groups, n])
