@@ -66,8 +66,6 @@ def check_unique_scenes(
     """Return `paths`, one path per scene, after checking that there is one and no scene repeats.
 
     Args:
-        folder: The folder of the release.
-        paths: The paths of its scenes.
         id_of: Returns the scene id of a path.
         contents: The expected contents of the folder, in words for error messages.
 
