@@ -112,25 +112,25 @@ def open_hydra(command: str, schema: type) -> Iterator[ConfigLoader]:
         try:
             yield GlobalHydra.instance().config_loader()
         except (HydraException, OmegaConfBaseException) as error:
-            raise _settings_error(command, schema, error) from error
+            raise _settings_error(command, error) from error
 
 
 def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.RUN) -> DictConfig:
-    """Compose settings and Hydra's own, with the two errors that do not name the override."""
+    """Compose the settings of a command and of Hydra, with clearer messages for two errors."""
     hydra = GlobalHydra.instance().hydra
     try:
         return hydra.compose_config(config_name(command), overrides, mode, from_shell=False)
     except ValueError as error:
-        typed = " ".join(o for o in overrides if o.endswith("=null"))
-        raise SettingsError(f"{typed}: give the name of a preset instead of null") from error
+        nulls = " ".join(o for o in overrides if o.endswith("=null"))
+        raise SettingsError(f"{nulls}: give the name of a preset instead of null") from error
     except (AssertionError, AttributeError) as error:
-        typed = " ".join(o for o in overrides if "." in o.partition("=")[0])
+        nested = " ".join(o for o in overrides if "." in o.partition("=")[0])
         raise SettingsError(
-            f"{typed}: the group above one of these keys is null; choose a preset that sets it"
+            f"{nested}: the group above one of these keys is null; choose a preset that sets it"
         ) from error
 
 
-def _settings_error(command: str, schema: type, error: Exception) -> SettingsError:
+def _settings_error(command: str, error: Exception) -> SettingsError:
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     text = " ".join(str(error).partition("Config search path")[0].split())
     unknown = re.search(r"Key '.*' (?:is )?not in .*\s+full_key: (\S+)", str(cause)) or re.match(
@@ -138,7 +138,7 @@ def _settings_error(command: str, schema: type, error: Exception) -> SettingsErr
     )
     if unknown:
         preset = re.match(r"In '(\S+)': ", text)
-        problem = _unknown_key(command, schema, unknown[1])
+        problem = _unknown_key(command, unknown[1])
         return SettingsError(f"{preset[0] if preset else ''}{problem}", code="unknown-key")
     text = re.sub(r" (full_key:|See https).*", "", text).removeprefix("Error merging override ")
     text = text.replace(" Available options", "; available options")
@@ -148,7 +148,7 @@ def _settings_error(command: str, schema: type, error: Exception) -> SettingsErr
     return SettingsError(f"{key}: {text}" if key else text)
 
 
-def _unknown_key(command: str, schema: type, key: str) -> str:
+def _unknown_key(command: str, key: str) -> str:
     if key in REMOVED_KEYS:
         return f"{key} was removed: {REMOVED_KEYS[key]}"
     if key.startswith("hydra."):

@@ -42,7 +42,7 @@ class Search:
     n_jobs: int | None
     seed: int
     params: dict[str, str] | None
-    """Sweeps of a preset, which `conf.compose.plan_sweep` adds to the overrides."""
+    """Sweeps of a preset, which `conf.multirun.sweep.Sweep` adds to the overrides."""
 
     def run(
         self,
