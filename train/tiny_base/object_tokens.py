@@ -9,7 +9,7 @@ the candidate's letter, and in clips the object's heading.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -62,28 +62,25 @@ class ObjectTokenCollator(Collator):
             batch["labels"], (length - batch["labels"].shape[1], 0), value=IGNORED
         )
         batch["logits_to_keep"] = torch.arange(length)
-        batch["object_labels"] = torch.tensor(
-            [
-                row
-                for k, s in enumerate(samples)
-                if s.supervised
-                for row in self._encode_object_labels(s, k, batch["input_ids"][k])
-            ]
-        ).reshape(-1, 2 + WORDS)
+        rows = [
+            row
+            for k, sample in enumerate(samples)
+            if sample.supervised
+            for row in self._label_rows(sample, k, batch["input_ids"][k])
+        ]
+        batch["object_labels"] = torch.tensor(rows).reshape(-1, 2 + WORDS)
         return batch
 
-    def _encode_object_labels(self, sample: Sample, row: int, ids: torch.Tensor) -> list[list[int]]:
+    def _label_rows(self, sample: Sample, row: int, ids: torch.Tensor) -> Iterator[list[int]]:
         visual = torch.tensor([self._processor.image_token_id, self._processor.video_token_id])
         positions = torch.isin(ids, visual).nonzero()[:, 0].tolist()
         each = len(positions) // max(1, sample.pictures)
         grid = math.isqrt(each)
-        rows = []
         for label in sample.object_labels:
             column, line = (min(int(share * grid), grid - 1) for share in label.place)
             position = positions[label.picture * each + line * grid + column]
             words = [first_token(self._processor, word) for word in label.words]
-            rows.append([row, position, *words, *[NONE] * (WORDS - len(words))])
-        return rows
+            yield [row, position, *words, *[NONE] * (WORDS - len(words))]
 
 
 class ObjectTokenTrainer(StudentTrainer):
@@ -102,15 +99,10 @@ class ObjectTokenTrainer(StudentTrainer):
         )
         if model.training and len(object_labels):
             # `num_items_in_batch` counts the tokens of all ranks, but gradients are averaged over
-            # ranks. The factor `world_size` turns the average into a sum, as in the language loss.
-            world_size = self.accelerator.num_processes
-            loss = (
-                loss
-                + world_size
-                * WEIGHT
-                * object_token_loss(outputs.logits, object_labels)
-                / num_items_in_batch
-            )
+            # ranks. The number of ranks turns the average into a sum, as in the language loss.
+            weight = self.accelerator.num_processes * WEIGHT
+            object_loss = object_token_loss(outputs.logits, object_labels)
+            loss = loss + weight * object_loss / num_items_in_batch
         return (loss, outputs) if return_outputs else loss
 
 

@@ -1,4 +1,4 @@
-"""Questions about frames and clips that teach the tiny base to see before it selects.
+"""Questions about frames and clips that train the tiny base to recognise objects and motion.
 
 The oracle answers them. They are about a single frame and about four candidates (the objects and
 their places), about the motion of an object in a clip, about a clip and its outcome in the words of
@@ -8,9 +8,10 @@ is the later one, and about which candidate fits a description. None is the sele
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,6 @@ from models.student.prompts import ObjectLabel, Sample, answer_line, conversatio
 from teacher.narrator import write_description, write_match_lines
 from teacher.predicates import (
     REGIONS,
-    ObjectFacts,
     Predicates,
     extract_facts,
     extract_predicates,
@@ -42,17 +42,6 @@ MATCH = (
     'why. End with a line "Answer:" and the letter.'
 )
 QUESTIONS = (FRAME, CANDIDATES, WHERE, COMPARE, MOVES, CLIP, LATER, MATCH)
-FRAMES = 2
-"""Frames that are described, per item and epoch."""
-SETS = 2
-"""Sets of candidates that are described, and sets that are searched, per item and epoch."""
-MOVING = 6
-"""Questions about an object's motion, per item and epoch. Motion is a few pixels per frame, and no
-other question about a clip requires it."""
-CLIPS = 2
-"""Descriptions of a clip, per item and epoch."""
-COMPARED = 3
-"""Comparisons of candidates with a clip's description, per item and epoch."""
 MOVED = 0.08
 """Least displacement of an object in the later of two frames, as a share of the image's width."""
 CLEAR = 0.3
@@ -63,206 +52,201 @@ NAMED = 4
 """Most objects that a description names."""
 
 
+class Picture(NamedTuple):
+    """A frame in a prompt, with its letter if it is a candidate."""
+
+    scene_id: str
+    frame: int
+    letter: str = ""
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question after pictures, and its answer.
+
+    Attributes:
+        after_clip: Whether the clip of the item's prefix is before the pictures.
+    """
+
+    text: str
+    answer: str
+    pictures: list[Picture]
+    after_clip: bool = False
+
+
 def build_questions(
     store: Store, items: list[SelectionItem], frame_count: int, frames: FrameReader, seed: int
 ) -> dict[str, list[LazySample]]:
     """Samples by kind of question. Frames, candidates and their order are random in each epoch."""
-    make = _SampleBuilder(store, frame_count, frames, seed, items)
-    return {
-        "frame": [make.frame(item, k) for item in items for k in range(FRAMES)],
-        "candidates": [make.candidates(item, k) for item in items for k in range(SETS)],
-        "where": [make.where(item, k) for item in items for k in range(SETS)],
-        "moves": [sample for item in items for sample in make.moves(item)],
-        "clip": [sample for item in items for sample in make.clip(item)],
-        "compared": [sample for item in items for sample in make.compared(item)],
-        "later": [sample for item in items for sample in make.later(item)],
-        "match": [sample for item in items for sample in make.match(item)],
-    }
+    builder = QuestionBuilder(store, items, frame_count, frames, seed)
+    return {kind: [s for item in items for s in builder.samples(item, kind)] for kind in KINDS}
 
 
-Picture = tuple[str, int, str]
-"""Scene id, frame, and the candidate's letter; empty if the frame is not a candidate."""
+@dataclass(frozen=True)
+class QuestionBuilder:
+    """Asks questions about items; seed, epoch and item determine the random choices.
 
-
-class _SampleBuilder:
-    """Builds the samples of items; seed, epoch and item determine the random choices.
-
-    For each kind of question, one method estimates a sample's length and another one builds it.
+    Each kind of question has a method, which returns None if it cannot ask about the item.
     """
 
-    def __init__(
-        self,
-        store: Store,
-        frame_count: int,
-        frames: FrameReader,
-        seed: int,
-        items: list[SelectionItem],
-    ) -> None:
-        self.store, self.frames, self.seed = store, frames, seed
-        self.frame_count = frame_count
-        self.items = items
-        self.media = frame_count // 2
-        """Pairs of frames in a clip."""
+    store: Store
+    items: list[SelectionItem]
+    frame_count: int
+    frames: FrameReader
+    seed: int
 
-    def frame(self, item: SelectionItem, k: int) -> LazySample:
-        """The objects of a frame and their places."""
-        text = f"{FRAME} {describe_frame(self.store.scene(item.scene_id), item.prefix_stop)}"
-        return LazySample(text, 1, partial(self._frame, item, k))
+    def samples(self, item: SelectionItem, kind: str) -> Iterator[LazySample]:
+        """Return the samples of a kind; the first epoch's question estimates their length."""
+        if first := self.ask(item, kind, 0, epoch=0):
+            media = len(first.pictures) + self.frame_count // 2 * first.after_clip
+            for repeat in range(KINDS[kind][1]):
+                render = partial(self.render, item, kind, repeat)
+                yield LazySample(f"{first.text} {first.answer}", media, render)
 
-    def _frame(self, item: SelectionItem, k: int, epoch: int) -> Sample:
-        rng = seeded_rng(self.seed, epoch, item.item_id, "frame", k)
-        scene_id, frame = self._random_frame(item, rng)
-        pixels = self.frames.array(scene_id, frame)
-        answer = describe_frame(self.store.scene(scene_id), frame)
-        labels = self._label_objects([(scene_id, frame, "")])
-        return conversation(f"{scene_id} {frame}", [pixels, f"\n{FRAME}"], answer, None, labels)
+    def ask(self, item: SelectionItem, kind: str, repeat: int, epoch: int) -> Question | None:
+        ask, repeats = KINDS[kind]
+        keys = (kind, repeat) if repeats > 1 else (kind,)
+        return ask(self, item, seeded_rng(self.seed, epoch, item.item_id, *keys))
 
-    def candidates(self, item: SelectionItem, k: int) -> LazySample:
-        """The objects and places of four candidates."""
-        answer = describe_frame(self.store.scene(item.scene_id), item.prefix_stop)
-        lines = "\n".join(f"Candidate {letter}: {answer}" for letter in LETTERS)
-        text = f"{CANDIDATES} {lines}"
-        return LazySample(text, len(LETTERS), partial(self._candidates, item, k))
-
-    def _candidates(self, item: SelectionItem, k: int, epoch: int) -> Sample:
-        pictures = self._random_four(
-            item, seeded_rng(self.seed, epoch, item.item_id, "candidates", k)
-        )
-        lines = [
-            f"Candidate {letter}: {describe_frame(self.store.scene(scene_id), frame)}"
-            for scene_id, frame, letter in pictures
+    def render(self, item: SelectionItem, kind: str, repeat: int, epoch: int) -> Sample:
+        question = self.ask(item, kind, repeat, epoch)
+        parts: list[str | np.ndarray] = []
+        for picture in question.pictures:
+            later = "Later: " if question.after_clip else ""
+            label = f"\nCandidate {picture.letter}: " if picture.letter else later
+            parts += [label] if label else []
+            parts.append(self.frames.array(picture.scene_id, picture.frame))
+        parts.append(f"\n{question.text}" if question.pictures else question.text)
+        clip, labels, pairs = None, [], []
+        if question.after_clip:
+            indices = self.prefix_frames(item)
+            clip, scene = load_clip(item.scene_id, indices, self.frames), self.scene(item)
+            # A visual token of a clip covers two frames; objects are labelled as in the first.
+            pairs = list(zip(indices[::2], [*indices[1::2], indices[-1]], strict=False))
+            labels = [
+                ObjectLabel(k, place, (*words, object_heading(scene, index, *pair) or "stationary"))
+                for k, pair in enumerate(pairs)
+                for index, place, words in visible_objects(scene, pair[0])
+            ]
+        labels += [
+            ObjectLabel(k, place, (*words, *picture.letter))
+            for k, picture in enumerate(question.pictures, len(pairs))
+            for _, place, words in visible_objects(
+                self.store.scene(picture.scene_id), picture.frame
+            )
         ]
-        name = f"{item.item_id} (candidates {k})"
-        return self._about_four(name, pictures, CANDIDATES, "\n".join(lines))
+        name = f"{item.item_id} ({kind} {repeat})"
+        return conversation(name, parts, question.answer, clip, labels)
 
-    def where(self, item: SelectionItem, k: int) -> LazySample:
+    def frame(self, item: SelectionItem, rng: np.random.Generator) -> Question:
+        """The objects of a frame and their places."""
+        scene_id, frame = self.random_frame(item, rng)
+        answer = describe_frame(self.store.scene(scene_id), frame)
+        return Question(FRAME, answer, [Picture(scene_id, frame)])
+
+    def candidates(self, item: SelectionItem, rng: np.random.Generator) -> Question:
+        """The objects and places of four candidates."""
+        pictures = self.random_four(item, rng)
+        lines = [
+            f"Candidate {p.letter}: {describe_frame(self.store.scene(p.scene_id), p.frame)}"
+            for p in pictures
+        ]
+        return Question(CANDIDATES, "\n".join(lines), pictures)
+
+    def where(self, item: SelectionItem, rng: np.random.Generator) -> Question:
         """The place of one object in four candidates, as a rationale compares them."""
-        phrase = self.store.scene(item.scene_id).objects[0].phrase
-        text = f"{WHERE.format(phrase)} {_typical_places(phrase)}"
-        return LazySample(text, len(LETTERS), partial(self._where, item, k))
-
-    def _where(self, item: SelectionItem, k: int, epoch: int) -> Sample:
-        rng = seeded_rng(self.seed, epoch, item.item_id, "where", k)
-        pictures = self._random_four(item, rng)
-        places = self._visible_regions(pictures)
-        phrase = self._choose_object(item, {p for objects in places for p in objects}, places, rng)
+        pictures = self.random_four(item, rng)
+        places = self.regions(pictures)
+        phrase = self.choose_object(item, {p for objects in places for p in objects}, places, rng)
         answer = " ".join(
-            f"{_format_place(letter, phrase, objects.get(phrase))}."
-            for (*_, letter), objects in zip(pictures, places, strict=True)
+            f"{format_place(letter, phrase, objects.get(phrase))}."
+            for letter, objects in zip(LETTERS, places, strict=True)
         )
-        name = f"{item.item_id} (where {k})"
-        return self._about_four(name, pictures, WHERE.format(phrase), answer)
+        return Question(WHERE.format(phrase), answer, pictures)
 
-    def moves(self, item: SelectionItem) -> Iterator[LazySample]:
+    def moves(self, item: SelectionItem, rng: np.random.Generator) -> Question | None:
         """The motion of an object in the clip; half of the objects are stationary."""
         facts = extract_facts(
-            self.store.scene(item.scene_id), item.prefix_start, item.prefix_stop, item.target_frame
+            self.scene(item), item.prefix_start, item.prefix_stop, item.target_frame
         )
         visible = [o for o in facts.objects if o.sight == "shown"] if facts else []
-        if visible:
-            longest = max((_describe_motion(facts.instant, o) for o in visible), key=len)
-            text = f"{MOVES.format(visible[0].object)} {longest}"
-            for k in range(MOVING):
-                make = partial(self._moves, item, facts.instant, visible, k)
-                yield LazySample(text, self.media, make)
-
-    def _moves(
-        self, item: SelectionItem, instant: str, visible: list[ObjectFacts], k: int, epoch: int
-    ) -> Sample:
-        rng = seeded_rng(self.seed, epoch, item.item_id, "moves", k)
+        if not visible:
+            return None
         stationary = rng.random() < 0.5
         chosen = [o for o in visible if (o.speed == "stationary") == stationary] or visible
         o = chosen[rng.integers(len(chosen))]
-        return self._after_clip(item, [MOVES.format(o.object)], _describe_motion(instant, o), [])
+        moment = f"{facts.instant[0].upper()}{facts.instant[1:]}"
+        heading = f" toward the {o.heading}" if o.heading else ""
+        motion = "does not move" if o.speed == "stationary" else f"moves {o.speed}{heading}"
+        answer = f"{moment}, the {o.object} is {o.region} and {motion}."
+        return Question(MOVES.format(o.object), answer, [], after_clip=True)
 
-    def clip(self, item: SelectionItem) -> Iterator[LazySample]:
+    def clip(self, item: SelectionItem, rng: np.random.Generator) -> Question | None:
         """The clip and its outcome; in half of the samples the target frame is visible."""
-        if (text := self._describe_clip(item)) is not None:
-            for k in range(CLIPS):
-                make = partial(self._clip, item, text, k)
-                yield LazySample(f"{CLIP} {text}", self.media + 1, make)
+        if (text := self.describe_clip(item)) is None:
+            return None
+        target = [Picture(item.scene_id, item.target_frame)]
+        return Question(CLIP, text, target if rng.random() < 0.5 else [], after_clip=True)
 
-    def _clip(self, item: SelectionItem, text: str, k: int, epoch: int) -> Sample:
-        with_target = seeded_rng(self.seed, epoch, item.item_id, "clip", k).random() < 0.5
-        pixels = self.frames.array(item.scene_id, item.target_frame)
-        target = ["Later: ", pixels, "\n"] if with_target else []
-        pictures = [(item.scene_id, item.target_frame, "")] if with_target else []
-        return self._after_clip(item, [*target, CLIP], text, pictures)
-
-    def compared(self, item: SelectionItem) -> Iterator[LazySample]:
+    def compared(self, item: SelectionItem, rng: np.random.Generator) -> Question | None:
         """An object's place in the item's candidates, compared with a description of the clip.
 
         As in a rationale, the text has the predicted place before the visible places, and the model
         must not confuse them. The description is part of the prompt: as part of the response it
         would outweigh the few words about visible places in the loss.
         """
-        if (text := self._describe_clip(item)) is not None:
-            phrase = self.store.scene(item.scene_id).objects[0].phrase
-            differences = f", not {REGIONS[0][0]}" * len(LETTERS)
-            longest = f"{text} {COMPARE.format(phrase)} {_typical_places(phrase)}{differences}"
-            for k in range(COMPARED):
-                make = partial(self._compared, item, text, k)
-                yield LazySample(longest, self.media + len(LETTERS), make)
+        if (text := self.describe_clip(item)) is None:
+            return None
+        pictures = self.permuted_candidates(item, rng)
+        places = self.regions(pictures)
+        predicted = visible_regions(self.scene(item), item.target_frame)
+        phrase = self.choose_object(item, predicted, places, rng)
+        expected, verdicts = predicted.get(phrase), []
+        for letter, objects in zip(LETTERS, places, strict=True):
+            place = objects.get(phrase)
+            difference = f", not {expected}" if place and expected else ""
+            verdict = " and agrees" if place == expected else difference
+            verdicts.append(f"{format_place(letter, phrase, place)}{verdict}.")
+        question = f"{text}\n{COMPARE.format(phrase)}"
+        return Question(question, " ".join(verdicts), pictures, after_clip=True)
 
-    def _compared(self, item: SelectionItem, text: str, k: int, epoch: int) -> Sample:
-        rng = seeded_rng(self.seed, epoch, item.item_id, "compared", k)
-        pictures = self._permuted_candidates(item, rng)
-        places = self._visible_regions(pictures)
-        expected = visible_regions(self.store.scene(item.scene_id), item.target_frame)
-        phrase = self._choose_object(item, expected, places, rng)
-        answer = " ".join(
-            _format_comparison(letter, phrase, objects.get(phrase), expected.get(phrase))
-            for (*_, letter), objects in zip(pictures, places, strict=True)
-        )
-        parts = [*self._label(pictures), f"\n{text}\n{COMPARE.format(phrase)}"]
-        return self._after_clip(item, parts, answer, pictures)
-
-    def later(self, item: SelectionItem) -> Iterator[LazySample]:
+    def later(self, item: SelectionItem, rng: np.random.Generator) -> Question | None:
         """Which of two distinguishable frames is later; only if something moves after the clip."""
-        frames = find_moved_frames(self.store.scene(item.scene_id), item.prefix_stop)
-        if frames:
-            text = f"{LATER} {answer_line(LETTERS[0])}"
-            yield LazySample(text, self.media + 2, partial(self._later, item, frames))
-
-    def _later(self, item: SelectionItem, frames: list[int], epoch: int) -> Sample:
-        rng = seeded_rng(self.seed, epoch, item.item_id, "later")
+        if not (frames := find_moved_frames(self.scene(item), item.prefix_stop)):
+            return None
         pair = item.prefix_stop, frames[rng.integers(len(frames))]
-        order = rng.permutation(2)
-        letter = LETTERS[order.tolist().index(1)]
-        pictures = _add_letters([(item.scene_id, pair[k]) for k in order])
-        parts = [*self._label(pictures), f"\n{LATER}"]
-        return self._after_clip(item, parts, answer_line(letter), pictures)
+        order = rng.permutation(2).tolist()
+        pictures = add_letters([(item.scene_id, pair[k]) for k in order])
+        return Question(LATER, answer_line(LETTERS[order.index(1)]), pictures, after_clip=True)
 
-    def match(self, item: SelectionItem) -> Iterator[LazySample]:
+    def match(self, item: SelectionItem, rng: np.random.Generator) -> Question | None:
         """The one candidate that fits a description, if regions distinguish it."""
-        predicates = extract_predicates(item, self.store.scene(item.scene_id), self.store.scene)
-        predicates = predicates and _keep_regional_differences(predicates)
+        predicates = extract_predicates(item, self.scene(item), self.store.scene)
+        predicates = predicates and keep_regional_differences(predicates)
         if not predicates:
-            return
+            return None
         differing = {d.object for c in predicates.candidates for d in c.differences[:1]}
         visible = [o for o in predicates.objects if o.target_sight == "shown"]
         visible.sort(key=lambda o: o.object not in differing)
         named = ", ".join(f"the {o.object} {o.target_region}" for o in visible[:NAMED])
-        question = MATCH.format(named)
         answer = "\n".join([*write_match_lines(predicates, item), answer_line(item.letter)])
-        make = partial(self._match, item, question, answer)
-        yield LazySample(f"{question} {answer}", len(LETTERS), make)
+        pictures = add_letters([(c.scene_id, c.frame) for c in item.candidates])
+        return Question(MATCH.format(named), answer, pictures)
 
-    def _match(self, item: SelectionItem, question: str, answer: str, epoch: int) -> Sample:
-        pictures = _add_letters([(c.scene_id, c.frame) for c in item.candidates])
-        return self._about_four(f"{item.item_id} (match)", pictures, question, answer)
+    def scene(self, item: SelectionItem) -> Scene:
+        return self.store.scene(item.scene_id)
 
-    def _describe_clip(self, item: SelectionItem) -> str | None:
+    def describe_clip(self, item: SelectionItem) -> str | None:
         """The clip and its outcome by the built-in narrator; None if the clip is too short."""
-        scene = self.store.scene(item.scene_id)
         return write_description(
-            scene, item.prefix_start, item.prefix_stop, item.target_frame, self.seed
+            self.scene(item), item.prefix_start, item.prefix_stop, item.target_frame, self.seed
         )
 
-    def _visible_regions(self, pictures: list[Picture]) -> list[dict[str, str]]:
-        return [visible_regions(self.store.scene(name), frame) for name, frame, _ in pictures]
+    def regions(self, pictures: list[Picture]) -> list[dict[str, str]]:
+        """The regions of the visible objects of each picture."""
+        return [visible_regions(self.store.scene(p.scene_id), p.frame) for p in pictures]
 
-    def _choose_object(
+    def choose_object(
         self,
         item: SelectionItem,
         visible: Collection[str],
@@ -270,97 +254,53 @@ class _SampleBuilder:
         rng: np.random.Generator,
     ) -> str:
         """A random visible object, if possible one whose place distinguishes candidates."""
-        names = sorted(visible) or [o.phrase for o in self.store.scene(item.scene_id).objects]
+        names = sorted(visible) or [o.phrase for o in self.scene(item).objects]
         names = [p for p in names if len({objects.get(p) for objects in places}) > 1] or names
         return names[rng.integers(len(names))]
 
-    def _permuted_candidates(self, item: SelectionItem, rng: np.random.Generator) -> list[Picture]:
+    def permuted_candidates(self, item: SelectionItem, rng: np.random.Generator) -> list[Picture]:
         frames = [(c.scene_id, c.frame) for c in item.candidates]
-        return _add_letters([frames[place] for place in rng.permutation(len(frames))])
+        return add_letters([frames[place] for place in rng.permutation(len(frames))])
 
-    def _random_four(self, item: SelectionItem, rng: np.random.Generator) -> list[Picture]:
+    def random_four(self, item: SelectionItem, rng: np.random.Generator) -> list[Picture]:
         """An item's own candidates or, easier to distinguish, frames of four random items."""
         if rng.random() < 0.5:
-            return self._permuted_candidates(item, rng)
+            return self.permuted_candidates(item, rng)
         items = [self.items[k] for k in rng.integers(len(self.items), size=len(LETTERS))]
-        return _add_letters([self._random_frame(other, rng) for other in items])
+        return add_letters([self.random_frame(other, rng) for other in items])
 
-    def _random_frame(self, item: SelectionItem, rng: np.random.Generator) -> tuple[str, int]:
+    def random_frame(self, item: SelectionItem, rng: np.random.Generator) -> tuple[str, int]:
         """A frame of an item's candidates or prefix."""
         frames = [(c.scene_id, c.frame) for c in item.candidates]
-        frames += [(item.scene_id, f) for f in self._prefix_frames(item)]
+        frames += [(item.scene_id, f) for f in self.prefix_frames(item)]
         return frames[rng.integers(len(frames))]
 
-    def _prefix_frames(self, item: SelectionItem) -> list[int]:
+    def prefix_frames(self, item: SelectionItem) -> list[int]:
         return sample_prefix_frames(item.prefix_start, item.prefix_stop, self.frame_count)
 
-    def _label(self, pictures: list[Picture]) -> Iterator[str | np.ndarray]:
-        for scene_id, frame, letter in pictures:
-            yield f"\nCandidate {letter}: "
-            yield self.frames.array(scene_id, frame)
 
-    def _about_four(self, name: str, pictures: list[Picture], question: str, answer: str) -> Sample:
-        parts = [*self._label(pictures), f"\n{question}"]
-        return conversation(name, parts, answer, None, self._label_objects(pictures))
-
-    def _after_clip(
-        self,
-        item: SelectionItem,
-        parts: list[str | np.ndarray],
-        answer: str,
-        pictures: list[Picture],
-    ) -> Sample:
-        frames = self._prefix_frames(item)
-        clip = load_clip(item.scene_id, frames, self.frames)
-        scene = self.store.scene(item.scene_id)
-        # A visual token of a clip covers two frames; objects are labelled as in the first.
-        pairs = [(f, frames[min(k + 1, len(frames) - 1)]) for k, f in enumerate(frames)][::2]
-        labels = [
-            ObjectLabel(k, place, (*words, object_heading(scene, index, *pair) or "stationary"))
-            for k, pair in enumerate(pairs)
-            for index, place, words in visible_objects(scene, pair[0])
-        ]
-        labels += self._label_objects(pictures, len(pairs))
-        return conversation(f"{item.item_id} (clip and frames)", parts, answer, clip, labels)
-
-    def _label_objects(self, pictures: list[Picture], before: int = 0) -> list[ObjectLabel]:
-        """The visible objects of pictures, which come after `before` others in the sample."""
-        return [
-            ObjectLabel(before + k, place, (*words, *letter))
-            for k, (scene_id, frame, letter) in enumerate(pictures)
-            for _, place, words in visible_objects(self.store.scene(scene_id), frame)
-        ]
+KINDS: dict[str, tuple[Callable[..., Question | None], int]] = {
+    "frame": (QuestionBuilder.frame, 2),
+    "candidates": (QuestionBuilder.candidates, 2),
+    "where": (QuestionBuilder.where, 2),
+    # Motion is a few pixels per frame, and no other question about a clip requires it.
+    "moves": (QuestionBuilder.moves, 6),
+    "clip": (QuestionBuilder.clip, 2),
+    "compared": (QuestionBuilder.compared, 3),
+    "later": (QuestionBuilder.later, 1),
+    "match": (QuestionBuilder.match, 1),
+}
+"""The kinds of questions: their method, and how often they are asked per item and epoch."""
 
 
-def _add_letters(frames: list[tuple[str, int]]) -> list[Picture]:
-    return [(*frame, letter) for frame, letter in zip(frames, LETTERS, strict=False)]
+def add_letters(frames: list[tuple[str, int]]) -> list[Picture]:
+    return [Picture(*frame, letter) for frame, letter in zip(frames, LETTERS, strict=False)]
 
 
-def _describe_motion(instant: str, o: ObjectFacts) -> str:
-    """An object's place and motion at an instant, in the words of a rationale."""
-    text = f"{instant[0].upper()}{instant[1:]}, the {o.object} is {o.region} and"
-    if o.speed == "stationary":
-        return f"{text} does not move."
-    return f"{text} moves {o.speed}{f' toward the {o.heading}' if o.heading else ''}."
-
-
-def _typical_places(phrase: str) -> str:
-    """A text as long as the answer to WHERE, to estimate its length."""
-    return " ".join(f"{_format_place(letter, phrase, REGIONS[0][0])}." for letter in LETTERS)
-
-
-def _format_place(letter: str, phrase: str, place: str | None) -> str:
+def format_place(letter: str, phrase: str, place: str | None) -> str:
     if place is None:
         return f"Candidate {letter} lacks the {phrase}"
     return f"Candidate {letter} shows the {phrase} {place}"
-
-
-def _format_comparison(letter: str, phrase: str, place: str | None, expected: str | None) -> str:
-    """An object's place in a candidate, and whether it is the expected one; None if not visible."""
-    if place == expected:
-        return f"{_format_place(letter, phrase, place)} and agrees."
-    difference = f", not {expected}" if place and expected else ""
-    return f"{_format_place(letter, phrase, place)}{difference}."
 
 
 def visible_regions(scene: Scene, frame: int) -> dict[str, str]:
@@ -398,7 +338,7 @@ def find_moved_frames(scene: Scene, start: int) -> list[int]:
     return (start + 1 + np.flatnonzero((far & in_view).any(axis=1))).tolist()
 
 
-def _keep_regional_differences(predicates: Predicates) -> Predicates | None:
+def keep_regional_differences(predicates: Predicates) -> Predicates | None:
     """Predicates with only the differences in regions and missing objects; None if a wrong
     candidate has no such difference."""
     candidates = []
