@@ -36,6 +36,7 @@ REMOVED_KEYS: dict[str, str] = {
     "shown": "use examples instead",
     "cards": "use gpus instead",
     "train.keep": "use train.keep_checkpoints instead",
+    "train.packing": "leave it out: samples of similar length are padded together",
     "train.best": "use train.best_metric instead",
     "train.batches": "leave it out: batches are random",
     "train.scene_queries": "leave it out: batches are random",

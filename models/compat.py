@@ -16,7 +16,7 @@ Hooks that are used through subclasses, outside of this file:
 - `train.retriever.loss` overrides `embed_minibatch_iter` of sentence-transformers' cached losses,
   and `train.retriever.trainer` overrides `_load_from_checkpoint` and `_load_best_model`.
 - `models.retriever.multi_vector` loads by `MultiVectorEncoder._load_with_module_classes`.
-- `train.student.packing` passes four rows of positions, the first of which isolates samples.
+- `train.student.trainer` overrides `_get_train_sampler` of transformers' Trainer.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from torch import nn
-from transformers import PreTrainedModel, Trainer, TrainingArguments
+from transformers import Trainer, TrainingArguments
 
 
 def checkpointing_arguments(enabled: bool) -> dict[str, Any]:
@@ -41,12 +41,6 @@ def checkpointing_arguments(enabled: bool) -> dict[str, Any]:
     renamed = "activation_checkpointing" in {field.name for field in fields(TrainingArguments)}
     name = "activation_checkpointing" if renamed else "gradient_checkpointing"
     return {name: True, f"{name}_kwargs": {"use_reentrant": False}}
-
-
-def attention_implementation(model: PreTrainedModel) -> str:
-    """Return the name of the language tower's attention, which transformers keeps in the private
-    `_attn_implementation`."""
-    return model.config.get_text_config()._attn_implementation
 
 
 def load_checkpoint(trainer: Trainer, checkpoint: Path) -> None:

@@ -33,7 +33,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from models.retriever.embedder import load_retriever, tokenizer_texts
     from train.common.checkpoints import newest_checkpoint
     from train.common.journal import run_metrics
-    from train.common.training_loop import explain_load_errors, lower_memory, run_training
+    from train.common.training_loop import explain_load_errors, run_training
     from train.retriever.batches import split_queries
     from train.retriever.run import build_trainer
 
@@ -58,13 +58,13 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     # Adapters are initialised before the trainer sets its seed.
     set_seed(cfg.seed)
     texts = tokenizer_texts(store.retrieval("train"), retriever)
-    with explain_load_errors(run.folder, "retriever"):
+    with explain_load_errors("retriever"):
         model = load_retriever(retriever, precision, texts, run.folder / "untrained")
     fuse(model)
 
     trainer = build_trainer(cfg, run, store, model, training, validation, rank_batch, checkpoint)
-    advice = lower_memory(cfg.train, "mini_batch", "retriever.image_size or retriever.frames")
-    best_step = run_training(trainer, run, checkpoint, advice)
+    memory_settings = "train.mini_batch, or retriever.image_size or retriever.frames"
+    best_step = run_training(trainer, run, checkpoint, memory_settings)
 
     if rank() == 0:
         model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)

@@ -18,81 +18,41 @@ import logging
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from conf.entry import Run, command
 from conf.errors import UserError
 from conf.runs import lock_folder, resolve_run_name, runs_folder, write_json
-from conf.schema import (
-    ContrastiveCommand,
-    ExportModelCommand,
-    RetrieverConfig,
-    SftCommand,
-    StudentConfig,
-)
+from conf.schema import ContrastiveCommand, ExportModelCommand, SftCommand
+
+if TYPE_CHECKING:
+    from train.retriever.merge import RetrieverMerge
+    from train.student.merge import StudentMerge
 
 log = logging.getLogger(__name__)
 
 RECORDS = ("config.yaml", "run.json", "metrics.json")
 """Files of the training run that belong to its export."""
 COMMANDS = {"student": SftCommand, "retriever": ContrastiveCommand}
-LOADERS = {
-    "student": "the standard classes and vLLM load",
-    "retriever": "SentenceTransformer loads",
-}
-
-
-@dataclass(frozen=True)
-class TrainedRun:
-    """A finished training run.
-
-    Attributes:
-        name: The run.
-        folder: Its folder.
-        product: What it trained: student or retriever.
-        settings: Its settings.
-    """
-
-    name: str
-    folder: Path
-    product: str
-    settings: SftCommand | ContrastiveCommand
-
-    @property
-    def saved(self) -> Path:
-        return self.folder / self.product
-
-    @property
-    def preset(self) -> StudentConfig | RetrieverConfig:
-        return getattr(self.settings, self.product)
 
 
 @command("train.export", ExportModelCommand)
 def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
-    trained = find_run(cfg.run, cfg.product, cfg.checkpoints)
-
     from data.store import hash_file
-    from models.resolved import RESOLVED, check_base
+    from models.resolved import RESOLVED
     from models.trained_runs import EXPORT, export_record
-    from train.common.merge import write_merged
     from train.common.model_card import model_card
 
-    adapters = trained.saved / "adapter_model.safetensors"
-    if not adapters.exists():
-        raise UserError(
-            f"{trained.saved} holds no adapters: delete the run and train again",
-            code="missing-adapters",
-        )
-    check_base(trained.folder, trained.preset)
-    weights = hash_file(adapters)
-    folder = run.folder / trained.product
+    name, trained, settings = find_run(cfg.run, cfg.product, cfg.checkpoints)
+    saved, folder = trained / cfg.product, run.folder / cfg.product
+    weights = hash_file(saved / "adapter_model.safetensors")
     if folder.exists():
         record = export_record(folder)
         if record["weights"] != weights:
             raise UserError(
-                f"{folder} is an export of other adapters than {trained.saved} holds now: "
-                "delete it to export these",
+                f"{folder} is an export of other adapters than {saved} holds now: delete it to "
+                "export these",
                 code="other-adapters",
             )
         log.info("%s is exported already; delete it to export again", folder)
@@ -100,55 +60,91 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
     measured: dict[str, float] = {}
     with renamed_when_complete(folder) as partial:
         if cfg.format == "adapter":
-            shutil.copytree(trained.saved, partial, dirs_exist_ok=True)
-            if (resolved := trained.folder / RESOLVED).exists():
+            shutil.copytree(saved, partial, dirs_exist_ok=True)
+            if (resolved := trained / RESOLVED).exists():
                 shutil.copy(resolved, partial)
+        elif cfg.product == "student":
+            from train.student.merge import StudentMerge
+
+            measured = write_merged(StudentMerge(settings, saved), partial, cfg)
         else:
-            store = Path(cfg.store) if cfg.verify else None
-            measured = write_merged(product_merge(trained), partial, cfg.format, store, cfg.workers)
-        for name in RECORDS:
-            shutil.copy(trained.folder / name, partial)
-        card = model_card(trained.name, trained.settings, trained.folder, cfg.format, measured)
+            from train.retriever.merge import RetrieverMerge
+
+            measured = write_merged(RetrieverMerge(settings, saved), partial, cfg)
+        for record in RECORDS:
+            shutil.copy(trained / record, partial)
+        card = model_card(name, settings, trained, cfg.format, measured)
         card.save(partial / "README.md")
-        record = {"run": trained.name, "format": cfg.format, "weights": weights}
-        write_json(partial / EXPORT, {**record, "measured": measured})
-    for name, value in measured.items():
-        log.info("%s: %.4g", name.replace("_", " "), value)
-    log.info("the exported %s is in %s", trained.product, folder)
+        record = {"run": name, "format": cfg.format, "weights": weights, "measured": measured}
+        write_json(partial / EXPORT, record)
+    for measure, value in measured.items():
+        log.info("%s: %.4g", measure.replace("_", " "), value)
+    log.info("the exported %s is in %s", cfg.product, folder)
     return measured
 
 
-def find_run(run: str, product: str, checkpoints: str) -> TrainedRun:
-    """Find the run to export.
+def find_run(
+    run: str, product: str, checkpoints: str
+) -> tuple[str, Path, SftCommand | ContrastiveCommand]:
+    """Return the name, the folder and the settings of the run to export.
 
     Raises:
-        UserError: No run has this name, it is not finished, or it trained the whole model.
+        UserError: No run has this name, it is not finished, it trained the whole model, its
+            adapters are missing, or its base has changed.
     """
+    from models.resolved import check_base
     from models.trained_runs import trained_settings
 
     runs = runs_folder(checkpoints, product)
     name = resolve_run_name(run, runs)
     folder = Path(runs) / name
     settings = trained_settings(folder, COMMANDS[product], product, "run")
-    trained = TrainedRun(name, folder, product, settings)
-    if trained.preset.lora.rank == 0:
+    preset = getattr(settings, product)
+    if preset.lora.rank == 0:
         raise UserError(
             f"run={folder} trained the whole model ({product}.lora.rank=0), so it has no adapters "
-            f"to merge: {trained.saved} is what {LOADERS[product]}",
+            f"to merge: {folder / product} is the model itself",
             code="nothing-to-merge",
         )
-    return trained
+    if not (folder / product / "adapter_model.safetensors").exists():
+        raise UserError(
+            f"{folder / product} holds no adapters: delete the run and train again",
+            code="missing-adapters",
+        )
+    check_base(folder, preset)
+    return name, folder, settings
 
 
-def product_merge(trained: TrainedRun):
-    """The merge of a run's student or retriever."""
-    if trained.product == "student":
-        from train.student.merge import StudentMerge
+def write_merged(
+    merge: StudentMerge | RetrieverMerge, folder: Path, cfg: ExportModelCommand
+) -> dict[str, float]:
+    """Write a merged model, and return the differences of its outputs from the trained model's.
 
-        return StudentMerge(trained.settings, trained.saved)
-    from train.retriever.merge import RetrieverMerge
+    Raises:
+        UserError: They differ too much, or the benchmark with the held-out items is missing.
+    """
+    from train.common.merge import compare
 
-    return RetrieverMerge(trained.settings, trained.saved)
+    if not cfg.verify:
+        merge.write(folder, cfg.format)
+        return {}
+    items = merge.held_out(Path(cfg.store), cfg.workers)
+    log.info("running the trained %s", cfg.product)
+    trained = merge.trained_outputs(items)
+    log.info("merging")
+    merge.write(folder, cfg.format)
+    log.info("running the merged %s", cfg.product)
+    measured = compare(trained, merge.merged_outputs(folder, items))
+    for name, value in measured.items():
+        # The negation also refuses NaN.
+        if name.endswith("_difference") and not value <= merge.max_difference:
+            raise UserError(
+                f"the {name.replace('_', ' ')} of the merged {cfg.product} is {value:.3g} of its "
+                f"size, more than {merge.max_difference}; nothing was exported. Try format=fp32 or "
+                "format=adapter",
+                code="merge-difference",
+            )
+    return measured
 
 
 @contextmanager

@@ -12,8 +12,8 @@ follows its trainer's own convention.
 
 TRL runs with its default settings and with each setting that could help it, including the MALLOC_*
 variables, which set what our trainer sets with mallopt. Its own collator supports no videos, so it
-has a collator of ours. It does not pack samples with images, and casts adapters over 4-bit weights
-to bf16. Without TRL only our trainer is measured.
+has a collator of ours. It casts adapters over 4-bit weights to bf16. Without TRL only our trainer
+is measured.
 
 `--losses` compares the losses of all steps in fp32 over the unquantised base; our trainer then uses
 TRL's convention, the mean over a micro-batch's tokens and over micro-batches.
@@ -49,14 +49,11 @@ from models.precision import resolve_precision
 from models.student.collator import Collator, encode, letter_ids, pad
 from models.student.prompts import Sample
 from teacher.narrate import ensure_rationales
-from train.common.arguments import prefetch_factor
-from train.student.dataset import tokenizer_corpus
+from train.student.dataset import load_datasets, tokenizer_corpus
 from train.student.length_sampler import LengthSampler
 from train.student.metrics import LetterAccuracy
-from train.student.packing import PackingCollator, packing_rope
-from train.student.regimes import TrainerCollator
-from train.student.run import load_datasets
-from train.student.trainer import StudentTrainer, token_mean
+from train.student.run import prefetch_factor
+from train.student.trainer import StudentTrainer, TrainerCollator, token_mean
 from train.student.vision_cache import VisionCache
 
 MALLOC = {
@@ -85,8 +82,7 @@ VARIANTS = {
     OURS: Variant(),
     "ours, activations kept": Variant((KEPT,)),
     "ours, activations recomputed": Variant((RECOMPUTED,)),
-    "ours, micro-batch 4, padded": Variant(("micro_batch=4", "packing=false")),
-    "ours, micro-batch 4, packed": Variant(("micro_batch=4", "packing=true")),
+    "ours, micro-batch 4": Variant(("micro_batch=4",)),
     "ours, vision features reused": Variant(("reuse_features=true",)),
     "ours, 4 workers": Variant(("workers=4",)),
     DEFAULT: Variant((*TRL_SETTINGS, RECOMPUTED), trl=True),
@@ -186,8 +182,6 @@ def build_own_trainer(
     train, accumulation = cfg.train, cfg.train.batch // cfg.train.micro_batch
     fuse(model)
     collator = Collator(processor, cfg.student.max_length)
-    rope = packing_rope(model, train.packing)
-    packs = rope and PackingCollator(processor, cfg.student.max_length, rope)
     cache = None
     if train.reuse_features:
         cache = VisionCache(model, train.precision, available_cpu_bytes() // 2)
@@ -201,7 +195,6 @@ def build_own_trainer(
             label_names=["labels"],
         ),
         data_collator=TrainerCollator(collator, cache is not None),
-        training_collator=TrainerCollator(packs or collator, cache is not None),
         train_dataset=samples,
         compute_loss_func=partial(mean_of_means, accumulation) if trl_loss else token_mean,
         sampler=SequentialSampler(samples),

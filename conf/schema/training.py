@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from conf.schema.settings import Settings, setting
 
 REGIMES = ("cot", "cot_no_candidate_analysis", "cot_no_match_layout", "answer_only", "describe")
+WITHOUT_RATIONALES = ("answer_only", "describe")
+"""Regimes that train on no rationales."""
 
 
 @dataclass
@@ -73,10 +75,6 @@ class SftTrainConfig(TrainConfig):
     reuse_features: bool = False
     """Cache the frozen vision tower's features of each frame in up to half of the free memory,
     about 3 MB per frame with an 8B model."""
-    packing: str = "auto"
-    """Concatenate the samples of a micro-batch into one sequence without padding, with attention
-    limited to each sample: true, false, or auto (only with flash attention; never on a CPU, where
-    packing is slower)."""
     permute_candidates: bool = False
     """Shuffle the candidates of each item in every epoch."""
     validation_items: int = setting(64, least=1)
@@ -87,20 +85,12 @@ class SftTrainConfig(TrainConfig):
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)
-        packing, describe = self.packing.lower(), f"{group}regime=describe"
         if self.micro_batch > 0 and self.batch % self.micro_batch:
             yield f"{group}micro_batch={self.micro_batch} must divide {group}batch={self.batch}"
-        if packing not in ("auto", "true", "false"):
-            yield f"{group}packing={self.packing}: the options are auto, true, false"
-        if packing == "true" and self.regime == "describe":
-            yield (
-                f"{group}packing=true with {describe}: this regime trains on padded samples; set "
-                f"{group}packing=auto"
-            )
         if self.permute_candidates and self.regime == "describe":
             yield (
-                f"{group}permute_candidates=true with {describe}: descriptions have no "
-                f"candidates; set {group}permute_candidates=false"
+                f"{group}permute_candidates=true with {group}regime=describe: descriptions "
+                f"have no candidates; set {group}permute_candidates=false"
             )
 
 

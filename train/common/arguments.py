@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -67,12 +66,3 @@ def common_arguments(
         "project": PROJECT,
         "disable_tqdm": False,
     }
-
-
-def prefetch_factor(workers: int, accumulation: int) -> int | None:
-    """Return the number of batches that each worker prepares in advance; None without workers.
-
-    The trainer requests all micro-batches of an optimizer step at once. Together the workers
-    prepare at least that many, so that they are ready when the previous step ends.
-    """
-    return max(2, math.ceil(accumulation / workers)) if workers else None

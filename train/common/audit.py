@@ -1,14 +1,15 @@
-"""Print and check the loaded model and its longest input before a run's first step."""
+"""Check a loaded model and its longest input before the first step of a run, and describe them."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from itertools import groupby
+from operator import itemgetter
+from typing import Any
 
-from sentence_transformers import MultiVectorEncoder, SentenceTransformer
-from sentence_transformers.multi_vector_encoder.modules import HierarchicalTokenPooling
 from torch import nn
-from transformers import ProcessorMixin
+from transformers import PreTrainedTokenizerBase, ProcessorMixin
 
 from conf.errors import UserError
 from conf.schema import RetrieverConfig, StudentConfig
@@ -29,26 +30,22 @@ def audit(
     sample: Sample,
     collator: Collator,
 ) -> str:
-    """Return the parameter counts by tower, the grids of the frames, and the longest sample,
-    decoded, with its supervised part between >>> and <<<.
+    """Return the parameter counts by tower, the vision tokens of the frames, and the longest
+    sample, decoded, with its supervised tokens between >>> and <<<.
 
     Raises:
         UserError: the counts differ from the preset, or the sample is too long.
     """
-    towers = count_towers(model)
-    check_towers(towers, cfg.name, cfg.quantization, cfg.lora.rank)
     batch = collator([sample])
-    ids = batch["input_ids"][0]
-    supervised = int((batch["labels"] != IGNORED).sum())
-    prompt, response = ids[: len(ids) - supervised], ids[len(ids) - supervised :]
-    decode = processor.tokenizer.decode
+    ids = batch["input_ids"][0].tolist()
+    prompt = len(ids) - int((batch["labels"] != IGNORED).sum())
+    supervised = [k >= prompt for k in range(len(ids))]
     return "\n".join(
         [
-            f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'whole'})",
-            format_towers(towers),
-            f"frames of {cfg.image_size} x {cfg.image_size} px become {grids(batch, processor)}",
-            f"the longest sample has {len(ids)} tokens, {supervised} of them supervised:",
-            f"{squeeze(decode(prompt))}>>>{squeeze(decode(response))}<<<",
+            *describe_model(model, processor, cfg, batch),
+            *describe_input(
+                "the longest sample", processor.tokenizer, ids, supervised, "supervised"
+            ),
         ]
     )
 
@@ -56,18 +53,15 @@ def audit(
 def audit_retriever(
     model: Retriever, cfg: RetrieverConfig, query: RetrievalQuery, frames: FrameReader
 ) -> str:
-    """The same for a retriever: counts, grids, the longest query and a frame, decoded; where it has
-    many vectors, what is scored of them between >>> and <<<.
+    """Return the parameter counts by tower, the vision tokens of the frames, and the longest query
+    and a frame, decoded, with the tokens whose vectors are scored between >>> and <<<.
 
     Raises:
-        UserError: the counts are not what the preset says, the model is narrower than its widest
-            width, or the query is too long.
+        UserError: the counts differ from the preset, the model is narrower than its widest width,
+            or the query is too long.
     """
-    towers = count_towers(model)
-    check_towers(towers, cfg.name, cfg.quantization, cfg.lora.rank)
     if cfg.late is None:
         check_widths(cfg, model.get_embedding_dimension())
-    processor = model[0].processor
     query_inputs = model.preprocess([query_input(query, frames, cfg)], prompt=cfg.query_instruction)
     length = query_inputs["input_ids"].shape[1]
     if length > cfg.max_length:
@@ -79,65 +73,58 @@ def audit_retriever(
     frame_inputs = model.preprocess(
         [frame_input(query.target, frames)], prompt=cfg.frame_instruction
     )
-    return "\n".join(
-        [
-            f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'whole'})",
-            format_towers(towers),
-            f"frames of {cfg.image_size} x {cfg.image_size} px become "
-            f"{grids(query_inputs | {k: frame_inputs[k] for k in ('image_grid_thw',)}, processor)}",
-            *(describe_last_tokens if cfg.late is None else describe_scored_tokens)(
-                model, query_inputs, frame_inputs
-            ),
-        ]
-    )
+    lines = describe_model(model, model[0].processor, cfg, {**frame_inputs, **query_inputs})
+    for name, inputs in (("the longest query", query_inputs), ("a frame", frame_inputs)):
+        ids = inputs["input_ids"]
+        if cfg.late is None:
+            # The embedding is the state of the last token.
+            scored = [k == ids.shape[1] - 1 for k in range(ids.shape[1])]
+        else:
+            mask = inputs["attention_mask"]
+            scored = find_scored_tokens(model).scored(ids, mask)[0].tolist()
+        lines += describe_input(name, model.tokenizer, ids[0].tolist(), scored, "scored")
+    if cfg.late is not None and cfg.late.pool > 1:
+        lines.append(f"a frame keeps one of {cfg.late.pool} of its vectors")
+    return "\n".join(lines)
 
 
-def describe_last_tokens(
-    model: SentenceTransformer, query_inputs: dict, frame_inputs: dict
+def describe_model(
+    model: nn.Module,
+    processor: ProcessorMixin,
+    cfg: StudentConfig | RetrieverConfig,
+    inputs: Mapping[str, Any],
 ) -> list[str]:
-    """Decode a query and a frame."""
-    query, frame = (features["input_ids"][0] for features in (query_inputs, frame_inputs))
-    decode = model.tokenizer.decode
+    """Compare the parameter counts with the preset, and return them with the grids of vision tokens
+    (frames x rows x columns) in `inputs`."""
+    towers = count_towers(model)
+    check_towers(towers, cfg.name, cfg.quantization, cfg.lora.rank)
+    merge = processor.image_processor.merge_size
+    grids = []
+    for name, medium in (("video_grid_thw", "a video"), ("image_grid_thw", "an image")):
+        if name in inputs:
+            time, height, width = inputs[name][0].tolist()
+            grids.append(f"{medium} of {time} x {height // merge} x {width // merge} tokens")
     return [
-        f"the longest query has {len(query)} tokens and is embedded at the last one:",
-        squeeze(decode(query)),
-        f"a frame of {len(frame)} tokens:",
-        squeeze(decode(frame)),
+        f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'whole'})",
+        format_towers(towers),
+        f"frames of {cfg.image_size} x {cfg.image_size} px become {' and '.join(grids)}",
     ]
 
 
-def describe_scored_tokens(
-    model: MultiVectorEncoder, query_inputs: dict, frame_inputs: dict
+def describe_input(
+    name: str,
+    tokenizer: PreTrainedTokenizerBase,
+    ids: Sequence[int],
+    marked: Sequence[bool],
+    meaning: str,
 ) -> list[str]:
-    """Decode a query and a frame, with the scored tokens between >>> and <<<."""
-    lines = []
-    for name, features in (("the longest query", query_inputs), ("a frame", frame_inputs)):
-        ids, attended = features["input_ids"], features["attention_mask"]
-        scored = find_scored_tokens(model).scored(ids, attended)[0].tolist()
-        runs = [
-            (kept, model.tokenizer.decode([token for token, _ in run]))
-            for kept, run in groupby(zip(ids[0].tolist(), scored, strict=True), lambda one: one[1])
-        ]
-        lines += [
-            f"{name} has {len(scored)} tokens, {sum(scored)} of them scored:",
-            squeeze("".join(f">>>{text}<<<" if kept else text for kept, text in runs)),
-        ]
-    pools = [module for module in model if isinstance(module, HierarchicalTokenPooling)]
-    return [*lines, *(f"a frame keeps one of {p.pool_factor} of its vectors" for p in pools)]
-
-
-def grids(batch: dict, processor: ProcessorMixin) -> str:
-    """Describe the vision tokens of a batch as frames x rows x columns."""
-    merge = processor.image_processor.merge_size
-    descriptions = []
-    for name, what in (("video_grid_thw", "a video"), ("image_grid_thw", "an image")):
-        if name in batch:
-            time, height, width = batch[name][0].tolist()
-            rows, columns = height // merge, width // merge
-            descriptions.append(f"{what} of {time} x {rows} x {columns} tokens")
-    return " and ".join(descriptions)
-
-
-def squeeze(text: str) -> str:
-    """Shorten each run of vision tokens in a decoded text to one."""
-    return re.sub(r"(<\|(image|video)_pad\|>)+", r"\1...", text)
+    """Return the number of tokens and the text of an input, with the marked tokens between >>> and
+    <<< and each run of vision tokens shortened to one."""
+    text = ""
+    for is_marked, run in groupby(zip(ids, marked, strict=True), itemgetter(1)):
+        decoded = tokenizer.decode([token for token, _ in run])
+        text += f">>>{decoded}<<<" if is_marked else decoded
+    return [
+        f"{name} has {len(ids)} tokens, {sum(marked)} of them {meaning}:",
+        re.sub(r"(<\|(image|video)_pad\|>)+", r"\1...", text),
+    ]

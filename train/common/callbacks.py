@@ -17,15 +17,8 @@ from train.common.journal import ANSWERS, CURVES, JOURNAL, read_journal, read_li
 NOT_REPRODUCIBLE = ("_runtime", "_per_second", "total_flos", "train_loss")
 """Endings of logged names that are left out of the journal: timings, and the trainer's mean loss,
 which counts only the steps since the run resumed."""
-BAR_LABELS = {
-    "generated_parse_rate": "parsed",
-    "generated_accuracy": "right",
-    "letter_accuracy": "letter",
-    "token_accuracy": "token",
-    "loss": "loss",
-    "recall@10": "recall@10",
-}
-"""Measures on the progress bar, by the ending of their names, and their labels."""
+BAR_MEASURES = ("loss", "letter_accuracy", "token_accuracy", "recall@10")
+"""Endings of the measures that the progress bar shows."""
 
 
 class JournalCallback(TrainerCallback):
@@ -56,8 +49,14 @@ class JournalCallback(TrainerCallback):
         plot_curves(read_journal(self._path.parent), self._path.with_name(CURVES))
 
 
-class CheckBestMeasure(TrainerCallback):
-    """Refuses a train.best_metric that the evaluation at the start did not measure."""
+class BestCheckpointCallback(TrainerCallback):
+    """Refuses a train.best_metric that the evaluation at the start did not measure, and sets the
+    best checkpoint's folder from its step, on every rank.
+
+    The library looks for the folder while it is written. With FSDP, whose checkpoints are written
+    in parts, that is too early: an earlier checkpoint remains the best, or the ranks disagree and
+    wait for each other forever at the end.
+    """
 
     def on_step_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
         best = args.metric_for_best_model
@@ -71,15 +70,6 @@ class CheckBestMeasure(TrainerCallback):
                 f"are {', '.join(names)}",
                 code="unknown-option",
             )
-
-
-class BestCheckpoint(TrainerCallback):
-    """Sets the best checkpoint's folder from its step, on every rank.
-
-    The library looks for the folder while it is written. With FSDP, whose checkpoints are written
-    in parts, that is too early: an earlier checkpoint remains the best, or the ranks disagree and
-    wait for each other forever at the end.
-    """
 
     def on_save(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
         if state.best_global_step:
@@ -103,23 +93,16 @@ class EpochCallback(TrainerCallback):
 class MetricsBar(ProgressCallback):
     """The trainer's progress bar with the latest measures."""
 
-    def __init__(self, max_str_len: int = 100) -> None:
-        super().__init__(max_str_len)
-        self._values: dict[str, dict[str, str]] = {"": {}}
+    def __init__(self) -> None:
+        super().__init__()
+        self._latest: dict[str, float] = {}
 
     def on_prediction_step(self, args, state, control, **_) -> None:
         """A bar for each evaluation would break the line of the run's bar."""
 
     def on_log(self, args, state, control, logs=None, **_) -> None:
         for name, value in (logs or {}).items():
-            ending = next((end for end in BAR_LABELS if name.endswith(end)), None)
-            if ending and not name.endswith(NOT_REPRODUCIBLE):
-                mode = name.removesuffix(ending).removeprefix("eval_").strip("_")
-                self._values.setdefault(mode, {})[BAR_LABELS[ending]] = f"{value:.3g}"
+            if name.endswith(BAR_MEASURES) and name != "train_loss":
+                self._latest[name.removeprefix("eval_")] = value
         if self.training_bar is not None:
-            texts = [
-                " ".join([mode, *(f"{label}={value}" for label, value in values.items())]).strip()
-                for mode, values in self._values.items()
-                if values
-            ]
-            self.training_bar.set_postfix_str(", ".join(texts))
+            self.training_bar.set_postfix(self._latest)

@@ -15,7 +15,7 @@ from conf.errors import UserError
 log = logging.getLogger(__name__)
 
 STATE = "trainer_state.json"
-NEEDED = {
+PARTS = {
     "file of weights": (
         "**/*.safetensors",
         "pytorch_model_fsdp*.bin",
@@ -29,6 +29,13 @@ NEEDED = {
 """Parts of a checkpoint, each with the patterns of its files. Without some of them the trainer
 would resume without an error, with a new optimizer or other random numbers. If several ranks write
 a part each, the list of the parts (.metadata) is written last."""
+READERS = {
+    ".json": lambda path: json.loads(path.read_bytes()),
+    ".safetensors": lambda path: safe_open(path, "pt"),
+    # torch writes zip archives, whose table of contents is at the end.
+    **dict.fromkeys((".pt", ".pth", ".bin"), lambda path: zipfile.ZipFile(path).close()),
+}
+"""Functions that fail on an incomplete file, by its suffix."""
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
@@ -42,19 +49,17 @@ def newest_checkpoint(folder: Path) -> Path | None:
         if (problem := find_damage(path)) is None:
             return path
         instead = "resuming from the one before" if k + 1 < len(numbered) else "starting again"
-        log.warning("%s was cut off (%s): %s", path, problem, instead)
+        log.warning("%s is incomplete (%s): %s", path, problem, instead)
     return None
 
 
-def check_best(checkpoint: Path) -> None:
-    """Raise UserError if the best checkpoint up to `checkpoint` is missing or incomplete.
-
-    The library would silently keep the last weights instead, or fail at the end.
-    """
-    best = json.loads((checkpoint / STATE).read_text())["best_global_step"]
-    if best and (problem := find_damage(kept := checkpoint.with_name(f"checkpoint-{best}"))):
+def check_best(checkpoint: Path, best_step: int | None) -> None:
+    """Raise UserError if the best checkpoint of a run that resumes from `checkpoint` is missing or
+    incomplete. The library would silently keep the last weights instead, or fail at the end."""
+    best = checkpoint.with_name(f"checkpoint-{best_step}")
+    if best_step and (problem := find_damage(best)):
         raise UserError(
-            f"{kept}, the best checkpoint so far, is missing or incomplete ({problem}): restore "
+            f"{best}, the best checkpoint so far, is missing or incomplete ({problem}): restore "
             f"it, or delete {checkpoint.parent} and train again",
             code="damaged-file",
         )
@@ -65,26 +70,13 @@ def find_damage(checkpoint: Path) -> str | None:
 
     The trainer writes its state last, but a machine that crashes may lose any file.
     """
-    for what, patterns in NEEDED.items():
+    for part, patterns in PARTS.items():
         if not any(True for pattern in patterns for _ in checkpoint.glob(pattern)):
-            return f"its {what} is missing"
+            return f"its {part} is missing"
     for path in sorted(checkpoint.rglob("*")):
-        if path.is_file() and not is_whole(path):
-            return f"{path.relative_to(checkpoint)} is not whole"
+        try:
+            if read := READERS.get(path.suffix):
+                read(path)
+        except (OSError, ValueError, SafetensorError, zipfile.BadZipFile):
+            return f"{path.relative_to(checkpoint)} is incomplete"
     return None
-
-
-def is_whole(path: Path) -> bool:
-    """Whether a file of weights, pickled state or JSON is complete; other files always are."""
-    try:
-        if path.suffix == ".json":
-            json.loads(path.read_bytes())
-        elif path.suffix == ".safetensors":
-            with safe_open(path, "pt"):
-                pass
-        elif path.suffix in (".pt", ".pth", ".bin"):
-            # torch writes zip archives, whose table of contents is at the end.
-            zipfile.ZipFile(path).close()
-    except (OSError, ValueError, SafetensorError, zipfile.BadZipFile):
-        return False
-    return True

@@ -1,4 +1,4 @@
-"""Held-out training scenes, which measure a run. Test scenes are never used in training."""
+"""Held-out training scenes, on which runs are evaluated. Test scenes are never used in training."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from conf.errors import UserError
 from data.store import Store
 
 HELD_OUT = 0.1
-"""Share of the training scenes whose items measure a run."""
+"""Share of the training scenes that are held out."""
 
 Row = TypeVar("Row")
 
@@ -20,7 +20,7 @@ def held_out_scenes(store: Store) -> set[str]:
     """Return the names of the held-out training scenes, at least one.
 
     The choice depends on each scene's name only, not on a run's seed or on the other scenes: a base
-    must not have been trained on a scene that measures a student that is trained over it.
+    must not have been trained on a scene that evaluates a student trained over it.
     """
     names = store.scene_ids("train")
     # A store of a few scenes may have none below the bound.
@@ -38,7 +38,7 @@ def shuffled(rows: list[Row], seed: int) -> list[Row]:
 
 
 def check_not_empty(count: int, what: str) -> None:
-    """Raise UserError if nothing is left to train on or to measure."""
+    """Raise UserError if nothing remains to train on or to evaluate."""
     if count == 0:
         raise UserError(
             f"no {what} remain: see the shortfalls that python -m data.build prints and the "

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
 from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
 from tqdm.contrib.logging import logging_redirect_tqdm
 from transformers import PrinterCallback, ProgressCallback, Trainer
@@ -18,13 +16,11 @@ from transformers.trainer_callback import TrainerState
 
 from conf.errors import UserError
 from conf.runs import Run, rank, run_id
-from conf.schema import TrainConfig
 from models.compat import load_checkpoint
 from models.distributed import is_sharded
-from models.loading import unwritable_error
-from models.memory import is_out_of_memory
+from models.memory import explain_out_of_memory
 from train.common.arguments import PROJECT
-from train.common.callbacks import BestCheckpoint, CheckBestMeasure, JournalCallback, MetricsBar
+from train.common.callbacks import BestCheckpointCallback, JournalCallback, MetricsBar
 from train.common.checkpoints import STATE, check_best
 
 log = logging.getLogger(__name__)
@@ -34,47 +30,34 @@ SERIALIZED = f"{UserError.__module__}.{UserError.__qualname__}: "
 
 
 def run_training(
-    trainer: Trainer, run: Run, checkpoint: Path | None, lower_memory: str
+    trainer: Trainer, run: Run, checkpoint: Path | None, memory_settings: str
 ) -> int | None:
     """Train from the start or a checkpoint, and keep the journal and the curves.
 
     Args:
-        lower_memory: The settings to lower when memory runs out, as a sentence.
+        memory_settings: The settings to lower when memory runs out.
 
     Returns:
         The step of the best checkpoint, whose weights the trainer's model then has, if
         train.best_metric names a measure; else None.
 
     Raises:
-        UserError: memory runs out, the disk is full, no evaluation has the measure of
-            train.best_metric, or any other UserError of a worker process or of another rank.
+        UserError: memory runs out, no evaluation has the measure of train.best_metric, or a worker
+            process or another rank raises a UserError.
     """
     add_callbacks(trainer, run)
     check_fsdp(trainer, checkpoint)
-    with explain_errors(
-        run.folder, lambda: f"after step {trainer.state.global_step}", lower_memory
-    ):
+    advice = (
+        f"lower {memory_settings}, or set train.gradient_checkpointing=true and "
+        "train.reuse_features=false, in another run (run=NAME)"
+    )
+    with explain_errors("while training", advice):
         fit(trainer, checkpoint)
     best_step = trainer.state.best_global_step
     if best_step:
         measure = f"{trainer.args.metric_for_best_model} = {trainer.state.best_metric:.4g}"
         log.info("keeping the checkpoint of step %d, the best by %s", best_step, measure)
     return best_step
-
-
-def lower_memory(train: TrainConfig, batch_key: str, inputs: str) -> str:
-    """Return the settings to lower when memory runs out, as a sentence.
-
-    Args:
-        batch_key: The setting of the samples that pass at once, such as micro_batch.
-        inputs: Settings of the input's size, for when a single sample does not fit.
-    """
-    batch = getattr(train, batch_key)
-    options = [f"lower {inputs if batch == 1 else f'train.{batch_key}, which is {batch}'}"]
-    for key, sparing in (("gradient_checkpointing", True), ("reuse_features", False)):
-        if getattr(train, key) is not sparing:
-            options.append(f"set train.{key}={str(sparing).lower()}")
-    return f"{', or '.join(options)}, in another run (run=NAME)"
 
 
 def add_callbacks(trainer: Trainer, run: Run) -> None:
@@ -84,8 +67,7 @@ def add_callbacks(trainer: Trainer, run: Run) -> None:
     trainer.add_callback(MetricsBar())
     if rank() == 0:
         trainer.add_callback(JournalCallback(run.folder))
-    trainer.add_callback(CheckBestMeasure())
-    trainer.add_callback(BestCheckpoint())
+    trainer.add_callback(BestCheckpointCallback())
     if "wandb" in trainer.args.report_to:
         # A resumed run is the same run at W&B; its files belong into the run's folder.
         wandb = {"DIR": run.folder, "PROJECT": PROJECT, "RUN_ID": run_id(run), "RESUME": "allow"}
@@ -96,59 +78,49 @@ def add_callbacks(trainer: Trainer, run: Run) -> None:
 def fit(trainer: Trainer, checkpoint: Path | None) -> None:
     """Train to the last step, from the start or a checkpoint."""
     if checkpoint is not None:
-        check_best(checkpoint)
         log.info("resuming from %s", checkpoint)
-    if checkpoint is not None and is_last(checkpoint):
-        # The trainer would take another step.
-        trainer.state = TrainerState.load_from_json(str(checkpoint / STATE))
-        best = trainer.state.best_global_step or trainer.state.global_step
-        load_weights(trainer, checkpoint.with_name(f"checkpoint-{best}"))
-        return
+        state = TrainerState.load_from_json(str(checkpoint / STATE))
+        check_best(checkpoint, state.best_global_step)
+        if state.global_step >= state.max_steps:
+            # The trainer would take another step.
+            trainer.state = state
+            best = state.best_global_step or state.global_step
+            load_weights(trainer, checkpoint.with_name(f"checkpoint-{best}"))
+            return
     # Log lines are printed above the progress bar.
     with logging_redirect_tqdm():
         trainer.train(resume_from_checkpoint=str(checkpoint) if checkpoint else None)
 
 
 @contextmanager
-def explain_errors(folder: Path, when: Callable[[], str], lower_memory: str) -> Iterator[None]:
+def explain_errors(when: str, lower: str) -> Iterator[None]:
     """Turn library errors that the user can correct into a UserError.
 
     Args:
-        when: Returns how far the run came.
-        lower_memory: The settings to lower when memory runs out.
+        when: What the program is doing.
+        lower: The settings to lower when memory runs out.
     """
     try:
-        yield
-    except SafetensorError as error:
-        raise unwritable_error(folder, str(error)) from error
+        with explain_out_of_memory(when, lower):
+            yield
     except RuntimeError as error:
-        if is_unwritten(error):
-            raise unwritable_error(folder, "a file was cut off; the disk may be full") from error
-        if SERIALIZED in str(error):
-            # Of another rank, whose traceback the library includes.
-            raise UserError(user_message(error), code="failed-rank") from error
-        if not is_out_of_memory(error):
+        if SERIALIZED not in str(error):
             raise
-        raise UserError(f"out of memory {when()}: {lower_memory}", code="out-of-memory") from error
+        # Of another rank, whose traceback the library includes.
+        raise UserError(user_message(error), code="failed-rank") from error
     except UserError as error:
         raise UserError(user_message(error), code=error.code) from error
 
 
-def explain_load_errors(folder: Path, group: str) -> AbstractContextManager[None]:
+def explain_load_errors(group: str) -> AbstractContextManager[None]:
     """Apply `explain_errors` while a student or retriever is loaded."""
     advice = f"set {group}.quantization=nf4, or give a smaller {group}.model"
-    return explain_errors(folder, lambda: f"while loading the {group}", advice)
+    return explain_errors(f"while loading the {group}", advice)
 
 
 def user_message(error: Exception) -> str:
     """Return an error's own message: torch prepends the traceback of a worker process."""
     return str(error).rpartition(SERIALIZED)[2].strip()
-
-
-def is_last(checkpoint: Path) -> bool:
-    """Whether a checkpoint is that of a run's last step."""
-    state = json.loads((checkpoint / STATE).read_text())
-    return state["global_step"] >= state["max_steps"]
 
 
 def check_fsdp(trainer: Trainer, checkpoint: Path | None) -> None:
@@ -190,8 +162,3 @@ def gather_weights(trainer: Trainer) -> dict[str, torch.Tensor] | None:
         return None
     options = StateDictOptions(full_state_dict=True, cpu_offload=True, ignore_frozen_params=True)
     return get_model_state_dict(trainer.model, options=options)
-
-
-def is_unwritten(error: RuntimeError) -> bool:
-    """Whether torch could not write a file; it has no other sign of a full disk."""
-    return "PytorchStreamWriter" in str(error) or "unexpected pos" in str(error)

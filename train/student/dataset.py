@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 
+from conf.schema import SftCommand
+from conf.schema.training import WITHOUT_RATIONALES
 from data.records import LETTERS, Rationale, SelectionItem
 from data.render.frame_cache import FrameReader
 from data.store import Store
@@ -24,9 +26,6 @@ from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
 from train.tiny_base import questions
 
-WITHOUT_RATIONALES = ("answer_only", "describe")
-"""Regimes that train on no rationales."""
-
 
 @dataclass(frozen=True)
 class Supervised:
@@ -45,6 +44,16 @@ class Supervised:
     @property
     def text(self) -> str:
         return f"{self.item.question} {instruction(self.mode, self.regime)} {self.response}"
+
+    def lazy(self, frames: FrameReader, frame_count: int, seed: int | None) -> LazySample:
+        """Return a sample that shows `frame_count` frames of the prefix. With a seed, candidates
+        are permuted in each epoch."""
+        render = partial(self.render, frames, frame_count, seed)
+        return LazySample(self.text, frame_count // 2 + len(LETTERS), render, self.item.family)
+
+    def render(self, frames: FrameReader, frame_count: int, seed: int | None, epoch: int) -> Sample:
+        one = self if seed is None else self.permuted(seed, epoch)
+        return selection_sample(one.item, one.mode, one.regime, frames, frame_count, one.response)
 
     def permuted(self, seed: int, epoch: int) -> Supervised:
         """Permute the candidates, and the letters in the texts with them, by seed and epoch."""
@@ -68,7 +77,11 @@ def supervised_items(
     by_mode: dict[str, list[Supervised]] = {mode: [] for mode in MODES}
     for item in items:
         if rationale := rationales.get(item.item_id):
-            lines = match_lines(store, item) if has_matches(regime) else ()
+            lines: tuple[str, ...] = ()
+            if has_matches(regime):
+                # An item that has a rationale has predicates.
+                predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
+                lines = write_match_lines(predicates, item)
             by_mode["reasoning"].append(
                 Supervised(item, "reasoning", regime, rationale.text, lines)
             )
@@ -76,80 +89,46 @@ def supervised_items(
     return by_mode
 
 
-def match_lines(store: Store, item: SelectionItem) -> tuple[str, ...]:
-    """Return the match layout's line for each candidate of an item that has a rationale."""
-    predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
-    # An item whose prefix is too short for predicates has no rationale either.
-    assert predicates is not None
-    return write_match_lines(predicates, item)
-
-
-def load_supervised(
-    supervised: Supervised, frames: FrameReader, frame_count: int, seed: int | None, epoch: int
-) -> Sample:
-    """Render a sample, with its candidates permuted from epoch to epoch if there is a seed."""
-    one = supervised if seed is None else supervised.permuted(seed, epoch)
-    return selection_sample(one.item, one.mode, one.regime, frames, frame_count, one.response)
-
-
-def build_datasets(
-    store: Store,
-    rationales: list[Rationale],
-    frames: FrameReader,
-    *,
-    regime: str,
-    frame_count: int,
-    seed: int,
-    validation_items: int,
-    permute_candidates: bool = False,
+def load_datasets(
+    cfg: SftCommand, store: Store, rationales: list[Rationale]
 ) -> tuple[StudentDataset, dict[str, StudentDataset]]:
-    """Return a regime's training dataset, and its held-out datasets by mode.
-
-    Args:
-        frame_count: Frames of a prefix that are visible.
-        validation_items: Items of held-out training scenes, at most.
-        permute_candidates: Whether the candidates' order changes from epoch to epoch in training.
+    """Return the training dataset of a regime, and the held-out datasets by mode.
 
     Raises:
         UserError: a dataset is empty.
     """
-    if regime not in WITHOUT_RATIONALES:
+    train, frame_count, seed = cfg.train, cfg.student.frames, cfg.seed
+    frames = FrameReader(store, cfg.student.image_size)
+    if train.regime not in WITHOUT_RATIONALES:
         check_not_empty(len(rationales), "accepted rationales")
     held_out = held_out_scenes(store)
     others = set(store.scene_ids("train")) - held_out
     items = store.selection("train")
     # No frame of a held-out scene is visible in training, not even as a distractor.
     trained = [item for item in items if shows_only(item, others)]
-    if regime == "describe":
-        kept = [item for item in items if shows_only(item, held_out)]
+    if train.regime == "describe":
+        measured = [item for item in items if shows_only(item, held_out)]
         training, validation = (
             questions.build_questions(store, part, frame_count, frames, seed)
-            for part in (trained, kept)
+            for part in (trained, measured)
         )
-        validation = {kind: shuffled(v, seed)[:validation_items] for kind, v in validation.items()}
+        validation = {
+            kind: shuffled(samples, seed)[: train.validation_items]
+            for kind, samples in validation.items()
+        }
     else:
         by_item = {r.item_id: r for r in rationales}
         # The items are sorted by family: a shuffled slice measures all of them.
-        kept = shuffled([i for i in items if i.scene_id in held_out], seed)[:validation_items]
+        measured = shuffled([i for i in items if i.scene_id in held_out], seed)
 
         def lazy(items: list[SelectionItem], seed: int | None) -> dict[str, list[LazySample]]:
-            media = frame_count // 2 + len(LETTERS)
-            return {
-                mode: [
-                    LazySample(
-                        one.text,
-                        media,
-                        partial(load_supervised, one, frames, frame_count, seed),
-                        one.item.family,
-                    )
-                    for one in supervised
-                ]
-                for mode, supervised in supervised_items(store, items, by_item, regime).items()
-            }
+            by_mode = supervised_items(store, items, by_item, train.regime)
+            return {m: [s.lazy(frames, frame_count, seed) for s in by_mode[m]] for m in by_mode}
 
-        training, validation = lazy(trained, seed if permute_candidates else None), lazy(kept, None)
+        training = lazy(trained, seed if train.permute_candidates else None)
+        validation = lazy(measured[: train.validation_items], None)
     samples = [sample for part in training.values() for sample in part]
-    check_not_empty(len(samples), f"samples for train.regime={regime}")
+    check_not_empty(len(samples), f"samples for train.regime={train.regime}")
     check_not_empty(sum(map(len, validation.values())), "items of held-out training scenes")
     return StudentDataset(samples), {m: StudentDataset(v) for m, v in validation.items() if v}
 

@@ -12,10 +12,12 @@ from typing import Any
 from torch import nn
 from transformers import ProcessorMixin
 
+from conf.runs import rank
+from conf.schema import SftCommand
 from models.memory import explain_out_of_memory
 from models.student.answer_parser import parse_choice
 from models.student.collator import Collator
-from models.student.generation import GeneratedText, generate, response_token_limit
+from models.student.generation import generate, response_token_limit
 from train.common.journal import ANSWERS
 from train.student.lazy_samples import StudentDataset
 
@@ -27,50 +29,49 @@ class HeldOutAnswers:
     appends them to the run's samples.jsonl. Decoding is greedy and uses no random numbers.
 
     Args:
-        max_length: Most tokens of a prompt.
-        max_new_tokens: Most tokens of a response in reasoning mode.
-        count: Samples of each mode.
+        cfg: Settings with a resolved precision.
+        folder: The run's folder.
     """
 
-    def __init__(
-        self,
-        processor: ProcessorMixin,
-        folder: Path,
-        *,
-        max_length: int,
-        max_new_tokens: int,
-        precision: str,
-        count: int,
-    ) -> None:
-        self._processor = processor
+    def __init__(self, cfg: SftCommand, processor: ProcessorMixin, folder: Path) -> None:
+        self._cfg, self._processor = cfg, processor
         self._path = folder / ANSWERS
-        self._collator = Collator(processor, max_length)
-        self._max_new_tokens = max_new_tokens
-        self._precision = precision
-        self._count = count
+        self._collator = Collator(processor, cfg.student.max_length)
 
     def measure(
-        self, model: nn.Module, mode: str, samples: StudentDataset, step: int, keep: bool = True
+        self, model: nn.Module, mode: str, samples: StudentDataset, step: int
     ) -> dict[str, float]:
         """Return the share of answers that can be parsed and the share that is right, over the
-        items that ask for a letter; empty if none does. `keep` writes the answers to the file.
+        items that ask for a letter; empty if none does. The main rank writes the answers.
 
         Raises:
             UserError: out of memory.
         """
-        held_out = [samples[k] for k in range(min(self._count, len(samples)))]
+        train, student = self._cfg.train, self._cfg.student
+        held_out = [samples[k] for k in range(min(train.generated_items, len(samples)))]
         inputs = self._collator([replace(sample, response=None) for sample in held_out])
-        limit = response_token_limit(mode, self._max_new_tokens)
+        limit = response_token_limit(mode, student.max_new_tokens)
         when = f"while generating {len(held_out)} answers after step {step}"
         lower = "lower train.generated_items, or set it to 0, in another run (run=NAME)"
         with explain_out_of_memory(when, lower):
-            texts = generate(model, self._processor, inputs, limit, self._precision)
-        rows = [
-            _row(step, mode, sample.sample_id, text, sample.response)
-            for sample, text in zip(held_out, texts, strict=True)
-        ]
-        if keep:
-            self._keep(rows)
+            texts = generate(model, self._processor, inputs, limit, train.precision)
+        rows = []
+        for sample, generated in zip(held_out, texts, strict=True):
+            parsed = parse_choice(generated.text, cut=generated.cut)
+            rows.append(
+                {
+                    "step": step,
+                    "mode": mode,
+                    "sample": sample.sample_id,
+                    "text": generated.text,
+                    "letter": parsed.letter,
+                    "reason": None if parsed.letter else parsed.reason and str(parsed.reason),
+                    # None for a response without an answer line.
+                    "answer": parse_choice(sample.response).letter,
+                }
+            )
+        if rank() == 0:
+            self._write(rows)
         letters = [row for row in rows if row["answer"]]
         if not letters:
             return {}
@@ -79,7 +80,7 @@ class HeldOutAnswers:
             "generated_accuracy": sum(r["letter"] == r["answer"] for r in letters) / len(letters),
         }
 
-    def _keep(self, rows: list[dict[str, Any]]) -> None:
+    def _write(self, rows: list[dict[str, Any]]) -> None:
         with open(self._path, "a") as file:
             file.writelines(json.dumps(row) + "\n" for row in rows)
         # The log prints another item at each evaluation.
@@ -87,20 +88,3 @@ class HeldOutAnswers:
         answer = f"; the answer is {row['answer']}" if row["answer"] else ""
         text = indent(row["text"] or "(empty)", "    ")
         log.info("step %d, %s%s:\n%s", row["step"], row["sample"], answer, text)
-
-
-def _row(
-    step: int, mode: str, sample: str, generated: GeneratedText, response: str
-) -> dict[str, Any]:
-    """Return a line of samples.jsonl; `answer` is the letter of the held-out response, or None if
-    it has no answer line."""
-    parsed = parse_choice(generated.text, cut=generated.cut)
-    return {
-        "step": step,
-        "mode": mode,
-        "sample": sample,
-        "text": generated.text,
-        "letter": parsed.letter,
-        "reason": None if parsed.letter else parsed.reason and str(parsed.reason),
-        "answer": parse_choice(response).letter,
-    }

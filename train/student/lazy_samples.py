@@ -34,40 +34,40 @@ class LazySample:
     family: str | None = None
 
 
+@dataclass(eq=False)
 class StudentDataset(Dataset):
     """Lazy samples as a trainer reads them.
 
     Index ~k (below 0) is sample k without supervision; the sampler fills up a step with it.
     """
 
-    def __init__(self, samples: Sequence[LazySample]) -> None:
-        self._samples = samples
-        self._epoch = 0
+    samples: Sequence[LazySample]
+    epoch: int = 0
 
     def set_epoch(self, epoch: int) -> None:
-        self._epoch = epoch
+        self.epoch = epoch
 
     def __len__(self) -> int:
-        return len(self._samples)
+        return len(self.samples)
 
     def __getitem__(self, index: int) -> Sample:
         if index < 0:
             return replace(self[~index], supervised=False)
-        return self._samples[index].load(self._epoch)
+        return self.samples[index].load(self.epoch)
 
     @property
     def families(self) -> list[str | None]:
-        return [s.family for s in self._samples]
+        return [s.family for s in self.samples]
 
     @property
     def texts(self) -> list[str]:
-        return [s.text for s in self._samples]
+        return [s.text for s in self.samples]
 
     def lengths(self, tokenizer: PreTrainedTokenizerBase, image_size: int) -> list[int]:
         """Estimate the tokens of each sample without rendering it."""
         ids = tokenizer(self.texts, add_special_tokens=False).input_ids
         each = round(image_size / TOKEN_PIXELS) ** 2 + EXTRA_TOKENS
-        return [len(i) + s.media * each for i, s in zip(ids, self._samples, strict=True)]
+        return [len(i) + s.media * each for i, s in zip(ids, self.samples, strict=True)]
 
 
 def seeded_rng(*keys: int | str) -> np.random.Generator:

@@ -1,14 +1,14 @@
 """The student's trainer: what differs from transformers.Trainer.
 
-The loss weighs every supervised token of an accumulated batch alike. Training batches may be packed
-while evaluation batches are padded, so that each row is one sample. A non-finite loss or gradient
+The loss weighs every supervised token of an accumulated batch alike. A non-finite loss or gradient
 stops the run before a checkpoint is written.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -17,16 +17,16 @@ import torch
 from torch.distributed.fsdp import register_fsdp_forward_method
 from torch.nn import Module
 from torch.nn.functional import cross_entropy
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Sampler
 from transformers import EvalPrediction, Trainer
 
 from conf.errors import UserError
 from conf.runs import rank, write_json
-from models.student.collator import IGNORED
+from models.student.collator import IGNORED, Collator
+from models.student.prompts import Sample
 from train.student.held_out_answers import HeldOutAnswers
-from train.student.length_sampler import LengthSampler
 from train.student.metrics import LetterAccuracy, TokenAccuracy
-from train.student.vision_cache import VisionCache
+from train.student.vision_cache import SLICES, VisionCache, slice_digests
 
 STOPPED = "stopped.json"
 """Names the samples of a non-finite loss or gradient; ranks above 0 put their number in front."""
@@ -57,6 +57,18 @@ def token_losses(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
     return torch.stack([losses.sum(dim=-1), (following != IGNORED).sum(dim=-1)], dim=-1)
 
 
+@dataclass(frozen=True)
+class TrainerCollator:
+    """Adds the samples' ids to a batch and, for a `VisionCache`, the digests of the slices."""
+
+    collator: Collator
+    digests: bool
+
+    def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
+        batch = {**self.collator(samples), "sample_ids": [s.sample_id for s in samples]}
+        return {**batch, SLICES: slice_digests(samples)} if self.digests else batch
+
+
 class StudentTrainer(Trainer):
     """A Trainer with its own order of samples, loss and measures.
 
@@ -64,7 +76,6 @@ class StudentTrainer(Trainer):
     the batch size and of the world size.
 
     Args:
-        training_collator: Makes training batches; `data_collator` makes those of evaluations.
         sampler: The order of the training samples.
         accuracy: The measure of an evaluation.
         answers: Generates answers to held-out items at each evaluation, or None.
@@ -74,8 +85,7 @@ class StudentTrainer(Trainer):
     def __init__(
         self,
         *args: Any,
-        training_collator: Callable[[list[Any]], dict[str, Any]],
-        sampler: LengthSampler,
+        sampler: Sampler[int],
         accuracy: TokenAccuracy | LetterAccuracy,
         answers: HeldOutAnswers | None = None,
         vision_cache: VisionCache | None = None,
@@ -87,24 +97,14 @@ class StudentTrainer(Trainer):
             compute_metrics=self._measure,
             **settings,
         )
-        self._training_collator = training_collator
         self._sampler = sampler
         self._accuracy = accuracy
         self._answers = answers
         self._vision_cache = vision_cache
-        self._step_samples: tuple[int, list[str]] = (-1, [])
+        self._step_samples: list[str] = []
 
-    def get_train_dataloader(self) -> DataLoader:
-        loader = DataLoader(
-            self.train_dataset,
-            batch_size=self.args.train_batch_size,
-            sampler=self._sampler,
-            collate_fn=self._training_collator,
-            num_workers=self.args.dataloader_num_workers,
-            prefetch_factor=self.args.dataloader_prefetch_factor,
-            pin_memory=self.args.dataloader_pin_memory,
-        )
-        return self.accelerator.prepare(loader)
+    def _get_train_sampler(self, *_: Any) -> Sampler[int]:
+        return self._sampler
 
     def _reduce(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
         """Return (B, 2 + columns of the accuracy), so that no logits are kept."""
@@ -128,13 +128,8 @@ class StudentTrainer(Trainer):
             # All ranks generate: each one holds a part of a sharded model.
             if "generate" not in vars(self.model):
                 register_fsdp_forward_method(self.model, "generate")
-            measured = self._answers.measure(
-                self.model,
-                metric_key_prefix.removeprefix("eval_"),
-                dataloader.dataset,
-                self.state.global_step,
-                keep=self.is_world_process_zero(),
-            )
+            mode, step = metric_key_prefix.removeprefix("eval_"), self.state.global_step
+            measured = self._answers.measure(self.model, mode, dataloader.dataset, step)
             output.metrics.update({f"{metric_key_prefix}_{k}": v for k, v in measured.items()})
         return output
 
@@ -150,17 +145,16 @@ class StudentTrainer(Trainer):
         if not torch.isfinite(loss):
             self._stop("loss", loss.item(), ids)
         if model.training:
-            step, earlier = self._step_samples
-            now = self.state.global_step
-            self._step_samples = (now, [*(earlier if step == now else []), *ids])
+            self._step_samples += ids
         return result
 
     def log(self, logs: dict[str, float], *args: Any, **settings: Any) -> None:
         """Raises UserError for a non-finite gradient, before its weights are saved."""
         super().log(logs, *args, **settings)
-        norm = logs.get("grad_norm")
-        if norm is not None and not math.isfinite(norm):
-            self._stop("gradient", norm, self._step_samples[1])
+        if "grad_norm" in logs:
+            ids, self._step_samples = self._step_samples, []
+            if not math.isfinite(logs["grad_norm"]):
+                self._stop("gradient", logs["grad_norm"], ids)
 
     def _stop(self, what: str, value: float, ids: list[str]) -> NoReturn:
         name = f"{rank()}-{STOPPED}" if rank() else STOPPED

@@ -8,7 +8,6 @@ pixels, so that no slice is mistaken for another.
 from __future__ import annotations
 
 import hashlib
-import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,8 +22,6 @@ from models.distributed import is_sharded
 from models.student.collator import MEDIA
 from models.student.prompts import Sample
 
-log = logging.getLogger(__name__)
-
 SLICES = "slices"
 """Name of a batch's slice digests: images first, then pairs of the clips' frames."""
 
@@ -36,16 +33,14 @@ def slice_digests(samples: Sequence[Sample]) -> list[bytes]:
     for sample in samples:
         if sample.clip is not None:
             pixels = sample.clip.pixels
-            last = len(pixels) - 1
-            pairs += [(pixels[k], pixels[min(k + 1, last)]) for k in range(0, last + 1, 2)]
-    return [_digest(*pair) for pair in pairs]
-
-
-def _digest(first: np.ndarray, second: np.ndarray) -> bytes:
-    digest = hashlib.blake2b(repr(first.shape).encode(), digest_size=16)
-    digest.update(np.ascontiguousarray(first))
-    digest.update(np.ascontiguousarray(second))
-    return digest.digest()
+            pairs += zip(pixels[::2], [*pixels[1::2], pixels[-1]], strict=False)
+    digests = []
+    for first, second in pairs:
+        digest = hashlib.blake2b(repr(first.shape).encode(), digest_size=16)
+        digest.update(np.ascontiguousarray(first))
+        digest.update(np.ascontiguousarray(second))
+        digests.append(digest.digest())
+    return digests
 
 
 class VisionCache:
@@ -84,10 +79,14 @@ class VisionCache:
 
     def replace_pixels(self, inputs: dict[str, Any]) -> None:
         """Put the tower's outputs, as `mm_encoder_outputs`, in the place of a batch's pixels."""
-        digests = inputs.pop(SLICES)
-        slices, counts = self._slices(inputs, digests)
-        missing = {key: patches for key, patches in slices.items() if key not in self._kept}
-        new = self._encode(missing, inputs)
+        digests, patches, counts = inputs.pop(SLICES), [], {}
+        for kind, (name, grid) in MEDIA.items():
+            if name in inputs:
+                sizes = [h * w for time, h, w in inputs[grid].tolist() for _ in range(time)]
+                patches += inputs.pop(name).split(sizes)
+                counts[kind] = len(sizes)
+        slices = dict(zip(digests, patches, strict=True))
+        new = self._encode({k: v for k, v in slices.items() if k not in self._kept}, inputs)
         device = inputs["input_ids"].device
         outputs, start = {}, 0
         for kind, count in counts.items():
@@ -102,24 +101,9 @@ class VisionCache:
             )
         inputs["mm_encoder_outputs"] = outputs
         for key, features in new.items():
-            self._keep(key, features)
-
-    @staticmethod
-    def _slices(
-        inputs: dict[str, Any], digests: Sequence[bytes]
-    ) -> tuple[dict[bytes, torch.Tensor], dict[str, int]]:
-        """Return the patches of each distinct slice, and the number of slices by kind of media."""
-        patches, counts = [], {}
-        for kind, (name, grid) in MEDIA.items():
-            if name in inputs:
-                each = [
-                    height * width
-                    for time, height, width in inputs[grid].tolist()
-                    for _ in range(time)
-                ]
-                patches += inputs.pop(name).split(each)
-                counts[kind] = len(each)
-        return dict(zip(digests, patches, strict=True)), counts
+            if self.bytes + features.nbytes <= self._limit:
+                self._kept[key] = features.cpu()
+                self.bytes += features.nbytes
 
     def _encode(
         self, slices: dict[bytes, torch.Tensor], inputs: dict[str, Any]
@@ -128,23 +112,10 @@ class VisionCache:
         if not slices:
             return {}
         height, width = next(inputs[g] for _, g in MEDIA.values() if g in inputs)[0, 1:].tolist()
-        grid = torch.tensor([[1, height, width]] * len(slices))
         patches = torch.cat(list(slices.values()))
-        device = patches.device
-        with (
-            torch.no_grad(),
-            torch.autocast(device.type, torch.bfloat16, enabled=self._precision == "bf16"),
-        ):
-            encoded = self._base.get_image_features(patches, grid.to(device))
+        grid = torch.tensor([[1, height, width]] * len(slices), device=patches.device)
+        bf16 = self._precision == "bf16"
+        with torch.no_grad(), torch.autocast(patches.device.type, torch.bfloat16, enabled=bf16):
+            encoded = self._base.get_image_features(patches, grid)
         layers = [encoded.pooler_output, *encoded.deepstack_features]
         return {key: torch.stack([layer[k] for layer in layers]) for k, key in enumerate(slices)}
-
-    def _keep(self, key: bytes, features: torch.Tensor) -> None:
-        size = features.nbytes
-        if self.bytes + size > self._limit:
-            if self.bytes <= self._limit:
-                log.info("the vision cache is full (%.1f GiB)", self.bytes / 2**30)
-                self._limit = 0
-            return
-        self._kept[key] = features.cpu()
-        self.bytes += size

@@ -1,5 +1,4 @@
-"""What the tests of several ranks have `accelerate launch` start: a trainer, once for each of the
-runs that a file lists, over the benchmark that the file holds."""
+"""Run trainers under `accelerate launch`: each of the runs that a JSON file lists."""
 
 from __future__ import annotations
 
@@ -20,52 +19,49 @@ from train import contrastive, sft
 from train.student import dataset
 from train.student import run as student_run
 
+TRAINERS = {"sft": sft.main, "contrastive": contrastive.main}
+VALIDATION_ITEMS = 3
+"""Held-out items in the settings of the tests; training has more."""
+build = dataset.supervised_items
 
-def let_cpus_share() -> None:
-    """Have accelerate take FSDP on CPUs as it does on GPUs. It knows the plugin there, and torch
-    and gloo do the rest."""
-    made = AcceleratorState.__init__
 
-    def sharing(self: AcceleratorState, *args: Any, fsdp_plugin: Any = None, **settings: Any):
-        made(self, *args, fsdp_plugin=fsdp_plugin, **settings)
+def enable_fsdp_on_cpus() -> None:
+    """Let accelerate use FSDP on CPUs as on GPUs; torch and gloo support it."""
+    init = AcceleratorState.__init__
+
+    def patched(self: AcceleratorState, *args: Any, fsdp_plugin: Any = None, **settings: Any):
+        init(self, *args, fsdp_plugin=fsdp_plugin, **settings)
         if fsdp_plugin is not None and self.distributed_type == DistributedType.MULTI_CPU:
             self.fsdp_plugin = fsdp_plugin
             self.distributed_type = DistributedType.FSDP
             PartialState._shared_state["distributed_type"] = DistributedType.FSDP
 
-    AcceleratorState.__init__ = sharing
+    AcceleratorState.__init__ = patched
 
 
-TRAINERS = {"sft": sft.main, "contrastive": contrastive.main}
-
-make = dataset.supervised_items
-MEASURED = 3
-"""Held-out items of the tests' settings; training has more."""
-
-
-def fewer(*arguments: Any) -> dict[str, list[dataset.Supervised]]:
+def five_samples(*arguments: Any) -> dict[str, list[dataset.Supervised]]:
     """Five training samples of two modes: a step of four, and one that all ranks cannot share."""
-    few = {"reasoning": 3, "answer": 2}
-    items = make(*arguments)
-    is_validation = len(arguments[1]) <= MEASURED
-    return items if is_validation else {mode: items[mode][: few[mode]] for mode in few}
+    items = build(*arguments)
+    if len(arguments[1]) <= VALIDATION_ITEMS:
+        return items
+    return {"reasoning": items["reasoning"][:3], "answer": items["answer"][:2]}
 
 
 def fail(*_: Any, **__: Any) -> None:
-    raise UserError("this rank alone cannot go on")
+    raise UserError("a failure of this rank", code="test-failure")
 
 
 def main() -> None:
-    told = json.loads(Path(sys.argv[1]).read_text())
-    ConfigStore.instance().store(group="benchmark", name="micro", node=told["benchmark"])
-    let_cpus_share()
-    dataset.supervised_items = fewer
-    for run in told["runs"]:
-        # As accelerate launch has it with and without --use_fsdp.
+    plan = json.loads(Path(sys.argv[1]).read_text())
+    ConfigStore.instance().store(group="benchmark", name="micro", node=plan["benchmark"])
+    enable_fsdp_on_cpus()
+    dataset.supervised_items = five_samples
+    for run in plan["runs"]:
+        # As accelerate launch sets it with and without --use_fsdp.
         os.environ["ACCELERATE_USE_FSDP"] = str(run["fsdp"]).lower()
-        if rank() == 0 and run["after"]:
-            shutil.copytree(run["after"], Path(run["folder"]) / Path(run["after"]).name)
-        if rank() == run["fails_on"]:
+        if rank() == 0 and run["checkpoint"]:
+            shutil.copytree(run["checkpoint"], Path(run["folder"]) / Path(run["checkpoint"]).name)
+        if rank() == run["failing_rank"]:
             student_run.token_mean = fail
         sys.argv[1:] = run["overrides"]
         TRAINERS[run["trainer"]]()

@@ -1,8 +1,7 @@
-"""Several ranks train what one does: the same steps, numbers and weights, however they share."""
+"""Several ranks train what one rank trains: the same steps, losses and weights."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import shutil
@@ -26,6 +25,8 @@ from conf.schema import ContrastiveCommand, LateConfig, LoraConfig, SftCommand
 from models import distributed
 from models.student.collator import IGNORED, Collator
 from models.student.prompts import selection_sample
+from tests.children import run_child
+from tests.train.common import launched
 from tests.user_errors import raises_user_error
 from train import contrastive, sft
 from train.common import journal
@@ -37,9 +38,6 @@ from train.student.length_sampler import LengthSampler
 from train.student.trainer import token_losses, token_mean
 
 ROOT = Path(__file__).parents[3]
-LAUNCHED = Path(__file__).with_name("launched.py")
-TIMEOUT = 1200
-"""Seconds after which ranks that wait for each other fail the test."""
 SHARDED = ("--use_fsdp", "--fsdp_version=2", "--fsdp_auto_wrap_policy=TRANSFORMER_BASED_WRAP")
 
 
@@ -49,48 +47,49 @@ def settings(few_steps) -> SftCommand:
 
 
 @pytest.fixture
-def few(monkeypatch) -> None:
-    """Five training samples, as for the ranks that are launched."""
-    spec = importlib.util.spec_from_file_location("launched", LAUNCHED)
-    launched = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(launched)
-    monkeypatch.setattr(dataset, "supervised_items", launched.fewer)
+def five_samples(monkeypatch) -> None:
+    """The training samples of the launched ranks."""
+    monkeypatch.setattr(dataset, "supervised_items", launched.five_samples)
 
 
-def alone(settings: SftCommand, folder: Path, after: Path | None = None) -> Path:
+def train_alone(settings: SftCommand, folder: Path, checkpoint: Path | None = None) -> Path:
     """A run of one rank, from its start or a checkpoint."""
     folder.mkdir(parents=True)
-    if after is not None:
-        shutil.copytree(after, folder / after.name)
+    if checkpoint is not None:
+        shutil.copytree(checkpoint, folder / checkpoint.name)
     sft.main.__wrapped__(settings, Run(folder.name, folder))
     return folder
 
 
-UNLESS = {"fsdp": False, "after": None, "fails_on": None}
-"""What launched.py does with a run, unless it is told."""
-
-
-def planned(settings: SftCommand, folder: Path, **changes: Any) -> dict[str, Any]:
-    """What launched.py is told of a run."""
-    student, train = settings.student, settings.train
-    overrides = [
-        "+exp=cot", "benchmark=micro", f"store={settings.store}", f"run={folder.name}",
+def overrides(settings: SftCommand | ContrastiveCommand, folder: Path) -> list[str]:
+    """The part of a command line that both trainers share."""
+    train = {k: v for k, v in asdict(settings.train).items() if k != "report_to"}
+    return [
+        "benchmark=micro", f"store={settings.store}", f"run={folder.name}",
         f"checkpoints={folder.parents[1]}", "workers=1",
-        *(f"student.{key}={getattr(student, key)}" for key in ("name", "model", "quantization")),
-        *(f"student.{key}={getattr(student, key)}" for key in ("image_size", "max_length")),
-        f"student.max_new_tokens={student.max_new_tokens}",
-        f"student.lora.rank={student.lora.rank}",
-        *(f"train.{key}={'null' if value is None else value}"
-          for key, value in asdict(train).items() if key != "report_to"),
+        *(f"train.{k}={'null' if v is None else v}" for k, v in train.items()),
     ]  # fmt: skip
-    return {"trainer": "sft", **UNLESS, "overrides": overrides, "folder": folder, **changes}
 
 
-def ranking(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]:
-    """What launched.py is told of a retriever's run."""
+def plan_student(settings: SftCommand, folder: Path, **changes: Any) -> dict[str, Any]:
+    """A run of a student for launched.py."""
+    student = settings.student
+    keys = ("name", "model", "quantization", "image_size", "max_length", "max_new_tokens")
+    command = [
+        "+exp=cot",
+        *overrides(settings, folder),
+        *(f"student.{key}={getattr(student, key)}" for key in keys),
+        f"student.lora.rank={student.lora.rank}",
+    ]
+    plan = {"trainer": "sft", "fsdp": False, "checkpoint": None, "failing_rank": None}
+    return {**plan, "overrides": command, "folder": folder, **changes}
+
+
+def plan_retriever(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]:
+    """A run of a retriever for launched.py."""
     retriever = settings.retriever
     late, sizes = retriever.late, retriever.architecture
-    built = (
+    model = (
         [f"retriever.architecture.{key}={value}" for key, value in asdict(sizes).items()]
         if sizes
         else [
@@ -99,38 +98,37 @@ def ranking(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]:
             f"retriever.lora.rank={retriever.lora.rank}",
         ]
     )
-    overrides = [
+    command = [
         *(["+exp=late_interaction", f"retriever.late.width={late.width}"] if late else []),
-        "retriever=tiny", "benchmark=micro", f"store={settings.store}", f"run={folder.name}",
-        f"checkpoints={folder.parents[1]}", "workers=1",
-        *built,
-        f"retriever.image_size={retriever.image_size}", f"retriever.widths={retriever.widths}",
-        *(f"train.{key}={'null' if value is None else value}"
-          for key, value in asdict(settings.train).items() if key != "report_to"),
-    ]  # fmt: skip
-    return {"trainer": "contrastive", **UNLESS, "overrides": overrides, "folder": folder}
+        "retriever=tiny",
+        *model,
+        *overrides(settings, folder),
+        f"retriever.image_size={retriever.image_size}",
+        f"retriever.widths={retriever.widths}",
+    ]
+    plan = {"trainer": "contrastive", "fsdp": False, "checkpoint": None, "failing_rank": None}
+    return {**plan, "overrides": command, "folder": folder}
 
 
 def launch(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """Two ranks on CPUs, whatever GPUs there are."""
+    """Two ranks on CPUs, also on a machine with GPUs."""
     accelerate = Path(sys.executable).with_name("accelerate")
-    command = [accelerate, "launch", "--num_processes=2", "--main_process_port=0", *arguments]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
-    return subprocess.run(
-        list(map(str, command)),
-        cwd=ROOT, env={**environment, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True,
-        timeout=TIMEOUT,
-    )  # fmt: skip
+    environment = {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+    return run_child(
+        [accelerate, "launch", "--num_processes=2", "--main_process_port=0", *arguments],
+        cwd=ROOT,
+        env={**os.environ, **environment},
+    )
 
 
-def same(one: Path, two: Path, step: int = -1) -> None:
-    """The journals after a step, and the weights."""
-    same_journals(one, two, step)
-    same_weights(one, two)
+def check_same(one: Path, two: Path, step: int = -1) -> None:
+    """Compare the journals after a step, and the weights."""
+    check_same_journals(one, two, step)
+    check_same_weights(one, two)
 
 
-def same_journals(one: Path, two: Path, step: int = -1) -> None:
-    """But for shares of an epoch, which are counted in a rank's micro-batches."""
+def check_same_journals(one: Path, two: Path, step: int = -1) -> None:
+    """The fraction of an epoch is not compared: it counts the micro-batches of a rank."""
     journals = [
         [{k: v for k, v in r.items() if k != "epoch"} for r in read_journal(f) if r["step"] > step]
         for f in (one, two)
@@ -139,7 +137,9 @@ def same_journals(one: Path, two: Path, step: int = -1) -> None:
         assert first == pytest.approx(second, rel=1e-5)
 
 
-def same_weights(one: Path, two: Path, name: str = "student/adapter_model.safetensors") -> None:
+def check_same_weights(
+    one: Path, two: Path, name: str = "student/adapter_model.safetensors"
+) -> None:
     weights = [load_file(f / name) for f in (one, two)]
     assert weights[0].keys() == weights[1].keys()
     for name, weight in weights[0].items():
@@ -147,26 +147,28 @@ def same_weights(one: Path, two: Path, name: str = "student/adapter_model.safete
         torch.testing.assert_close(weight, weights[1][name], atol=5e-6, rtol=1e-5)
 
 
-def errors_of(ended: subprocess.CompletedProcess[str]) -> list[str]:
-    """The errors that a user is told; what a bug looks like fails."""
+def error_lines(ended: subprocess.CompletedProcess[str]) -> list[str]:
+    """The errors that a user sees, none of which is a traceback."""
     assert "[rank0]: Traceback" not in ended.stderr
     assert "[rank1]: Traceback" not in ended.stderr
     return [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
 
 
 @pytest.mark.slow
-def test_two_ranks_are_one(settings, contrastive_settings, saved_base, few, tmp_path) -> None:
-    """A student's are one with twice the accumulation, a retriever's one with the whole batch; so
-    are a student's where FSDP gives each a part of the weights, after a kill, and where one rank
-    began and two go on, or the reverse. What goes wrong on one rank ends both with one sentence.
+def test_two_ranks_train_what_one_trains(
+    settings, contrastive_settings, saved_base, five_samples, tmp_path
+) -> None:
+    """Two ranks equal one with twice the accumulation (a student) or with the whole batch (a
+    retriever). So do two ranks of FSDP, a resumed run, and runs that one rank starts and two resume
+    or the reverse. An error on one rank ends both with one sentence.
     """
     runs = tmp_path / "sft"
-    one = alone(settings, runs / "one")
-    # Unlike 4-bit weights, those of such a base are parted too.
+    one = train_alone(settings, runs / "one")
+    # Unlike 4-bit weights, those of an unquantised base are sharded too.
     unquantised = replace(settings.student, quantization="none")
     best = replace(settings.train, best_metric="eval_answer_loss")
     plain = replace(settings, student=unquantised, train=best)
-    alone(plain, runs / "plain")
+    train_alone(plain, runs / "plain")
     train = contrastive_settings.train
     many = replace(contrastive_settings.retriever, late=LateConfig(width=24))
     late = replace(contrastive_settings, retriever=many, train=replace(train, scale=1.0))
@@ -175,48 +177,57 @@ def test_two_ranks_are_one(settings, contrastive_settings, saved_base, few, tmp_
     # Mined frames are often another query's target, which both ranks mask.
     train = replace(train, mine_every=2, reuse_features=True)
     mined = replace(contrastive_settings, retriever=adapted, train=train)
-    wholes = {"plain": contrastive_settings, "mined": mined, "late": late}
-    for name, alone_settings in wholes.items():
-        (whole := tmp_path / "contrastive" / name).mkdir(parents=True)
-        contrastive.main.__wrapped__(alone_settings, Run(name, whole))
-    told = [
-        planned(settings, runs / "two"),
-        planned(settings, runs / "more", after=one / "checkpoint-2"),
-        planned(settings, runs / "parts", fsdp=True),
-        planned(settings, runs / "on", fsdp=True, after=runs / "parts" / "checkpoint-2"),
-        planned(settings, runs / "done", fsdp=True, after=runs / "parts" / "checkpoint-4"),
-        *(ranking(cfg, tmp_path / "contrastive" / f"{name}-two") for name, cfg in wholes.items()),
-        planned(plain, runs / "plain-parts", fsdp=True),
-        planned(settings, runs / "lost", fails_on=1),
+    retrievers = {"plain": contrastive_settings, "mined": mined, "late": late}
+    for name, retriever_settings in retrievers.items():
+        (folder := tmp_path / "contrastive" / name).mkdir(parents=True)
+        contrastive.main.__wrapped__(retriever_settings, Run(name, folder))
+    sharded = runs / "sharded"
+    planned = [
+        plan_student(settings, runs / "two"),
+        plan_student(settings, runs / "resumed", checkpoint=one / "checkpoint-2"),
+        plan_student(settings, sharded, fsdp=True),
+        plan_student(
+            settings, runs / "sharded-resumed", fsdp=True, checkpoint=sharded / "checkpoint-2"
+        ),
+        plan_student(
+            settings, runs / "sharded-ended", fsdp=True, checkpoint=sharded / "checkpoint-4"
+        ),
+        *(
+            plan_retriever(cfg, tmp_path / "contrastive" / f"{name}-two")
+            for name, cfg in retrievers.items()
+        ),
+        plan_student(plain, runs / "plain-sharded", fsdp=True),
+        plan_student(settings, runs / "failing", failing_rank=1),
     ]
     file = tmp_path / "runs.json"
     benchmark = asdict(settings.benchmark)
-    file.write_text(json.dumps({"benchmark": benchmark, "runs": told}, default=str))
-    ended = launch(*SHARDED, LAUNCHED, file)
-    assert errors_of(ended) == ["error: this rank alone cannot go on  [user-error]"], ended.stderr
+    file.write_text(json.dumps({"benchmark": benchmark, "runs": planned}, default=str))
+    ended = launch(*SHARDED, launched.__file__, file)
+    assert error_lines(ended) == ["error: a failure of this rank  [test-failure]"], ended.stderr
     assert ended.returncode == 1
-    for name in ("two", "parts"):
-        same(one, runs / name)
-    same(runs / "plain", runs / "plain-parts")
-    for name in wholes:
-        whole = tmp_path / "contrastive" / name
-        same_journals(whole, whole.with_name(f"{name}-two"))
+    check_same(one, runs / "two")
+    check_same(one, sharded)
+    check_same(runs / "plain", runs / "plain-sharded")
+    for name in retrievers:
+        whole, two = tmp_path / "contrastive" / name, tmp_path / "contrastive" / f"{name}-two"
+        check_same_journals(whole, two)
         weights = "adapter_model" if name == "mined" else "model"
-        same_weights(whole, whole.with_name(f"{name}-two"), f"retriever/{weights}.safetensors")
-    same_weights(whole, whole.with_name(f"{name}-two"), "retriever/1_Dense/model.safetensors")
-    for name in ("more", "on"):
-        same(one, runs / name, step=2)
-    same_weights(one, runs / "done")
-    fewer = alone(settings, runs / "fewer", after=runs / "two" / "checkpoint-2")
-    same(one, fewer, step=2)
+        check_same_weights(whole, two, f"retriever/{weights}.safetensors")
+    check_same_weights(whole, two, "retriever/1_Dense/model.safetensors")
+    for name in ("resumed", "sharded-resumed"):
+        check_same(one, runs / name, step=2)
+    check_same_weights(one, runs / "sharded-ended")
+    fewer = train_alone(settings, runs / "fewer", checkpoint=runs / "two" / "checkpoint-2")
+    check_same(one, fewer, step=2)
     with raises_user_error("other-launch", contains="checkpoint-2"):
-        alone(settings, runs / "mixed", after=runs / "parts" / "checkpoint-2")
-    for what, folder in (("file of weights", "pytorch_model_fsdp_0"), ("optimizer", "optimizer_0")):
-        parts = runs / "parts" / "checkpoint-4" / folder / ".metadata"
-        listed = parts.rename(runs / "listed")
-        assert find_damage(runs / "parts" / "checkpoint-4") == f"its {what} is missing"
-        listed.rename(parts)
-    assert find_damage(runs / "parts" / "checkpoint-4") is None
+        train_alone(settings, runs / "mixed", checkpoint=sharded / "checkpoint-2")
+    last = sharded / "checkpoint-4"
+    for part, folder in (("file of weights", "pytorch_model_fsdp_0"), ("optimizer", "optimizer_0")):
+        metadata = last / folder / ".metadata"
+        moved = metadata.rename(runs / "moved")
+        assert find_damage(last) == f"its {part} is missing"
+        moved.rename(metadata)
+    assert find_damage(last) is None
     record = json.loads((runs / "two" / "run.json").read_text())
     assert (record["ranks"], record["earlier_starts"]) == (2, [])
     assert (runs / "two" / "run.log").read_text().count("loading student") == 1
@@ -226,45 +237,45 @@ def test_two_ranks_are_one(settings, contrastive_settings, saved_base, few, tmp_
 
 
 @pytest.mark.slow
-def test_what_is_wrong_for_all_ranks_is_said_once(tmp_path) -> None:
-    overrides = ["+exp=cot", "train.batch=6", "train.micro_batch=2", f"checkpoints={tmp_path}"]
-    ended = launch("--multi_gpu", "-m", "train.sft", *overrides)
+def test_an_error_on_all_ranks_is_printed_once(tmp_path) -> None:
+    command = ["+exp=cot", "train.batch=6", "train.micro_batch=2", f"checkpoints={tmp_path}"]
+    ended = launch("--multi_gpu", "-m", "train.sft", *command)
     assert ended.returncode == 1
-    (line,) = errors_of(ended)
+    (line,) = error_lines(ended)
     assert "train.batch=6" in line
     assert line.endswith("[uneven-batch]")
 
 
 @pytest.mark.slow
-def test_fsdp_that_would_be_passed_over_is_refused(settings, tmp_path, monkeypatch) -> None:
+def test_fsdp_without_effect_is_refused(settings, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
     with raises_user_error("unsupported-with-fsdp", contains="--use_fsdp"):
-        alone(settings, tmp_path / "run")
+        train_alone(settings, tmp_path / "run")
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 8, 11, 64])
 @pytest.mark.parametrize(("micro_batch", "number"), [(1, 2), (2, 2), (4, 2), (2, 4), (1, 8)])
 def test_ranks_share_the_steps_of_one(count, micro_batch, number) -> None:
-    """As accelerate deals out an order: micro-batches in turn."""
+    """accelerate gives the micro-batches of an order to the ranks in turn."""
     lengths = np.random.default_rng(0).integers(1, 1000, count).tolist()
     alone = list(LengthSampler(lengths, 8, 0))
     order = LengthSampler(lengths, 8, 0, micro_batch, number)
     batches = BatchSampler(order, micro_batch, drop_last=False)
-    dealt = [list(BatchSamplerShard(batches, number, rank)) for rank in range(number)]
-    assert len(order) == len(list(order)) == sum(len(b) for part in dealt for b in part)
+    shares = [list(BatchSamplerShard(batches, number, rank)) for rank in range(number)]
+    assert len(order) == len(list(order)) == sum(len(b) for part in shares for b in part)
     each = 8 // (micro_batch * number)
     for step in range(0, count, 8):
         first = step // 8 * each
-        taken = [i for part in dealt for b in part[first : first + each] for i in b]
-        supervised = sorted(i for i in taken if i >= 0)
+        samples = [i for part in shares for b in part[first : first + each] for i in b]
+        supervised = sorted(i for i in samples if i >= 0)
         assert supervised == sorted(alone[step : step + 8])
-        # Fillers are the shortest there is.
-        assert {~i for i in taken if i < 0} <= {alone[step : step + 8][-1]}
-    assert len({len(part) for part in dealt}) == 1
+        # Fillers repeat the shortest sample of the step.
+        assert {~i for i in samples if i < 0} <= {alone[step : step + 8][-1]}
+    assert len({len(part) for part in shares}) == 1
 
 
-def test_ranks_have_as_much_to_do() -> None:
-    """None gets the longer of each two neighbours."""
+def test_ranks_have_equal_work() -> None:
+    """No rank always has the longer of two neighbours."""
     lengths = np.random.default_rng(0).integers(1, 1000, 64)
     order = np.array(list(LengthSampler(lengths.tolist(), 64, 0, 1, 2))).reshape(-1, 2)
     loads = lengths[order].sum(axis=0)
@@ -275,19 +286,19 @@ def test_ranks_have_as_much_to_do() -> None:
 
 def test_a_filler_changes_no_loss(micro_store, frames, student_cfg, processor, model) -> None:
     items = micro_store.selection("train")[:2]
-    made = StudentDataset(
+    samples = StudentDataset(
         [
-            LazySample("", 0, partial(shown, item, frames, student_cfg, text))
+            LazySample("", 0, partial(render, item, frames, student_cfg, text))
             for item, text in zip(items, ("Answer: A", "near the top\nAnswer: B"), strict=True)
         ]
     )
     collate = Collator(processor, 1500)
-    plain = collate([made[0], made[1]])
-    filled = collate([made[0], made[1], made[~0]])
+    plain = collate([samples[0], samples[1]])
+    filled = collate([samples[0], samples[1], samples[~0]])
     count = int((plain["labels"] != IGNORED).sum())
     assert int((filled["labels"] != IGNORED).sum()) == count
     losses = []
-    for batch in (plain, filled, collate([made[~1]])):
+    for batch in (plain, filled, collate([samples[~1]])):
         labels = batch.pop("labels")
         logits = model(**batch, use_cache=False).logits
         losses.append(token_mean(SimpleNamespace(logits=logits), labels, count))
@@ -299,7 +310,7 @@ def test_a_filler_changes_no_loss(micro_store, frames, student_cfg, processor, m
     assert all((p.grad == 0).all() for p in model.parameters() if p.grad is not None)
 
 
-def shown(item, frames, cfg, text, epoch):
+def render(item, frames, cfg, text, epoch):
     return selection_sample(item, "answer", "cot", frames, cfg.frames, text)
 
 

@@ -1,4 +1,4 @@
-"""What a run must not do: train on what measures it or on other GPUs, or go on where it cannot."""
+"""What stops a run, and what a run must not train on."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from data.records import SelectionItem
 from data.store import Store
 from tests.user_errors import raises_user_error
 from train import sft
-from train.common.held_out import held_out_scenes
-from train.student.dataset import shows_only
-from train.student.run import load_datasets
+from train.common.held_out import HELD_OUT, held_out_scenes
+from train.student.dataset import load_datasets, shows_only
 from train.student.trainer import token_mean
 
 
@@ -29,49 +28,43 @@ def settings(few_steps) -> SftCommand:
 
 
 @pytest.mark.slow
-def test_a_loss_that_is_no_number_stops_with_its_samples(settings, micro_store, tmp_path) -> None:
+def test_a_non_finite_loss_stops_the_run(settings, micro_store, tmp_path) -> None:
     too_fast = replace(settings, train=replace(settings.train, lr=1e30, warmup=0.0))
     with raises_user_error("non-finite-loss", contains="stopped.json"):
         sft.main.__wrapped__(too_fast, Run("run", tmp_path))
-    told = json.loads((tmp_path / "stopped.json").read_text())
-    named = {f"{item.item_id} (answer)" for item in micro_store.selection("train")}
-    assert len(told["samples"]) == 2
-    assert set(told["samples"]) <= named
+    samples = json.loads((tmp_path / "stopped.json").read_text())["samples"]
+    assert len(samples) == 2
+    assert set(samples) <= {f"{i.item_id} (answer)" for i in micro_store.selection("train")}
 
 
-class Spoilt(torch.autograd.Function):
-    """A loss that is a number, with a gradient that is none."""
+class NanGradient(torch.autograd.Function):
+    """A finite loss with a gradient of NaN."""
 
     @staticmethod
     def forward(ctx: Any, loss: torch.Tensor) -> torch.Tensor:
         return loss.clone()
 
     @staticmethod
-    def backward(ctx: Any, given: torch.Tensor) -> torch.Tensor:
-        return given * torch.nan
+    def backward(ctx: Any, gradient: torch.Tensor) -> torch.Tensor:
+        return gradient * torch.nan
 
 
 @pytest.mark.slow
-def test_a_gradient_that_is_no_number_stops_with_its_steps_samples(
-    settings, tmp_path, monkeypatch
-) -> None:
-    def spoilt(*given: Any, **named: Any) -> torch.Tensor:
-        return Spoilt.apply(token_mean(*given, **named))
+def test_a_non_finite_gradient_stops_the_run(few_steps, tmp_path, monkeypatch) -> None:
+    def loss(*args: Any, **options: Any) -> torch.Tensor:
+        return NanGradient.apply(token_mean(*args, **options))
 
-    monkeypatch.setattr("train.student.run.token_mean", spoilt)
+    monkeypatch.setattr("train.student.run.token_mean", loss)
+    settings = few_steps(regime="answer_only", batch=4, micro_batch=2)
     with raises_user_error("non-finite-gradient", contains="stopped.json"):
         sft.main.__wrapped__(settings, Run("run", tmp_path))
-    told = json.loads((tmp_path / "stopped.json").read_text())
-    assert len(told["samples"]) == settings.train.batch
+    assert len(json.loads((tmp_path / "stopped.json").read_text())["samples"]) == 4
     assert not list(tmp_path.glob("checkpoint-*"))
 
 
 @pytest.mark.slow
-def test_too_little_memory_is_told_with_the_key_to_lower(settings, tmp_path, monkeypatch) -> None:
-    def greedy(*_, **__) -> torch.Tensor:
-        return torch.empty(1 << 50)
-
-    monkeypatch.setattr("train.student.run.token_mean", greedy)
+def test_too_little_memory_names_the_settings_to_lower(settings, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("train.student.run.token_mean", lambda *_, **__: torch.empty(1 << 50))
     with raises_user_error("out-of-memory", contains="train.micro_batch"):
         sft.main.__wrapped__(settings, Run("run", tmp_path))
 
@@ -90,31 +83,52 @@ class OneMore:
 
 
 @pytest.mark.parametrize("regime", ["answer_only", "describe"])
-def test_nothing_is_trained_on_that_shows_a_held_out_scene(
-    settings, micro_store, frames, regime
-) -> None:
+def test_no_training_item_shows_a_held_out_scene(settings, micro_store, regime) -> None:
     held_out = held_out_scenes(micro_store)
     others = set(micro_store.scene_ids("train")) - held_out
     item = next(i for i in micro_store.selection("train") if shows_only(i, others))
-    stranger = replace(item.candidates[item.answer - 1], scene_id=next(iter(held_out)))
     candidates = list(item.candidates)
-    candidates[item.answer - 1] = stranger
+    distractor = replace(candidates[item.answer - 1], scene_id=next(iter(held_out)))
+    candidates[item.answer - 1] = distractor
     crossed = replace(item, item_id="crossed", candidates=tuple(candidates))
-    told = replace(settings, train=replace(settings.train, regime=regime))
-    plain, _ = load_datasets(told, micro_store, [])
-    more, _ = load_datasets(told, OneMore(micro_store, crossed), [])
-    again, _ = load_datasets(told, OneMore(micro_store, replace(item, item_id="again")), [])
-    assert len(plain) == len(more) < len(again)
+    settings = replace(settings, train=replace(settings.train, regime=regime))
+    plain, with_crossed, with_copy = (
+        load_datasets(settings, store, [])[0]
+        for store in (
+            micro_store,
+            OneMore(micro_store, crossed),
+            OneMore(micro_store, replace(item, item_id="copy")),
+        )
+    )
+    assert len(plain) == len(with_crossed) < len(with_copy)
+
+
+class Names:
+    """A store of scene names only."""
+
+    def __init__(self, names: list[str]) -> None:
+        self.names = names
+
+    def scene_ids(self, split: str) -> list[str]:
+        return self.names
+
+
+def test_whether_a_scene_is_held_out_depends_on_its_name_only() -> None:
+    names = [f"s0-{k:06d}" for k in range(2000)]
+    held_out = held_out_scenes(Names(names))
+    assert len(held_out) == pytest.approx(HELD_OUT * len(names), rel=0.15)
+    assert held_out_scenes(Names(names[:500])) == held_out & set(names[:500])
+    assert len(held_out_scenes(Names(names[:1]))) == 1
 
 
 @pytest.mark.parametrize(
-    ("visible", "rank", "kept"),
+    ("visible", "rank", "expected"),
     [("2,3", None, "2"), ("1", None, "1"), ("", None, ""), ("2,3", "0", "2,3")],
 )
-def test_a_run_keeps_to_one_gpu_unless_ranks_were_started(monkeypatch, visible, rank, kept) -> None:
+def test_a_run_without_ranks_uses_one_gpu(monkeypatch, visible, rank, expected) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     monkeypatch.delenv("LOCAL_RANK", raising=False)
     if rank is not None:
         monkeypatch.setenv("LOCAL_RANK", rank)
     gpus.restrict_to_one_gpu()
-    assert os.environ["CUDA_VISIBLE_DEVICES"] == kept
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == expected

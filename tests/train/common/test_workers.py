@@ -1,4 +1,4 @@
-"""Processes that prepare batches: what they make ahead, and how their errors end."""
+"""Processes that prepare batches: how many batches they prepare, and how their errors end."""
 
 from __future__ import annotations
 
@@ -9,61 +9,45 @@ from torch.utils.data import DataLoader
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.schema import SftCommand, SftTrainConfig
 from models.student.collator import Collator
 from models.student.prompts import selection_sample
 from tests.user_errors import raises_user_error
 from train import sft
-from train.common import arguments, training_loop
+from train.common.training_loop import user_message
+from train.student.run import prefetch_factor
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3, 5])
 @pytest.mark.parametrize("batches", [1, 2, 16])
-def test_the_next_step_is_made_ahead(workers, batches) -> None:
-    ahead = arguments.prefetch_factor(workers, batches)
+def test_workers_prepare_the_next_step(workers, batches) -> None:
+    ahead = prefetch_factor(workers, batches)
     assert ahead * workers >= batches
     assert ahead == 2 or (ahead - 1) * workers < batches
+    assert prefetch_factor(0, batches) is None
 
 
-def test_no_worker_makes_nothing_ahead() -> None:
-    assert arguments.prefetch_factor(0, 16) is None
-
-
-def test_a_workers_error_is_the_one_sentence(micro_store, frames, student_cfg, processor) -> None:
+def test_the_error_of_a_worker_loses_its_traceback(
+    micro_store, frames, student_cfg, processor
+) -> None:
     item = micro_store.selection("train")[0]
     samples = [selection_sample(item, "answer", "cot", frames, student_cfg.frames, "Answer: A")]
     collator = Collator(processor, 10)
     with pytest.raises(UserError) as alone:
         collator(samples)
-    with pytest.raises(UserError) as found:
+    with pytest.raises(UserError) as of_worker:
         next(iter(DataLoader(samples, collate_fn=collator, num_workers=1)))
-    # What the library makes of it, should it change, needs another look.
-    assert "Traceback" in str(found.value)
-    assert (
-        training_loop.user_message(found.value)
-        == training_loop.user_message(alone.value)
-        == str(alone.value)
-    )
+    assert "Traceback" in str(of_worker.value)
+    assert user_message(of_worker.value) == user_message(alone.value) == str(alone.value)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 1])
-def test_a_sample_that_is_too_long_ends_a_run_in_a_sentence(
-    micro, micro_store, nf4_cfg, tmp_path, monkeypatch, workers
-) -> None:
-    """The audit finds the longest by an estimate, and may pass by one that is longer."""
+def test_a_sample_that_is_too_long_ends_the_run(few_steps, tmp_path, monkeypatch, workers) -> None:
+    """The audit estimates lengths, and may miss the longest sample."""
     monkeypatch.setattr("train.student.run.audit", lambda *_: "")
-    settings = SftCommand(
-        benchmark=micro,
-        store=str(micro_store.folder.parent),
-        workers=1,
-        student=replace(nf4_cfg, max_length=150),
-        train=SftTrainConfig(
-            max_steps=1, micro_batch=1, gradient_checkpointing=False, regime="answer_only",
-            precision="fp32", validation_items=2, workers=workers,
-        ),
-    )  # fmt: skip
-    # A worker process loses the code.
+    settings = few_steps(regime="answer_only", workers=workers)
+    settings = replace(settings, student=replace(settings.student, max_length=150))
+    # The error of a worker process has lost its code.
     code = "user-error" if workers else "sample-too-long"
     with raises_user_error(code, contains="student.max_length=150"):
         sft.main.__wrapped__(settings, Run("run", tmp_path))

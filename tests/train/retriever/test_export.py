@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -31,6 +30,7 @@ from evaluation import retrieve
 from models import compat, loading
 from models.resolved import resolve_run
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
+from tests.children import run_child
 from tests.user_errors import raises_user_error
 from train import export
 
@@ -146,10 +146,9 @@ def test_the_library_alone_computes_the_same_embeddings(
     torch.save(data, tmp_path / "inputs.pt")
     kind = "one" if preset.late is None else "many"
     arguments = [forms["fp32"][1], tmp_path / "inputs.pt", tmp_path / "outputs.pt", kind]
-    subprocess.run(
-        [sys.executable, "-c", ELSEWHERE, *map(str, arguments)],
-        cwd=tmp_path, check=True, env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
-    )  # fmt: skip
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    ended = run_child([sys.executable, "-c", ELSEWHERE, *arguments], cwd=tmp_path, env=environment)
+    assert ended.returncode == 0, ended.stderr
     model = load_trained(preset, "fp32", runs / "contrastive" / "run" / "retriever")
     compat.keep_differentiable(model)
     wanted = model.encode_query(data["queries"]), model.encode_document(data["frames"])

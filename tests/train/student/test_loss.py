@@ -1,4 +1,4 @@
-"""Laws of what is supervised and how it is averaged."""
+"""Which tokens are supervised, how their losses are averaged, and how answers are measured."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from transformers import EvalPrediction
+from transformers import EvalPrediction, PreTrainedModel, ProcessorMixin
 
+from conf.schema import LoraConfig
 from data.records import FPS, SelectionItem, sample_prefix_frames
-from models.student.collator import IGNORED, Collator, encode, letter_ids, pad
+from models import loading
+from models.attention import BY_FRAME
+from models.student.collator import IGNORED, Collator, Encoded, encode, letter_ids, pad
 from models.student.prompts import Sample, selection_sample
 from tests.user_errors import raises_user_error
 from train.student.lazy_samples import LazySample, StudentDataset
@@ -18,19 +21,27 @@ from train.student.length_sampler import LengthSampler
 from train.student.metrics import LetterAccuracy, TokenAccuracy
 from train.student.trainer import token_mean
 
+# The attention of the language tower and of the vision tower.
+ATTENTIONS = {
+    "eager": "eager",
+    "sdpa": "sdpa",
+    "by frame": {"text_config": "sdpa", "vision_config": BY_FRAME},
+}
+
 
 @pytest.fixture
-def lines(micro_store, frames, student_cfg) -> list[Sample]:
-    """Samples of unequal length."""
+def samples(micro_store, frames, student_cfg) -> list[Sample]:
+    """Samples of unequal length; the last one has no clip."""
     items = micro_store.selection("train")[:3]
     texts = [
         "Answer: A",
         "Scene parse: stationary. " * 6 + "\nAnswer: B",
         "near the top\nAnswer: C",
     ]
+    controls = (None, None, "candidate_only")
     return [
-        selection_sample(i, "reasoning", "cot", frames, student_cfg.frames, t)
-        for i, t in zip(items, texts, strict=True)
+        selection_sample(i, "reasoning", "cot", frames, student_cfg.frames, t, c)
+        for i, t, c in zip(items, texts, controls, strict=True)
     ]
 
 
@@ -40,89 +51,118 @@ def loss_of(model, batch: dict, count: int | None = None) -> torch.Tensor:
     return token_mean(model(**batch, use_cache=False), labels, count)
 
 
-def test_supervised_is_the_response_and_nothing_else(lines, processor) -> None:
-    for line in lines:
-        encoded = encode(line, processor, 1500)
+def gradients(model: PreTrainedModel, loss: torch.Tensor) -> list[torch.Tensor]:
+    return torch.autograd.grad(loss, [p for p in model.parameters() if p.requires_grad])
+
+
+def right_padded(encoded: list[Encoded], processor: ProcessorMixin) -> dict:
+    """The left-padded batch, each row rolled until its padding is on the right."""
+    batch = pad(encoded, processor.tokenizer.pad_token_id)
+    longest = batch["input_ids"].shape[1]
+    for name in ("input_ids", "attention_mask", "mm_token_type_ids", "labels"):
+        rows = zip(batch[name], encoded, strict=True)
+        batch[name] = torch.stack([row.roll(len(one.input_ids) - longest) for row, one in rows])
+    return batch
+
+
+@pytest.mark.parametrize("attention", ATTENTIONS)
+def test_padding_changes_neither_loss_nor_gradients(samples, processor, model, attention) -> None:
+    model.set_attn_implementation(ATTENTIONS[attention])
+    torch.manual_seed(0)
+    model = loading.add_adapters(model, LoraConfig(rank=2))
+    with torch.no_grad():
+        # Gradients reach all adapters only if none is zero.
+        for name, weight in model.named_parameters():
+            if "lora_B" in name:
+                weight.normal_(std=0.1)
+    model.eval()
+    collate = Collator(processor, 1500)
+    encoded = [encode(s, processor, 1500) for s in samples]
+    assert len({len(e.input_ids) for e in encoded}) == len(samples)
+    count = sum(sum(label != IGNORED for label in e.labels) for e in encoded)
+    mean = sum(loss_of(model, collate([s]), 1) for s in samples) / count
+    expected = gradients(model, mean)
+    for batch in (collate(samples), right_padded(encoded, processor)):
+        assert int((batch["labels"] != IGNORED).sum()) == count
+        loss = loss_of(model, batch, count)
+        torch.testing.assert_close(loss, mean, atol=1e-5, rtol=0)
+        for one, two in zip(gradients(model, loss), expected, strict=True):
+            assert two.abs().max() > 1e-4
+            assert (one - two).norm() < 1e-3 * two.norm()
+
+
+def test_only_the_response_is_supervised(samples, processor) -> None:
+    for sample in samples:
+        encoded = encode(sample, processor, 1500)
         kept = [i for i, x in zip(encoded.input_ids, encoded.labels, strict=True) if x != IGNORED]
-        assert processor.tokenizer.decode(kept) == line.response + "<|im_end|>"
-        prompt = encode(replace(line, response=None), processor, 1500)
+        assert processor.tokenizer.decode(kept) == sample.response + "<|im_end|>"
+        prompt = encode(replace(sample, response=None), processor, 1500)
         assert encoded.input_ids[: len(prompt.input_ids)] == prompt.input_ids
 
 
-def test_one_sample_alone_weighs_as_in_a_padded_batch(lines, processor, model) -> None:
+def test_accumulated_gradients_are_those_of_the_big_batch(samples, processor, model) -> None:
     collate = Collator(processor, 1500)
-    counts = [int((collate([s])["labels"] != IGNORED).sum()) for s in lines]
-    alone = sum(loss_of(model, collate([s])) * n for s, n in zip(lines, counts, strict=True)) / sum(
-        counts
-    )
-    torch.testing.assert_close(loss_of(model, collate(lines)), alone, atol=1e-5, rtol=0)
-
-
-def test_accumulated_gradients_are_those_of_the_big_batch(lines, processor, model) -> None:
-    collate = Collator(processor, 1500)
-    loss_of(model, collate(lines)).backward()
+    loss_of(model, collate(samples)).backward()
     whole = [p.grad.clone() for p in model.parameters() if p.grad is not None]
     model.zero_grad()
-    count = sum(int((collate([s])["labels"] != IGNORED).sum()) for s in lines)
-    for group in (lines[:1], lines[1:]):
+    count = sum(int((collate([s])["labels"] != IGNORED).sum()) for s in samples)
+    for group in (samples[:1], samples[1:]):
         loss_of(model, collate(group), count).backward()
     parts = [p.grad for p in model.parameters() if p.grad is not None]
     for one, two in zip(whole, parts, strict=True):
         torch.testing.assert_close(one, two, atol=1e-6, rtol=1e-3)
 
 
-def test_kept_rows_give_the_loss_of_all_rows(lines, processor, model) -> None:
-    batch = pad([encode(s, processor, 1500) for s in lines], processor.tokenizer.pad_token_id)
+def test_logits_of_supervised_positions_give_the_loss_of_all(samples, processor, model) -> None:
+    batch = pad([encode(s, processor, 1500) for s in samples], processor.tokenizer.pad_token_id)
     labels = batch.pop("labels")
     logits = model(**batch, use_cache=False).logits
     full = torch.nn.functional.cross_entropy(
         logits[:, :-1].flatten(0, 1), labels[:, 1:].flatten(), ignore_index=IGNORED
     )
-    torch.testing.assert_close(loss_of(model, Collator(processor, 1500)(lines)), full)
+    torch.testing.assert_close(loss_of(model, Collator(processor, 1500)(samples)), full)
 
 
-def test_the_prompt_holds_every_shown_frame_at_its_true_time(
-    micro_store, frames, student_cfg, processor
-) -> None:
+def test_the_prompt_has_each_frame_at_its_time(micro_store, frames, student_cfg, processor) -> None:
     item = micro_store.selection("train")[0]
     encoded = encode(
         selection_sample(item, "answer", "cot", frames, student_cfg.frames), processor, 1500
     )
     assert encoded.media["video_grid_thw"].tolist() == [[6, 6, 6]]
     assert encoded.media["image_grid_thw"].tolist() == [[1, 6, 6]] * 4
-    shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, 12)
-    times = [(a + b) / 2 / FPS for a, b in zip(shown[::2], shown[1::2], strict=True)]
+    visible = sample_prefix_frames(item.prefix_start, item.prefix_stop, 12)
+    times = [(a + b) / 2 / FPS for a, b in zip(visible[::2], visible[1::2], strict=True)]
     text = processor.tokenizer.decode(encoded.input_ids)
     at = 0
     for time in times:
         at = text.index(f"<{time:.1f} seconds>", at) + 1
 
 
-def test_a_sample_over_the_limit_is_refused_with_its_length(lines, processor) -> None:
-    length = len(encode(lines[1], processor, 1500).input_ids)
-    encode(lines[1], processor, length)
+def test_a_sample_over_the_limit_is_refused(samples, processor) -> None:
+    length = len(encode(samples[1], processor, 1500).input_ids)
+    encode(samples[1], processor, length)
     with raises_user_error("sample-too-long", contains=(str(length), "student.max_length")):
-        encode(lines[1], processor, length - 1)
+        encode(samples[1], processor, length - 1)
 
 
-def test_lengths_rank_samples_without_making_them(
+def test_lengths_are_estimated_without_rendering(
     micro_store, frames, student_cfg, processor
 ) -> None:
     def refuse(epoch: int) -> Sample:
-        raise AssertionError("a sample was made")
+        raise AssertionError("a sample was rendered")
 
     items = micro_store.selection("train")[:4]
     texts = ["near the top " * words + "\nAnswer: A" for words in (3, 9, 27, 1)]
-    made = StudentDataset([LazySample(text, 10, refuse) for text in texts])
-    guessed = made.lengths(processor.tokenizer, 96)
+    samples = StudentDataset([LazySample(text, 10, refuse) for text in texts])
+    estimated = samples.lengths(processor.tokenizer, 96)
     real = [
-        len(encode(lines, processor, 1500).input_ids)
-        for lines in (
+        len(encode(sample, processor, 1500).input_ids)
+        for sample in (
             selection_sample(i, "answer", "cot", frames, student_cfg.frames, t)
             for i, t in zip(items, texts, strict=True)
         )
     ]
-    assert np.argsort(guessed).tolist() == np.argsort(real).tolist()
+    assert np.argsort(estimated).tolist() == np.argsort(real).tolist()
 
 
 def test_the_letters_logits_choose_the_answer(
@@ -144,38 +184,19 @@ def test_the_letters_logits_choose_the_answer(
     chosen, right = LetterAccuracy(letters).reduce(logits, labels).T
     assert right.tolist() == [i.answer for i in items]
     assert (chosen == right).tolist() == [False] + [True] * 5
-    measured = StudentDataset(
+    samples = StudentDataset(
         [LazySample("", 0, lambda epoch: None, f) for f in ("event",) * 4 + ("time",) * 2]
     )
-    told = LetterAccuracy.measure(
-        EvalPrediction(torch.stack([chosen, right], dim=1).numpy(), None), measured
+    metrics = LetterAccuracy.measure(
+        EvalPrediction(torch.stack([chosen, right], dim=1).numpy(), None), samples
     )
-    assert told == {
+    assert metrics == {
         "letter_accuracy": 5 / 6, "letter_accuracy_event": 3 / 4, "letter_accuracy_time": 1.0
     }  # fmt: skip
 
 
-def test_controls_reach_the_prompt(micro_store, frames, student_cfg, processor) -> None:
-    item = micro_store.selection("test")[0]
-    plain, alone, shuffled = (
-        encode(
-            selection_sample(item, "answer", "cot", frames, student_cfg.frames, control=control),
-            processor,
-            1500,
-        )
-        for control in (None, "candidate_only", "shuffled_prefix")
-    )
-    assert "pixel_values_videos" not in alone.media
-    assert len(alone.input_ids) < len(plain.input_ids)
-    # The same times are told of the same frames in another order.
-    assert shuffled.input_ids == plain.input_ids
-    pixels = [e.media["pixel_values_videos"] for e in (plain, shuffled)]
-    assert pixels[0].shape == pixels[1].shape
-    assert not torch.equal(*pixels)
-
-
 @pytest.mark.parametrize("count", [1, 7, 64, 1000])
-def test_an_order_is_of_its_epoch_and_sorts_each_step(count) -> None:
+def test_each_step_is_sorted_by_length(count) -> None:
     lengths = np.random.default_rng(0).integers(1, 1000, count)
     order = LengthSampler(lengths.tolist(), 16, seed=0)
     first = list(order)
@@ -186,7 +207,7 @@ def test_an_order_is_of_its_epoch_and_sorts_each_step(count) -> None:
     order.set_epoch(1)
     second = list(order)
     assert sorted(second) == list(range(count))
-    # One step alone is sorted into one order.
+    # The samples of a single step have one order.
     assert first != second or count <= 16
     assert second != list(LengthSampler(lengths.tolist(), 16, seed=1)) or count <= 16
 
@@ -194,10 +215,10 @@ def test_an_order_is_of_its_epoch_and_sorts_each_step(count) -> None:
 def test_the_right_tokens_are_counted() -> None:
     labels = torch.tensor([[5, 6, 7, 8], [IGNORED, IGNORED, 7, 8]])
     logits = torch.nn.functional.one_hot(torch.tensor([[6, 7, 0, 0], [3, 7, 8, 0]]), 10).float()
-    choice = TokenAccuracy({"color": [6, 9], "shape": [8], "place": [9]})
-    counts = choice.reduce(logits, labels)
-    # A position's logits tell the next one's token; what is not supervised is not counted.
+    accuracy = TokenAccuracy({"color": [6, 9], "shape": [8], "place": [9]})
+    counts = accuracy.reduce(logits, labels)
+    # The logits of a position predict the next token; unsupervised tokens are not counted.
     assert counts[:, :2].tolist() == [[2, 3], [2, 2]]
-    told = choice.measure(EvalPrediction(counts.numpy(), None), StudentDataset([]))
-    # No word of the last kind stands there.
-    assert told == {"token_accuracy": 4 / 5, "color_accuracy": 1, "shape_accuracy": 1 / 2}
+    metrics = accuracy.measure(EvalPrediction(counts.numpy(), None), StudentDataset([]))
+    # There is no word of the last kind.
+    assert metrics == {"token_accuracy": 4 / 5, "color_accuracy": 1, "shape_accuracy": 1 / 2}

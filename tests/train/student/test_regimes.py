@@ -1,13 +1,11 @@
-"""Each regime's responses, which stay right in every order of the candidates."""
+"""The responses of each regime, which stay correct in every order of the candidates."""
 
 from __future__ import annotations
-
-from functools import partial
 
 import pytest
 
 from conf.schema import TeacherConfig
-from conf.schema.training import REGIMES
+from conf.schema.training import REGIMES, WITHOUT_RATIONALES
 from data.records import LETTERS
 from data.store import Store
 from models.student.answer_parser import parse_choice
@@ -17,12 +15,11 @@ from teacher.predicates import extract_predicates
 from teacher.sections import SECTIONS, split_sections
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
-from train.common.held_out import HELD_OUT, held_out_scenes
-from train.student.dataset import Supervised, load_supervised, supervised_items
-from train.student.lazy_samples import LazySample, StudentDataset
+from train.student.dataset import Supervised, supervised_items
+from train.student.lazy_samples import StudentDataset
 
 TEACHER = TeacherConfig(name="template")
-COT = [r for r in REGIMES if r not in ("answer_only", "describe")]
+COT = [r for r in REGIMES if r not in WITHOUT_RATIONALES]
 
 
 def items_of(store: Store, regime: str) -> dict[str, list[Supervised]]:
@@ -31,18 +28,17 @@ def items_of(store: Store, regime: str) -> dict[str, list[Supervised]]:
 
 
 @pytest.mark.parametrize("regime", COT)
-def test_a_regime_leaves_out_its_part_only(micro_store, regime) -> None:
+def test_a_regime_leaves_out_only_its_part(micro_store, regime) -> None:
     supervised = items_of(micro_store, regime)["reasoning"]
     assert supervised
+    left_out = {"Candidate analysis"} if regime == "cot_no_candidate_analysis" else set()
     for s in supervised:
-        text = s.response
-        headings = [name for name, _, _ in split_sections(text)]
-        left_out = {"Candidate analysis"} if regime == "cot_no_candidate_analysis" else set()
+        headings = [name for name, _, _ in split_sections(s.response)]
         assert headings == [*(name for name in SECTIONS if name not in left_out), "Answer"]
         for name, start, stop in split_sections(s.rationale):
             if name not in ("Answer", *left_out):
-                assert s.rationale[start:stop].strip() in text
-        lines = text.splitlines()
+                assert s.rationale[start:stop].strip() in s.response
+        lines = s.response.splitlines()
         candidates = [line.split()[1] for line in lines if line.startswith("Candidate ") and
                    not line.startswith("Candidate analysis")]  # fmt: skip
         assert candidates == ([] if regime == "cot_no_match_layout" else list(LETTERS))
@@ -60,27 +56,25 @@ def test_both_modes_are_trained_with_the_same_answer(micro_store, regime) -> Non
         assert instruction(s.mode, regime) != instruction("answer", regime)
 
 
-def test_responses_are_right_in_every_epochs_order(micro_store) -> None:
+def test_permuted_responses_are_correct(micro_store) -> None:
     """For every item in the orders of several epochs, the validator accepts the rationale, the
     match lines agree with the predicates, and the answer is the same frame."""
     by_mode = items_of(micro_store, "cot")
     orders = set()
     for s in by_mode["reasoning"] + by_mode["answer"]:
-        right = s.item.candidates[s.item.answer]
+        target = s.item.candidates[s.item.answer]
         for epoch in range(4):
             permuted = s.permuted(0, epoch)
             item = permuted.item
-            assert item.candidates[item.answer] == right
+            assert item.candidates[item.answer] == target
             assert sorted(item.candidates, key=repr) == sorted(s.item.candidates, key=repr)
-            assert parse_choice(permuted.response).letter == LETTERS[item.candidates.index(right)]
+            assert parse_choice(permuted.response).letter == LETTERS[item.candidates.index(target)]
             orders.add(tuple(s.item.candidates.index(c) for c in item.candidates))
             if s.mode == "reasoning":
-                predicates = extract_predicates(
-                    item, micro_store.scene(item.scene_id), micro_store.scene
-                )
-                assert (
-                    validate_rationale(permuted.rationale, predicates, item, TEACHER).reasons == ()
-                )
+                scene = micro_store.scene(item.scene_id)
+                predicates = extract_predicates(item, scene, micro_store.scene)
+                checked = validate_rationale(permuted.rationale, predicates, item, TEACHER)
+                assert checked.reasons == ()
                 matching = [line for line in permuted.matches if " matches: " in line]
                 assert [line.split()[1] for line in matching] == [item.letter]
                 assert [line.split()[1] for line in permuted.matches] == list(LETTERS)
@@ -91,49 +85,21 @@ def test_responses_are_right_in_every_epochs_order(micro_store) -> None:
     assert len(orders) == 24
 
 
-def test_an_order_depends_on_seed_epoch_and_item(micro_store) -> None:
-    first, second = items_of(micro_store, "answer_only")["answer"][:2]
+def test_an_order_depends_on_seed_epoch_and_item(micro_store, frames, student_cfg) -> None:
+    supervised = items_of(micro_store, "answer_only")["answer"]
 
     def orders(s: Supervised, seed: int = 0) -> list[list[int]]:
         permuted = [s.permuted(seed, epoch).item.candidates for epoch in range(8)]
         return [[s.item.candidates.index(c) for c in candidates] for candidates in permuted]
 
-    assert orders(first) == orders(first)
-    assert len(set(map(tuple, orders(first)))) > 1
-    assert orders(first) != orders(first, seed=1)
-    assert orders(first) != orders(second)
-
-
-def test_samples_follow_the_epoch(micro_store, frames, student_cfg) -> None:
-    supervised = items_of(micro_store, "answer_only")["answer"]
-    count = student_cfg.frames
-    lazy = [
-        LazySample(s.text, 1, partial(load_supervised, s, frames, count, 0)) for s in supervised
-    ]
-    dataset = StudentDataset(lazy)
-    responses = []
-    for epoch in range(4):
-        dataset.set_epoch(epoch)
-        responses.append([dataset[k].response for k in range(len(dataset))])
-        assert responses[-1] == [s.permuted(0, epoch).response for s in supervised]
-    assert responses[0] != responses[1]
-    unpermuted = load_supervised(supervised[0], frames, count, None, 3)
-    assert unpermuted.response == supervised[0].response
-
-
-class Names:
-    """A store of scene names only."""
-
-    def __init__(self, names: list[str]) -> None:
-        self.names = names
-
-    def scene_ids(self, split: str) -> list[str]:
-        return self.names
-
-
-def test_whether_a_scene_is_held_out_depends_on_its_name_only() -> None:
-    names = [f"s0-{k:06d}" for k in range(2000)]
-    held_out = held_out_scenes(Names(names))
-    assert len(held_out) == pytest.approx(HELD_OUT * len(names), rel=0.15)
-    assert held_out_scenes(Names(names[:500])) == held_out & set(names[:500])
-    assert len(held_out_scenes(Names(names[:1]))) == 1
+    first, second, *_ = map(orders, supervised)
+    assert first == orders(supervised[0])
+    assert len(set(map(tuple, first))) > 1
+    assert first != orders(supervised[0], seed=1)
+    assert first != second
+    for seed in (0, None):
+        dataset = StudentDataset([s.lazy(frames, student_cfg.frames, seed) for s in supervised])
+        dataset.set_epoch(1)
+        for k, s in enumerate(supervised):
+            expected = s if seed is None else s.permuted(seed, 1)
+            assert dataset[k].response == expected.response

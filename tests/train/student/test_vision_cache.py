@@ -16,8 +16,7 @@ from models.student.prompts import Clip, Sample, conversation, selection_sample
 from tests.user_errors import raises_user_error
 from train import sft
 from train.common.journal import read_journal
-from train.student.regimes import TrainerCollator
-from train.student.trainer import token_mean
+from train.student.trainer import TrainerCollator, token_mean
 from train.student.vision_cache import SLICES, VisionCache, slice_digests
 
 PLENTY = 1 << 40
@@ -31,7 +30,7 @@ def student(nf4_cfg):
 
 
 @pytest.fixture
-def lines(micro_store, frames, student_cfg) -> list[Sample]:
+def samples(micro_store, frames, student_cfg) -> list[Sample]:
     """Two items with clips, one without its clip, and the first again."""
     items = micro_store.selection("train")[:3]
     samples = [
@@ -44,17 +43,17 @@ def lines(micro_store, frames, student_cfg) -> list[Sample]:
     return [*samples, samples[0]]
 
 
-def passed(
-    model: nn.Module, collator: TrainerCollator, lines: list[Sample], features: VisionCache | None
+def loss_and_gradients(
+    model: nn.Module, collator: TrainerCollator, samples: list[Sample], cache: VisionCache | None
 ):
     """The loss of a batch, and the gradient of every adapter."""
-    batch = collator(lines)
+    batch = collator(samples)
     batch.pop("sample_ids")
     labels = batch.pop("labels")
-    if features is None:
+    if cache is None:
         batch.pop(SLICES)
     else:
-        features.replace_pixels(batch)
+        cache.replace_pixels(batch)
         assert not {"pixel_values", "pixel_values_videos", SLICES} & batch.keys()
     model.zero_grad()
     loss = token_mean(model(**batch), labels)
@@ -64,16 +63,9 @@ def passed(
     }
 
 
-def same(one, two) -> None:
-    torch.testing.assert_close(one[0], two[0], atol=1e-6, rtol=0)
-    assert one[1].keys() == two[1].keys()
-    for name, gradient in one[1].items():
-        torch.testing.assert_close(gradient, two[1][name], atol=1e-6, rtol=0)
-
-
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.0])
-def test_loss_and_gradients_are_those_of_the_pixels(student, lines, share) -> None:
-    """Also where the cache has room for a share of the features only."""
+def test_loss_and_gradients_are_those_of_the_pixels(student, samples, share) -> None:
+    """Also if the cache has room for a share of the features only."""
     model, processor = student
     # Adapters start at zero, where many gradients vanish.
     for name, weight in model.named_parameters():
@@ -81,45 +73,50 @@ def test_loss_and_gradients_are_those_of_the_pixels(student, lines, share) -> No
             nn.init.normal_(weight, std=0.1)
     collator = TrainerCollator(Collator(processor, 1500), digests=True)
     whole = VisionCache(model, "fp32", PLENTY)
-    plain = passed(model, collator, lines, None)
+    plain = loss_and_gradients(model, collator, samples, None)
     assert max(g.abs().max() for g in plain[1].values()) > 1e-3
-    same(passed(model, collator, lines, whole), plain)
+    close = {"atol": 1e-6, "rtol": 0}
+    torch.testing.assert_close(loss_and_gradients(model, collator, samples, whole), plain, **close)
     part = VisionCache(model, "fp32", int(share * whole.bytes))
-    for batch in (lines, lines, lines[1:3], lines[2:3], lines[:1]):
-        same(passed(model, collator, batch, part), passed(model, collator, batch, None))
+    for batch in (samples, samples, samples[1:3], samples[2:3], samples[:1]):
+        torch.testing.assert_close(
+            loss_and_gradients(model, collator, batch, part),
+            loss_and_gradients(model, collator, batch, None),
+            **close,
+        )
     assert part.bytes <= share * whole.bytes
     assert share < 1 or part.bytes == whole.bytes
 
 
-def test_cached_slices_do_not_pass_the_tower(student, lines) -> None:
+def test_cached_slices_do_not_pass_the_tower(student, samples) -> None:
     model, processor = student
     collator = TrainerCollator(Collator(processor, 1500), digests=True)
-    features = VisionCache(model, "fp32", PLENTY)
+    cache = VisionCache(model, "fp32", PLENTY)
     seen = []
     model.get_base_model().model.visual.register_forward_pre_hook(
         lambda _, inputs: seen.append(len(inputs[0]))
     )
-    passed(model, collator, lines[:2], features)
-    slices = slice_digests(lines[:2])
+    loss_and_gradients(model, collator, samples[:2], cache)
+    slices = slice_digests(samples[:2])
     # 96 px are six patches of 16 px.
     assert seen == [36 * len(set(slices))]
-    passed(model, collator, [lines[1], lines[0]], features)
+    loss_and_gradients(model, collator, [samples[1], samples[0]], cache)
     assert len(seen) == 1
 
 
 def test_digests_depend_on_the_pixels_only(micro_store, frames, student_cfg, processor) -> None:
     one, two, three = (frames.array(micro_store.scene_ids("train")[0], k) for k in (0, 40, 80))
 
-    def shown(images, clip=()):
+    def digests(images, clip=()):
         clip = Clip(np.asarray(clip), list(range(len(clip)))) if len(clip) else None
         return slice_digests([conversation("", images, None, clip)])
 
-    assert len(set(shown([one, two, one]))) == 2
-    assert shown([one]) == shown([one.copy()]) != shown([two])
-    pairs = shown([], np.stack([one, two, two, one, three]))
+    assert len(set(digests([one, two, one]))) == 2
+    assert digests([one]) == digests([one.copy()]) != digests([two])
+    pairs = digests([], np.stack([one, two, two, one, three]))
     assert len(set(pairs)) == 3
     # An odd last frame is repeated, as an image is.
-    assert pairs[-1:] == shown([three])
+    assert pairs[-1:] == digests([three])
 
 
 def test_a_trained_tower_is_refused(model) -> None:
@@ -129,7 +126,7 @@ def test_a_trained_tower_is_refused(model) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 1])
-def test_a_run_learns_the_same(few_steps, tmp_path, workers) -> None:
+def test_a_run_with_the_cache_is_the_same(few_steps, tmp_path, workers) -> None:
     """Over two epochs, evaluations included."""
     journals = []
     for reuse in (False, True):
