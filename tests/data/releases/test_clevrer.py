@@ -81,18 +81,12 @@ def test_an_annotation_without_the_published_layout_is_refused(tmp_path: Path, d
         clevrer.read_scene(path, tmp_path, "test")
 
 
-@pytest.mark.parametrize(
-    ("text", "code"),
-    [
-        ("", "damaged-file"),
-        ("[]", "invalid-record"),
-        (json.dumps(clevrer_annotation())[:4000], "damaged-file"),
-    ],
-)
-def test_a_broken_annotation_is_refused(tmp_path: Path, text: str, code: str) -> None:
-    path, _ = write_clevrer_scene(tmp_path, text, 10800)
-    with raises_user_error(code, contains="annotation_10800.json"):
-        clevrer.read_scene(path, tmp_path, "test")
+def test_a_broken_annotation_is_refused(tmp_path: Path) -> None:
+    cut = json.dumps(clevrer_annotation())[:4000]
+    for text, code in (("", "damaged-file"), (cut, "damaged-file"), ("[]", "invalid-record")):
+        path, _ = write_clevrer_scene(tmp_path, text, 10800)
+        with raises_user_error(code, contains="annotation_10800.json"):
+            clevrer.read_scene(path, tmp_path, "test")
 
 
 def test_an_incomplete_video_is_refused(tmp_path: Path) -> None:
@@ -109,14 +103,9 @@ def test_an_incomplete_video_is_refused(tmp_path: Path) -> None:
         clevrer.read_scene(path, tmp_path, "test")
 
 
-def test_a_folder_without_scenes_is_refused(tmp_path: Path) -> None:
+def test_scenes_are_listed_in_order_and_once(tmp_path: Path) -> None:
     with raises_user_error("empty-release", contains="annotation_train/"):
         clevrer.list_scenes(tmp_path)
-    with raises_user_error("missing-folder", contains="nowhere"):
-        clevrer.list_scenes(tmp_path / "nowhere")
-
-
-def test_scenes_are_listed_in_order_and_once(tmp_path: Path) -> None:
     for index in (1200, 3, 10):
         write_clevrer_scene(tmp_path / "original", clevrer_annotation(index), index, 1)
     names = [path.stem for path in clevrer.list_scenes(tmp_path / "original")]
