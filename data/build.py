@@ -14,7 +14,7 @@ from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
 from conf.schema import BenchmarkConfig, BuildCommand
 from data.parallel import Workers
-from data.partial_build import find_change, lock_partial_build
+from data.partial_build import check_same_settings, lock_partial_build
 from data.render.prerender import RECORD, prerender_frames
 from data.store import (
     FRAMES_FOLDER,
@@ -69,12 +69,12 @@ def ensure_items(cfg: BenchmarkConfig, root: Path, workers: Workers, strict: boo
     if not folder.exists():
         build(cfg, folder, workers, strict)
     store = open_store(folder)
-    _check_same_settings(store, cfg)
-    if cfg.folder is not None:
-        # The release may have moved since the build.
-        config = store.manifest["config"] | {"folder": cfg.folder}
-        store = replace(store, manifest=store.manifest | {"config": config})
-    return store
+    # The release may have moved since the build.
+    config = store.manifest["config"] | ({"folder": cfg.folder} if cfg.folder else {})
+    check_same_settings(
+        {"benchmark": config}, {"benchmark": asdict(cfg) | {"folder": config["folder"]}}, folder
+    )
+    return replace(store, manifest=store.manifest | {"config": config})
 
 
 def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = False) -> None:
@@ -145,16 +145,6 @@ def check_names(cfg: BenchmarkConfig) -> None:
     ]
     if problems:
         raise SettingsError("\n".join(problems), code="unknown-option")
-
-
-def _check_same_settings(store: Store, cfg: BenchmarkConfig) -> None:
-    if change := find_change(store.manifest["config"], asdict(cfg), ignored={"folder"}):
-        key, built, requested = change
-        raise UserError(
-            f"{store.folder} was built with benchmark.{key}={built}, but the command has "
-            f"{requested}: choose another name with benchmark.name=NAME, or delete {store.folder}",
-            code="different-settings",
-        )
 
 
 if __name__ == "__main__":

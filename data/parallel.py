@@ -83,14 +83,10 @@ class Workers:
         if self.engine == "ray":
             _join_cluster(self.count)
             # Ray's backend cannot return results one by one.
-            parallel = Parallel(self.count, backend="ray")
+            options = {}
         else:
-            parallel = Parallel(
-                self.count,
-                backend="loky",
-                return_as="generator_unordered",
-                initializer=_exit_with_parent,
-            )
+            options = {"return_as": "generator_unordered", "initializer": _exit_with_parent}
+        parallel = Parallel(self.count, backend=self.engine, **options)
         # Loky restarts a worker whose memory grows, which caching scenes causes.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs")
         for batch in batched(list(jobs.items()), CHUNK * self.count):

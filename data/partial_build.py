@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from conf.errors import UserError
-from conf.runs import wait_for_lock
+from conf.runs import flatten, wait_for_lock
 from conf.schema import BenchmarkConfig
 from data.records import SPLITS
 from data.store import PLAN, write_atomically
@@ -42,7 +42,13 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
     """
     partial = folder.with_name(f".{folder.name}.partial")
     partial.mkdir(parents=True, exist_ok=True)
-    plan = _plan(cfg)
+    plan = {
+        "generator": generator_version(cfg.standin),
+        "benchmark": {key: getattr(cfg, key) for key in SCENE_SETTINGS},
+        "counterfactual scenes": {
+            split: getattr(cfg.retrieval.counterfactual, split) > 0 for split in SPLITS
+        },
+    }
     handle = os.open(partial, os.O_RDONLY)
     try:
         wait_for_lock(handle, f"{folder} is being built by another process")
@@ -51,7 +57,8 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
             yield None
             return
         if (partial / PLAN).exists():
-            _check_same_plan(json.loads((partial / PLAN).read_text()), plan, partial)
+            # Scenes take hours to simulate, so a changed setting does not discard them silently.
+            check_same_settings(json.loads((partial / PLAN).read_text()), plan, partial)
         for leftover in partial.rglob(".*.partial"):
             leftover.unlink()
         write_atomically(partial / PLAN, json.dumps(plan).encode())
@@ -60,42 +67,17 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
         os.close(handle)
 
 
-def _plan(cfg: BenchmarkConfig) -> dict[str, Any]:
-    absent = {split: getattr(cfg.retrieval.counterfactual, split) > 0 for split in SPLITS}
-    return {
-        "generator": generator_version(cfg.standin),
-        "benchmark": {key: getattr(cfg, key) for key in SCENE_SETTINGS},
-        "counterfactual scenes": absent,
-    }
-
-
-def _check_same_plan(old: dict[str, Any], new: dict[str, Any], partial: Path) -> None:
-    """Scenes take hours to simulate, so a changed setting does not discard them silently."""
-    if change := find_change(old, new):
-        key, started, requested = change
-        raise UserError(
-            f"{partial} holds an unfinished build with {key}={started}, but the command has "
-            f"{requested}: resume that build with its setting, choose another name with "
-            f"benchmark.name=NAME, or delete {partial}",
-            code="different-settings",
-        )
-
-
-def find_change(
-    old: dict[str, Any], new: dict[str, Any], ignored: Collection[str] = ()
-) -> tuple[str, Any, Any] | None:
-    """The first dotted key whose value differs between nested settings, with both values."""
-    before, after = _flatten(old), _flatten(new)
+def check_same_settings(old: dict[str, Any], new: dict[str, Any], folder: Path) -> None:
+    """Raises UserError where a key differs between the nested settings of two builds."""
+    before, after = (
+        {key: value for key, value in flatten(settings).items() if value != {}}
+        for settings in (old, new)
+    )
     for key in before | after:
-        if key not in ignored and before.get(key) != after.get(key):
-            return key, before.get(key), after.get(key)
-    return None
-
-
-def _flatten(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by dotted key."""
-    flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        name = f"{prefix}{key}"
-        flat |= _flatten(value, f"{name}.") if isinstance(value, dict) else {name: value}
-    return flat
+        if before.get(key) != after.get(key):
+            raise UserError(
+                f"{folder} was built with {key}={before.get(key)}, but the command has "
+                f"{after.get(key)}: use the earlier setting, choose another name with "
+                f"benchmark.name=NAME, or delete {folder}",
+                code="different-settings",
+            )

@@ -7,9 +7,13 @@ column names of the released files, such as `selection.parquet`.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
 
 FRAMES = 128
 """Frames per scene (CLEVRER's clip length)."""
@@ -116,13 +120,9 @@ class Scene:
 
     def __post_init__(self) -> None:
         frames, count = self.positions.shape[:2]
-        for name in self.ARRAYS:
-            shape = getattr(self, name).shape
-            if shape[:2] != (frames, count):
-                raise ValueError(
-                    f"scene {self.scene_id}: {name} has shape {shape}, "
-                    f"expected ({frames}, {count}, ...)"
-                )
+        shapes = {name: getattr(self, name).shape for name in self.ARRAYS}
+        if any(shape[:2] != (frames, count) for shape in shapes.values()):
+            raise ValueError(f"scene {self.scene_id}: the shapes of its arrays differ: {shapes}")
         if len(self.objects) != count:
             raise ValueError(
                 f"scene {self.scene_id}: {len(self.objects)} objects, but states of {count}"
@@ -160,8 +160,27 @@ class Candidate(FrameRef):
     source: str = "target"
 
 
+class Record:
+    """A dataclass that is a row of a table."""
+
+    def to_row(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_row(cls, row: dict[str, Any]) -> Self:
+        """Raises ValueError where a value is missing or has another type."""
+        return _adapter(cls).validate_python(row)
+
+
+@cache
+def _adapter(record: type[Record]) -> TypeAdapter:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(record)
+
+
 @dataclass(frozen=True)
-class SelectionItem:
+class SelectionItem(Record):
     """A question with four candidate frames, one of which is the target.
 
     `prefix_start` and `prefix_stop` are inclusive. A construction axis that does not apply is None.
@@ -216,17 +235,9 @@ class SelectionItem:
         """The key in logs and caches."""
         return self.item_id
 
-    def to_row(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @classmethod
-    def from_row(cls, row: dict[str, Any]) -> SelectionItem:
-        candidates = tuple(Candidate(**c) for c in row["candidates"])
-        return cls(**{**row, "candidates": candidates})
-
 
 @dataclass(frozen=True)
-class RetrievalQuery:
+class RetrievalQuery(Record):
     """A prefix and a question whose answer is one frame of a database."""
 
     query_id: str
@@ -239,7 +250,7 @@ class RetrievalQuery:
     prefix_start: int
     prefix_stop: int
     target: FrameRef
-    hard_negatives: tuple[FrameRef, ...]
+    hard_negatives: tuple[FrameRef, ...] = ()
     removed_object: str | None = None
     standard: bool = False
     """Whether the query belongs to the standard test."""
@@ -249,17 +260,9 @@ class RetrievalQuery:
         """The key in logs and caches."""
         return self.query_id
 
-    def to_row(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @classmethod
-    def from_row(cls, row: dict[str, Any]) -> RetrievalQuery:
-        negatives = tuple(FrameRef(**f) for f in row["hard_negatives"])
-        return cls(**{**row, "target": FrameRef(**row["target"]), "hard_negatives": negatives})
-
 
 @dataclass(frozen=True)
-class Rationale:
+class Rationale(Record):
     """One response of a teacher for one item, accepted or rejected with reasons."""
 
     item_id: str
@@ -289,18 +292,8 @@ class Rationale:
     claims: dict[str, list[int]] = field(default_factory=dict)
     """Counts of supported, contradicted and undecided claims, by kind of claim."""
 
-    def to_row(self) -> dict[str, Any]:
-        return {**asdict(self), "reasons": list(self.reasons)}
-
-    @classmethod
-    def from_row(cls, row: dict[str, Any]) -> Rationale:
-        return cls(**{**row, "reasons": tuple(row["reasons"])})
-
 
 def sample_prefix_frames(start: int, stop: int, count: int) -> list[int]:
     """Sample `count` frames of the inclusive range [start, stop], evenly and with both ends; all
     frames where the range has no more."""
-    available = stop - start + 1
-    if available <= count:
-        return list(range(start, stop + 1))
-    return [int(f) for f in np.linspace(start, stop, count).round()]
+    return [int(f) for f in np.linspace(start, stop, min(count, stop - start + 1)).round()]

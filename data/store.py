@@ -29,7 +29,6 @@ from typing import Any
 import numpy as np
 
 from conf.errors import UserError
-from data import render
 from data.records import (
     Collision,
     FrameRef,
@@ -39,6 +38,7 @@ from data.records import (
     SceneObject,
     SelectionItem,
 )
+from data.render import RENDERERS
 from data.tracks.selection.distractors import BUILDERS_VERSION
 from data.world.standins import generator_version
 
@@ -57,11 +57,10 @@ counterfactual queries. The first is a part of the second."""
 def component_versions(simulator: str, renderer: str, standin: str | None) -> dict[str, str]:
     """Versions of the code that determines a benchmark's scenes, pixels, items and queries."""
     is_rendered = simulator == "bullet"
+    frames = RENDERERS[renderer].version if is_rendered else f"{simulator}'s own frames"
     return {
         "generator": generator_version(standin),
-        "renderer": render.renderer_version(renderer)
-        if is_rendered
-        else f"{simulator}'s own frames",
+        "renderer": frames,
         "builders": BUILDERS_VERSION,
     }
 
@@ -85,6 +84,12 @@ def write_atomically(path: Path, content: bytes) -> None:
 def scene_path(folder: Path, scene_id: str) -> Path:
     """Path of a scene's oracle in a store or a partial build."""
     return folder / SCENES_FOLDER / f"{scene_id}.npz"
+
+
+def part_path(folder: Path, inputs: Any) -> Path:
+    """Path of a job's result in a partial build, which depends on all inputs of the job."""
+    key = hashlib.sha256(json.dumps(inputs).encode()).hexdigest()
+    return folder / PARTS / f"{key[:32]}.json"
 
 
 def save_scene(scene: Scene, path: Path) -> None:
@@ -216,37 +221,33 @@ def open_store(folder: Path) -> Store:
             damaged file.
     """
     path = folder / MANIFEST
-    rebuild = f"delete {folder} and build it again with python -m data.build"
+
+    def refusal(problem: str, code: str) -> UserError:
+        advice = f"delete {folder} and build it again with python -m data.build"
+        return UserError(f"{problem}; {advice}", code=code)
+
     if not path.exists():
-        raise UserError(
-            f"{folder} is not a benchmark: {MANIFEST} is missing; {rebuild}", code="missing-file"
-        )
+        raise refusal(f"{folder} is not a benchmark: {MANIFEST} is missing", "missing-file")
     try:
         manifest = json.loads(path.read_text())
         config = manifest["config"]
         current = component_versions(config["simulator"], config["renderer"], config["standin"])
         built = {key: manifest[key] for key in current}
     except (ValueError, TypeError, KeyError) as error:
-        raise UserError(f"{path} cannot be parsed; {rebuild}", code="damaged-file") from error
+        raise refusal(f"{path} cannot be parsed", "damaged-file") from error
     for key, version in current.items():
         if built[key] != version:
-            raise UserError(
-                f"{folder} was built by {key} version {built[key]}, but this is version "
-                f"{version}; {rebuild}",
-                code="different-version",
+            raise refusal(
+                f"{folder} was built by {key} version {built[key]}, but this is version {version}",
+                "different-version",
             )
     if manifest != add_checksum(manifest):
-        raise UserError(f"{path} was changed after the build; {rebuild}", code="damaged-file")
+        raise refusal(f"{path} was changed after the build", "damaged-file")
     expected, actual = manifest["files"], hash_files(folder)
     if missing := expected.keys() - actual.keys():
-        raise UserError(
-            f"{folder / min(missing)} is missing ({len(missing)} files in total); {rebuild}",
-            code="missing-file",
-        )
+        raise refusal(f"{len(missing)} files are missing: {folder / min(missing)}", "missing-file")
     if damaged := [name for name in expected if actual[name] != expected[name]]:
-        raise UserError(
-            f"{folder / damaged[0]} differs from the manifest ({len(damaged)} files in total); "
-            f"{rebuild}",
-            code="damaged-file",
+        raise refusal(
+            f"{len(damaged)} files differ from the manifest: {folder / damaged[0]}", "damaged-file"
         )
     return Store(folder, manifest)

@@ -1,7 +1,7 @@
 """Selection items of the transfer suites, which are built from scenes of MoVi-A and Physion.
 
-`TRANSFER_SUITES[suite][family]` has the interface of a module of `data.tracks.selection`: `CELLS`
-and `make_item`. Its questions are the same.
+`TRANSFER_SUITES[suite][family]` has the interface of a family; see
+`data.tracks.selection.distractors`. Its questions are the same.
 
 The target of an event item is the frame of the event, and its prefix ends some frames earlier. The
 prefix of a time item is the scene's first second, and its target is one or two seconds after the
@@ -18,10 +18,9 @@ from itertools import islice
 
 import numpy as np
 
-from data.records import Candidate, FrameRef, Scene, SelectionItem
+from data.records import Candidate, Scene, SelectionItem
 from data.tracks.selection import event, time
-from data.tracks.selection.distractors import DistractorPicker, new_item, scene_candidates
-from data.tracks.selection.event import EventTiming
+from data.tracks.selection.distractors import DistractorPicker, Timing, scene_candidates
 from data.world.events import find_motion_onsets
 
 LEAST_PREFIX = 5
@@ -41,7 +40,7 @@ class TransferCell:
     """
 
     question: str
-    timings: Callable[[Scene], list[EventTiming]]
+    timings: Callable[[Scene], list[Timing]]
 
 
 @dataclass(frozen=True)
@@ -60,42 +59,37 @@ class TransferFamily:
     after_target: bool
     CELLS: dict[str, TransferCell]
 
+    def timings(self, subtype: str, scene: Scene) -> list[Timing]:
+        return self.CELLS[subtype].timings(scene)
+
     def make_item(
-        self, subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
+        self,
+        subtype: str,
+        scene: Scene,
+        timing: Timing,
+        rng: np.random.Generator,
+        picker: DistractorPicker,
     ) -> SelectionItem | None:
-        """Make an item of a cell at one of the scene's timings, tried in a random order."""
+        """Make an item of a cell at one of its timings."""
         cell = self.CELLS[subtype]
-        timings = cell.timings(scene)
-        for k in rng.permutation(len(timings)):
-            timing = timings[k]
-            frames = np.arange(
-                (timing.target if self.after_target else timing.stop) + 1, scene.frames
-            )
-            wrong = rng.permutation(frames[frames != timing.target])
-            picked = picker.pick_each(
-                FrameRef(scene.scene_id, timing.target),
+        frames = np.arange((timing.target if self.after_target else timing.stop) + 1, scene.frames)
+        wrong = rng.permutation(frames[frames != timing.target])
+        gap = timing.target - timing.stop
+        axes = {"framing": "future", "gap": gap} if timing.event is not None else {"horizon": gap}
+        return picker.make_item(
+            scene,
+            timing,
+            [
                 (scene_candidates(scene, wrong, "same_time"), self.same_scene),
                 (cross_scene_candidates(cell, scene, rng, picker), 3 - self.same_scene),
-            )
-            if picked is None:
-                continue
-            gap = timing.target - timing.stop
-            axes = {"horizon": gap}
-            if self.family == "event":
-                axes = {"event_frame": timing.event, "framing": "future", "gap": gap}
-            return new_item(
-                scene,
-                self.family,
-                subtype,
-                cell.question,
-                (timing.start, timing.stop),
-                timing.target,
-                picked,
-                suite=self.suite,
-                distractors="mixed",
-                **axes,
-            )
-        return None
+            ],
+            family=self.family,
+            subtype=subtype,
+            suite=self.suite,
+            question=cell.question,
+            distractors="mixed",
+            **axes,
+        )
 
 
 def cross_scene_candidates(
@@ -129,10 +123,10 @@ def event_cell(event_name: str, step: int, gap: int) -> TransferCell:
     The prefix ends `gap` frames before the event and starts `step` frames before its end.
     """
 
-    def timings(scene: Scene) -> list[EventTiming]:
+    def timings(scene: Scene) -> list[Timing]:
         stops = [frame - gap for frame in sorted(set(EVENTS[event_name](scene)))]
         return [
-            EventTiming(stop + gap, max(stop - step, 0), stop, stop + gap)
+            Timing(max(stop - step, 0), stop, stop + gap, event=stop + gap)
             for stop in stops
             if stop + 1 >= LEAST_PREFIX
         ]
@@ -143,10 +137,10 @@ def event_cell(event_name: str, step: int, gap: int) -> TransferCell:
 def time_cell(seconds: int) -> TransferCell:
     """Return a cell whose prefix is the scene's first second. The target is `seconds` later."""
 
-    def timings(scene: Scene) -> list[EventTiming]:
+    def timings(scene: Scene) -> list[Timing]:
         second = round(scene.fps)
         target = second - 1 + second * seconds
-        return [EventTiming(target, 0, second - 1, target)] if target < scene.frames else []
+        return [Timing(0, second - 1, target)] if target < scene.frames else []
 
     return TransferCell(time.question(seconds), timings)
 

@@ -11,7 +11,6 @@ from typing import Protocol
 
 from PIL import Image
 
-from conf.errors import UserError
 from data.records import Scene
 from data.render import blender, bullet
 from data.render.appearance import STANDARD_VIEW, View
@@ -23,10 +22,6 @@ class Renderer(Protocol):
     version: str
     """Changes whenever the same oracle gives different pixels."""
 
-    @staticmethod
-    def check() -> None:
-        """Raises UserError where this machine lacks a requirement of the renderer."""
-
     def render(self, scene: Scene, frame: int) -> Image.Image:
         """Render one frame as an RGB image."""
 
@@ -37,36 +32,11 @@ RENDERERS: dict[str, type[Renderer]] = {
 }
 
 
-def renderer_version(name: str) -> str:
-    """A renderer's version, whether or not it can run on this machine.
-
-    Raises:
-        UserError: the name is unknown.
-    """
-    if name not in RENDERERS:
-        raise UserError(
-            f"benchmark.renderer={name}: unknown renderer, the options are {', '.join(RENDERERS)}",
-            code="unknown-option",
-        )
-    return RENDERERS[name].version
-
-
-def check_renderer(name: str) -> None:
-    """Check that a renderer can run on this machine.
-
-    Raises:
-        UserError: a package is missing, or the name is unknown.
-    """
-    renderer_version(name)
-    RENDERERS[name].check()
-
-
 @cache
 def get_renderer(name: str, width: int, height: int, view: View = STANDARD_VIEW) -> Renderer:
     """The renderer of this process for a frame size (px) and a view.
 
     Raises:
-        UserError: it cannot run on this machine, or the name is unknown.
+        UserError: it cannot run on this machine.
     """
-    check_renderer(name)
     return RENDERERS[name](width, height, view)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data.records import COLORS
 from data.world.camera import STANDARD_CAMERA, Camera
 from data.world.shapes import CUBE_HALF, RADIUS
 
@@ -25,22 +24,16 @@ class View:
 
 STANDARD_VIEW = View()
 
-RGB = dict(
-    zip(
-        COLORS,
-        [
-            (112, 112, 112),
-            (186, 38, 38),
-            (38, 72, 204),
-            (34, 136, 34),
-            (122, 66, 22),
-            (38, 196, 196),
-            (132, 38, 186),
-            (250, 230, 48),
-        ],
-        strict=True,
-    )
-)
+RGB = {
+    "gray": (112, 112, 112),
+    "red": (186, 38, 38),
+    "blue": (38, 72, 204),
+    "green": (34, 136, 34),
+    "brown": (122, 66, 22),
+    "cyan": (38, 196, 196),
+    "purple": (132, 38, 186),
+    "yellow": (250, 230, 48),
+}
 """CLEVRER's colours; green and brown are darker so that small objects differ more."""
 
 SEGMENTS = 48
@@ -48,24 +41,16 @@ SEGMENTS = 48
 
 def mesh(shape: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (V, 3), normals (V, 3), texture coordinates (V, 2) and triangles (T, 3)."""
+    if shape == "cube":
+        return _cube()
     if shape == "sphere":
-        return _revolve(*_sphere_profile())
-    if shape == "cylinder":
-        return _revolve(*_cylinder_profile())
-    return _cube()
-
-
-def _sphere_profile() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    angle = np.linspace(0, np.pi, SEGMENTS // 2 + 1)
-    normals = np.stack([np.sin(angle), np.cos(angle)], axis=1)
-    return RADIUS * normals, normals, angle / np.pi
-
-
-def _cylinder_profile() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        angle = np.linspace(0, np.pi, SEGMENTS // 2 + 1)
+        normals = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+        return _revolve(RADIUS * normals, normals, angle / np.pi)
     # The rim has two vertices, with the cap's normal and with the side's, for a hard edge.
     points = RADIUS * np.array([[0, 1], [1, 1], [1, 1], [1, -1], [1, -1], [0, -1]], dtype=float)
     normals = np.array([[0, 1], [0, 1], [1, 0], [1, 0], [0, -1], [0, -1]], dtype=float)
-    return points, normals, np.array([0.05, 0.2, 0.25, 0.75, 0.8, 0.95])
+    return _revolve(points, normals, np.array([0.05, 0.2, 0.25, 0.75, 0.8, 0.95]))
 
 
 def _revolve(

@@ -6,12 +6,12 @@ where available; GPU pixels differ slightly from CPU pixels.
 
 from __future__ import annotations
 
-import importlib.metadata
-import io
+import contextlib
 import json
 import subprocess
 import sys
 import tempfile
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,21 @@ class BlenderRenderer:
     version = VERSION
 
     def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
+        """Start Blender.
+
+        Raises:
+            UserError: the right release of Blender's module is missing.
+        """
+        try:
+            installed = version("bpy")
+        except PackageNotFoundError:
+            installed = None
+        if installed != BPY:
+            raise UserError(
+                f"renderer=blender needs Blender's module bpy {BPY} (installed: {installed}): "
+                "install it with pip install -e '.[blender]', or use renderer=bullet",
+                code="missing-package",
+            )
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  lives as long as the worker
         # Without -P the worker would import the modules beside it.
         self._worker = subprocess.Popen(
@@ -47,6 +62,7 @@ class BlenderRenderer:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
+            text=True,
         )
         camera = view.camera.sized(width, height)
         settings = {
@@ -60,58 +76,38 @@ class BlenderRenderer:
         }
         self._request(settings, "starting")
 
-    @staticmethod
-    def check() -> None:
-        """Raises UserError unless the right release of Blender's module is installed."""
-        try:
-            installed = importlib.metadata.version("bpy")
-        except importlib.metadata.PackageNotFoundError:
-            installed = None
-        if installed != BPY:
-            raise UserError(
-                f"renderer=blender needs Blender's module bpy {BPY} (installed: {installed}): "
-                "install it with pip install -e '.[blender]', or use renderer=bullet",
-                code="missing-package",
-            )
-
     def render(self, scene: Scene, frame: int) -> Image.Image:
         """Render one frame as an RGB image.
 
         Raises:
             UserError: the Blender process ended.
         """
+        positions, quaternions = scene.positions[frame], scene.quaternions[frame]
         objects = [
             {
-                "shape": look.shape,
-                "material": look.material,
-                "color": [_linear(value / 255) for value in RGB[look.color]],
+                "shape": each.shape,
+                "material": each.material,
+                "color": [_linear(value / 255) for value in RGB[each.color]],
                 "position": position,
                 "quaternion": quaternion,
             }
-            for look, position, quaternion in zip(
-                scene.objects,
-                scene.positions[frame].tolist(),
-                scene.quaternions[frame].tolist(),
-                strict=True,
+            for each, position, quaternion in zip(
+                scene.objects, positions.tolist(), quaternions.tolist(), strict=True
             )
         ]
-        png = self._request(objects, f"rendering frame {frame} of {scene.scene_id}")
-        return Image.open(io.BytesIO(png)).convert("RGB")
+        path = self._request(objects, f"rendering frame {frame} of {scene.scene_id}")
+        return Image.open(path).convert("RGB")
 
-    def _request(self, request: Any, activity: str) -> bytes:
-        """Send a request to the worker and return the bytes of its response."""
-        try:
-            self._worker.stdin.write(json.dumps(request).encode() + b"\n")
-            self._worker.stdin.flush()
-            header = self._worker.stdout.readline()
-            if header:
-                return self._worker.stdout.read(json.loads(header)["bytes"])
-        except BrokenPipeError:
-            pass
+    def _request(self, request: Any, activity: str) -> str:
+        """Send a request to the worker and return its response."""
+        with contextlib.suppress(BrokenPipeError):
+            print(json.dumps(request), file=self._worker.stdin, flush=True)
+            if response := self._worker.stdout.readline():
+                return response.rstrip("\n")
         status = self._worker.wait()
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").split("\n")
-        last = next((line.strip() for line in reversed(lines) if line.strip()), f"status {status}")
+        last = ([f"status {status}", *filter(str.strip, lines)])[-1].strip()
         raise UserError(
             f"renderer=blender: Blender ended while {activity} ({last}); run the command again, "
             "with fewer workers if memory is short, or use renderer=bullet",

@@ -3,21 +3,18 @@
 Blender has one global scene, prints to standard output and may crash, so it runs in a separate
 process. Each request is a line of JSON on standard input: first the settings (see `Studio`), then
 the objects of one frame after another (see `Studio.render`). Each response on standard output is a
-line {"bytes": n} and n bytes: none for the settings, a PNG for a frame. The process exits when its
-input ends. It needs only `bpy` and the standard library.
+line with the path of a PNG, whose content is the frame's until the next request. The process exits
+when its input ends. It needs only `bpy` and the standard library.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import shutil
 import sys
 import tempfile
-import threading
 from pathlib import Path
-from queue import SimpleQueue
-from typing import Any, BinaryIO
+from typing import Any
 
 MATERIALS = {
     "metal": {"Metallic": 1.0, "Roughness": 0.15, "IOR": 2.5},
@@ -37,44 +34,34 @@ LAMPS = {
 """Square lamps that point at the origin, in simulator units; larger ones cast softer shadows."""
 AMBIENT = 0.1
 """Strength of ambient light, so that shadows and reflections are not black."""
-ADAPTIVE_NOISE, ADAPTIVE_MIN_SAMPLES = 0.05, 8
-"""Sampling of a pixel stops at this noise level, after at least this many samples."""
-BOUNCES = 3
+IMAGE = {"file_format": "PNG", "color_mode": "RGB", "compression": 0}
+SAMPLING = {
+    # Sampling of a pixel stops at this noise level, after at least this many samples.
+    "adaptive_threshold": 0.05,
+    "adaptive_min_samples": 8,
+    "use_denoising": True,
+    "denoiser": "OPENIMAGEDENOISE",
+    "max_bounces": 3,
+    "use_light_tree": False,
+}
+"""Settings of Blender's path tracer."""
 
 
 def main() -> None:
-    with tempfile.TemporaryDirectory(prefix="dynapix-blender-") as folder:
-        requests, answers = _channels(folder)
-        studio = Studio(json.loads(requests.get()), Path(folder) / "frame.png")
-        _answer(answers, b"")
-        while True:
-            _answer(answers, studio.render(json.loads(requests.get())))
-
-
-def _channels(folder: str) -> tuple[SimpleQueue[str], BinaryIO]:
-    """The queue of requests, and the file for responses, which Blender's output cannot reach."""
-    answers = os.fdopen(os.dup(1), "wb")
+    # Blender prints to standard output, which must only have responses.
+    responses = os.fdopen(os.dup(1), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    requests: SimpleQueue[str] = SimpleQueue()
-
-    def listen() -> None:
+    with tempfile.TemporaryDirectory(prefix="dynapix-blender-") as folder:
+        path = Path(folder) / "frame.png"
+        studio = Studio(json.loads(sys.stdin.readline()), path)
+        print(path, file=responses, flush=True)
         for line in sys.stdin:
-            requests.put(line)
-        # Exit immediately, even while a frame is being rendered.
-        shutil.rmtree(folder, ignore_errors=True)
-        os._exit(0)
-
-    threading.Thread(target=listen, daemon=True).start()
-    return requests, answers
-
-
-def _answer(answers: BinaryIO, body: bytes) -> None:
-    answers.write(json.dumps({"bytes": len(body)}).encode() + b"\n" + body)
-    answers.flush()
+            studio.render(json.loads(line))
+            print(path, file=responses, flush=True)
 
 
 class Studio:
-    """A Blender scene with ground, lamps, a camera and one solid for each look."""
+    """A Blender scene with ground, lamps, a camera and one solid for each appearance."""
 
     def __init__(self, settings: dict[str, Any], path: Path) -> None:
         """Set up the scene.
@@ -89,7 +76,6 @@ class Studio:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         self._scene = bpy.context.scene
         self._scene.render.filepath = str(path)
-        self._path = path
         self._meshes = {shape: _mesh(shape, h) for shape, h in settings["half_heights"].items()}
         self._solids: dict[tuple[str, str, tuple[float, ...]], Any] = {}
         _set_quality(self._scene, settings)
@@ -97,8 +83,8 @@ class Studio:
         _set_lamps(self._scene)
         _set_ground(self._scene)
 
-    def render(self, objects: list[dict[str, Any]]) -> bytes:
-        """Render a PNG of objects.
+    def render(self, objects: list[dict[str, Any]]) -> None:
+        """Render objects to the file.
 
         Args:
             objects: shape, material, color (linear RGB), position and quaternion (x y z w) each.
@@ -108,15 +94,14 @@ class Studio:
         for solid in self._solids.values():
             solid.hide_render = True
         for item in objects:
-            look = (item["shape"], item["material"], tuple(item["color"]))
-            if look not in self._solids:
-                self._solids[look] = self._add(*look)
-            solid = self._solids[look]
+            appearance = (item["shape"], item["material"], tuple(item["color"]))
+            if appearance not in self._solids:
+                self._solids[appearance] = self._add(*appearance)
+            solid = self._solids[appearance]
             x, y, z, w = item["quaternion"]
             solid.location, solid.rotation_quaternion = item["position"], (w, x, y, z)
             solid.hide_render = False
         bpy.ops.render.render(write_still=True)
-        return self._path.read_bytes()
 
     def _add(self, shape: str, material: str, color: tuple[float, ...]) -> Any:
         import bpy
@@ -172,19 +157,13 @@ def _material(name: str, color: tuple[float, ...]) -> Any:
 def _set_quality(scene: Any, settings: dict[str, Any]) -> None:
     scene.render.engine = "CYCLES"
     scene.render.resolution_x, scene.render.resolution_y = settings["width"], settings["height"]
-    scene.render.image_settings.file_format = "PNG"
-    scene.render.image_settings.color_mode = "RGB"
-    scene.render.image_settings.compression = 0
-    scene.render.dither_intensity = 0
     # Blender's default transform would desaturate the objects' colours.
     scene.view_settings.view_transform = "Standard"
+    scene.render.dither_intensity = 0
     scene.cycles.samples = settings["samples"]
-    scene.cycles.adaptive_threshold = ADAPTIVE_NOISE
-    scene.cycles.adaptive_min_samples = ADAPTIVE_MIN_SAMPLES
-    scene.cycles.use_denoising = True
-    scene.cycles.denoiser = "OPENIMAGEDENOISE"
-    scene.cycles.max_bounces = BOUNCES
-    scene.cycles.use_light_tree = False
+    for group, values in ((scene.render.image_settings, IMAGE), (scene.cycles, SAMPLING)):
+        for key, value in values.items():
+            setattr(group, key, value)
     _use_gpu(scene)
 
 

@@ -43,28 +43,30 @@ class BulletRenderer:
         self._scene_id: str | None = None
         self._handles: list[int] = []
 
-    @staticmethod
-    def check() -> None:
-        """It has no requirements beyond those of the simulation."""
-
     def render(self, scene: Scene, frame: int) -> Image.Image:
         """Render one frame as an RGB image."""
         self.pose(scene, frame)
-        touched, objects, cover = _average(*self.capture())
+        pixels, mask = self.capture()
+        opaque = pixels.view(np.uint32)[..., 0] | np.uint32(0xFF000000)
+        layers = np.where(mask >= 0, opaque, np.uint32(0))
+        # Pillow would premultiply the colours of an RGBA image.
+        fine = Image.frombuffer("RGBX", mask.shape[::-1], layers, "raw", "RGBX", 0, 1)
+        *colors, cover = fine.reduce(OVERSAMPLING).split()
         shade = self._floor.shade(scene.positions[frame], self._shadows[frame])
         bands = []
-        for channel, tint in zip(objects, self._scene_view.floor, strict=True):
-            plane = shade * tint
-            pixels = plane.reshape(-1)
-            pixels[touched] = channel + (1 - cover) * pixels[touched]
-            bands.append(Image.fromarray(np.rint(plane, out=plane).astype(np.uint8)))
+        uncovered = 1 - np.asarray(cover, np.float32) / 255
+        for color, tint in zip(colors, self._scene_view.floor, strict=True):
+            band = shade * tint
+            band *= uncovered
+            band += color
+            bands.append(Image.fromarray(np.rint(band, out=band).astype(np.uint8)))
         return Image.merge("RGB", bands)
 
     def pose(self, scene: Scene, frame: int) -> list[int]:
         """Move the objects to their poses at a frame, and return their handles in the mask."""
         if scene.scene_id != self._scene_id:
             self._load(scene)
-        for handle, look, place, turn in zip(
+        for handle, scene_object, place, turn in zip(
             self._handles,
             scene.objects,
             scene.positions[frame].tolist(),
@@ -72,7 +74,7 @@ class BulletRenderer:
             strict=True,
         ):
             # The reflection on a sphere does not move as it rolls.
-            turn = [0, 0, 0, 1] if look.shape == "sphere" else turn
+            turn = [0, 0, 0, 1] if scene_object.shape == "sphere" else turn
             self._bullet.resetBasePositionAndOrientation(handle, place, turn)
         return list(self._handles)
 
@@ -109,54 +111,27 @@ class BulletRenderer:
         # resetSimulation would leak megabytes each time.
         for handle in self._handles:
             self._bullet.removeBody(handle)
-        self._handles = [self._add(look) for look in scene.objects]
+        self._handles = [self._add(scene_object) for scene_object in scene.objects]
         self._shadows = self._floor.shadows(scene.positions)
         self._scene_id = scene.scene_id
 
-    def _add(self, look: SceneObject) -> int:
+    def _add(self, scene_object: SceneObject) -> int:
         bullet = self._bullet
-        if look not in self._visuals:
-            vertices, normals, uvs, triangles = mesh(look.shape)
-            shine = 1.0 if look.material == "metal" else 0.05
-            self._visuals[look] = bullet.createVisualShape(
+        if scene_object not in self._visuals:
+            vertices, normals, uvs, triangles = mesh(scene_object.shape)
+            shine = 1.0 if scene_object.material == "metal" else 0.05
+            self._visuals[scene_object] = bullet.createVisualShape(
                 bullet.GEOM_MESH,
                 vertices=vertices.tolist(),
                 normals=normals.tolist(),
                 uvs=uvs.tolist(),
                 indices=triangles.ravel().tolist(),
-                rgbaColor=[*(np.array(RGB[look.color]) / 255), 1],
+                rgbaColor=[*(np.array(RGB[scene_object.color]) / 255), 1],
                 specularColor=[shine] * 3,
             )
-        handle = bullet.createMultiBody(0, -1, self._visuals[look])
-        bullet.changeVisualShape(handle, -1, textureUniqueId=self._textures[look.material])
+        handle = bullet.createMultiBody(0, -1, self._visuals[scene_object])
+        bullet.changeVisualShape(handle, -1, textureUniqueId=self._textures[scene_object.material])
         return handle
-
-
-def _average(pixels: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Downsample the objects by two, at the pixels that they touch.
-
-    Args:
-        pixels: (2H, 2W, 4) uint8.
-        mask: (2H, 2W) int32, -1 without an object.
-
-    Returns:
-        (P,) flat indices of the touched pixels in the small image; their colours (3, P) float32 on
-        black; and (P,) float32 the share of each pixel that objects cover.
-    """
-    # Compares two neighbours at once: all bits of the mask are set where it has no object.
-    pairs = mask.view(np.int64)
-    touched = np.flatnonzero((pairs[0::2] & pairs[1::2]) != -1)
-    width = mask.shape[1]
-    row, column = np.divmod(touched, width // 2)
-    first = 2 * row * width + 2 * column
-    four = first + np.array([[0], [1], [width], [width + 1]])
-    is_object = mask.ravel()[four] >= 0
-    masked = pixels.view(np.uint32).ravel()[four] * is_object
-    total = masked.view(np.uint8).reshape(4, -1).sum(axis=0, dtype=np.uint16)
-    objects = ((total + 2) // 4).reshape(-1, 4)[:, :3].T.astype(np.float32)
-    # Rounded to 1/255, as a fourth channel of the image would be.
-    cover = (is_object.sum(axis=0, dtype=np.uint16) * 255 + 2) // 4
-    return touched, objects, cover.astype(np.float32) / 255
 
 
 def _projection(camera: Camera) -> list[float]:

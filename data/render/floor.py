@@ -47,15 +47,8 @@ class Floor:
         ):
             if left < right and top < bottom:
                 box = np.s_[top:bottom, left:right]
-                across, along = self._y[box] - y, self._x[top:bottom] - x
-                across *= across
-                along *= along
-                across += along
-                across /= -_SPREAD
-                np.exp(across, out=across)
-                across *= -SHADOW_DEPTH
-                across += 1
-                shade[box] *= across
+                squares = (self._y[box] - y) ** 2 + (self._x[top:bottom] - x) ** 2
+                shade[box] *= 1 - SHADOW_DEPTH * np.exp(-squares / _SPREAD)
         return shade
 
     def shadows(self, positions: np.ndarray) -> np.ndarray:

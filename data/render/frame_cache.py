@@ -16,6 +16,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -24,7 +25,7 @@ from PIL import Image
 from data.records import Scene
 from data.releases.readers import READERS
 from data.render import get_renderer
-from data.store import Store, cached_scene, scene_path, write_atomically
+from data.store import FRAMES_FOLDER, Store, cached_scene, scene_path, write_atomically
 from data.world.standins import standin_view
 
 log = logging.getLogger(__name__)
@@ -43,7 +44,8 @@ def save_frames(frames: dict[int, np.ndarray], path: Path) -> None:
         for frame in ordered:
             difference = frames[frame] - frames[first] if frame != first else frames[first]
             packed = pa.compress(np.ascontiguousarray(difference), codec=_CODEC, asbytes=True)
-            archive.writestr(_member(frame), packed)
+            # ZipInfo has a fixed date, so that the same frames give the same bytes.
+            archive.writestr(zipfile.ZipInfo(_member(frame)), packed)
     write_atomically(path, buffer.getvalue())
 
 
@@ -81,51 +83,47 @@ def _warn_damaged(path: Path, reason: str) -> None:
     log.warning("%s is damaged (%s); rendering its frames again", path, reason)
 
 
-def _member(frame: int) -> zipfile.ZipInfo:
-    # With a fixed date, the same frames give the same bytes.
-    return zipfile.ZipInfo(f"{frame:03d}", (1980, 1, 1, 0, 0, 0))
+def _member(frame: int) -> str:
+    return f"{frame:03d}"
 
 
 def _unpack(archive: zipfile.ZipFile, frame: int, shape: list[int]) -> np.ndarray:
-    packed = archive.read(_member(frame).filename)
+    packed = archive.read(_member(frame))
     raw = pa.decompress(packed, int(np.prod(shape)), codec=_CODEC)
     return np.frombuffer(raw, np.uint8).reshape(shape)
 
 
 @dataclass(frozen=True)
 class FrameCache:
-    """Location of a store's rendered frames, and the means to render others."""
+    """Location of a store's rendered frames, and the means to render others.
+
+    Attributes:
+        folder: Folder of the store.
+        config: Settings of the benchmark.
+    """
 
     folder: Path
-    width: int
-    height: int
-    renderer: str
-    simulator: str
-    release: str | None
-    """Folder of another simulator's release, which has recorded frames."""
-    standin: str | None
+    config: dict[str, Any]
 
     @classmethod
     def of(cls, store: Store) -> FrameCache:
-        config = store.manifest["config"]
-        keys = ("width", "height", "renderer", "simulator", "folder", "standin")
-        return cls(store.folder, *(config.get(key) for key in keys))
+        return cls(store.folder, store.manifest["config"])
 
     def path(self, scene_id: str) -> Path:
-        return self.folder / "frames" / f"{scene_id}.zip"
+        return self.folder / FRAMES_FOLDER / f"{scene_id}.zip"
 
     def render(self, scene_id: str, frames: list[int]) -> dict[int, np.ndarray]:
         """Render frames of a scene or read them from its release, (height, width, 3) uint8."""
         if not frames:
             return {}
-        scene = cached_scene(scene_path(self.folder, scene_id))
+        scene, config = cached_scene(scene_path(self.folder, scene_id)), self.config
         if scene.footage is not None:
-            images = READERS[self.simulator].load_images(scene, Path(self.release), frames)
+            reader = READERS[config["simulator"]]
+            images = reader.load_images(scene, Path(config["folder"]), frames)
             return {frame: np.asarray(image) for frame, image in images.items()}
-        render = get_renderer(
-            self.renderer, self.width, self.height, standin_view(self.standin)
-        ).render
-        return {frame: np.asarray(render(scene, frame)) for frame in frames}
+        view = standin_view(config["standin"])
+        renderer = get_renderer(config["renderer"], config["width"], config["height"], view)
+        return {frame: np.asarray(renderer.render(scene, frame)) for frame in frames}
 
 
 class FrameReader:

@@ -9,7 +9,6 @@ from functools import partial
 
 from data.parallel import Workers
 from data.records import POOLS, sample_prefix_frames
-from data.render import check_renderer
 from data.render.frame_cache import FrameCache, load_frames, save_frames
 from data.store import DATABASES, FRAMES_FOLDER, Store, write_atomically
 from data.tracks.controls import MATCHED_ANCHOR
@@ -32,9 +31,6 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
     path = store.folder / FRAMES_FOLDER / RECORD
     if path.exists() and options.items() <= json.loads(path.read_text()).items():
         return
-    config = store.manifest["config"]
-    if which != "none" and config["simulator"] == "bullet":
-        check_renderer(config["renderer"])
     cache = FrameCache.of(store)
     jobs = {
         scene: partial(_render_scene, cache, scene, frames)
@@ -58,18 +54,6 @@ def frames_to_render(store: Store, which: str) -> dict[str, list[int]]:
     """Frames to render by scene, scenes of the test split first."""
     if which == "none":
         return {}
-    frames = referenced_frames(store)
-    if which == "all":
-        for split in ("test", "train"):
-            for scene in store.scene_ids(split):
-                frames[scene].update(range(store.scene(scene).frames))
-    test = set(store.scene_ids("test"))
-    order = sorted(frames, key=lambda scene: (scene.split("-without-")[0] not in test, scene))
-    return {scene: sorted(frames[scene]) for scene in order}
-
-
-def referenced_frames(store: Store) -> dict[str, set[int]]:
-    """The frames that items, queries and databases refer to, by scene."""
     frames: dict[str, set[int]] = defaultdict(set)
     count = store.manifest["config"]["prefix_frames"]
     items = [*store.selection(), *store.selection(suite=MATCHED_ANCHOR)]
@@ -83,7 +67,12 @@ def referenced_frames(store: Store) -> dict[str, set[int]]:
         *(f for name in DATABASES for f in store.database(name)),
     ):
         frames[frame.scene_id].add(frame.frame)
-    return frames
+    if which == "all":
+        for scene in (*store.scene_ids("test"), *store.scene_ids("train")):
+            frames[scene].update(range(store.scene(scene).frames))
+    test = set(store.scene_ids("test"))
+    order = sorted(frames, key=lambda scene: (scene.split("-without-")[0] not in test, scene))
+    return {scene: sorted(frames[scene]) for scene in order}
 
 
 def _render_scene(cache: FrameCache, scene_id: str, frames: list[int]) -> int:

@@ -7,7 +7,6 @@ with the parts that exist, and a build with changed quotas repeats only the jobs
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections import Counter
@@ -19,9 +18,9 @@ from typing import Any
 
 from conf.schema import BenchmarkConfig, Quota
 from data.parallel import Workers
-from data.records import RetrievalQuery, Scene, SelectionItem
+from data.records import FAMILIES, RetrievalQuery, Scene, SelectionItem
 from data.releases.transfer_suites import TRANSFER_SUITES
-from data.store import PARTS, load_scene, scene_path, write_atomically
+from data.store import load_scene, part_path, scene_path, write_atomically
 from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
 from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.retrieval import counterfactual, future
@@ -30,6 +29,7 @@ from data.tracks.selection.distractors import BUILDERS_VERSION
 from data.world.physics import GENERATOR_VERSION
 
 DYNAPIX_FAMILIES = {"event": event, "time": time, "window": window}
+COUNTERFACTUAL = "counterfactual"
 CACHED_SCENES = 20_000
 """Scenes that a worker keeps in memory, at about 50 KB each."""
 QUERY_RESERVE = 1.3
@@ -47,8 +47,20 @@ def make_items_and_queries(
         Items; queries, more than the quotas by `QUERY_RESERVE`; and how many of each were dropped
         because too few candidates differ enough.
     """
-    quotas = _job_quotas(cfg)
-    paths = {name: _part_path(folder, cfg, scene_ids, name, quotas[name]) for name in quotas}
+    quotas = {
+        name: _reserve(quota) if _is_query_cell(name) else quota
+        for name, quota in cell_quotas(cfg).items()
+    }
+    inputs = {
+        "versions": [GENERATOR_VERSION, BUILDERS_VERSION],
+        "seed": cfg.seed,
+        "scenes": scene_ids,
+        "least": cfg.selection.min_displacement,
+        "hard negatives": cfg.retrieval.hard_negatives,
+    }
+    paths = {
+        name: part_path(folder, [inputs, name, asdict(quota)]) for name, quota in quotas.items()
+    }
     # Largest quotas first, so that no single worker is left with a large job at the end.
     jobs = {
         name: partial(_run_job, cfg, folder, scene_ids, name, quota, paths[name])
@@ -63,18 +75,17 @@ def make_items_and_queries(
     dropped: Counter[str] = Counter()
     for name in quotas:
         part = json.loads(paths[name].read_bytes())
-        track, group, _ = name.split("/")
-        if track == "retrieval":
+        if _is_query_cell(name):
             queries += map(RetrievalQuery.from_row, part["rows"])
             dropped["queries dropped, too alike"] += part["dropped"]
         else:
             items += map(SelectionItem.from_row, part["rows"])
-            dropped[f"items dropped, too alike/{group}"] += part["dropped"]
+            dropped[f"items dropped, too alike/{name.partition('/')[0]}"] += part["dropped"]
     return items, queries, dict(dropped)
 
 
 def item_families(cfg: BenchmarkConfig) -> Mapping[str, Any]:
-    """The families of a benchmark's suite; each has `CELLS` and `make_item`."""
+    """The families of a benchmark's suite; see `data.tracks.selection.distractors`."""
     return TRANSFER_SUITES.get(suite_name(cfg), DYNAPIX_FAMILIES)
 
 
@@ -87,42 +98,34 @@ def suite_name(cfg: BenchmarkConfig) -> str:
 
 def family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:
     """The selection track's quotas by family and subtype."""
-    track = cfg.selection
-    return {"event": track.event, "time": track.time, "window": track.window}
+    return {family: getattr(cfg.selection, family) for family in FAMILIES}
 
 
-def _job_quotas(cfg: BenchmarkConfig) -> dict[str, Quota]:
-    """Quotas by track/group/cell, one a job."""
+def cell_quotas(cfg: BenchmarkConfig) -> dict[str, Quota]:
+    """Quotas of all cells and builders, by name."""
     return {
         **{
-            f"selection/{family}/{subtype}": quota
+            f"{family}/{subtype}": quota
             for family, quotas in family_quotas(cfg).items()
             for subtype, quota in quotas.items()
         },
-        f"controls/{MATCHED_ANCHOR}/pairs": cfg.selection.matched,
-        **{f"retrieval/future/{b}": _reserve(q) for b, q in cfg.retrieval.builders.items()},
-        "retrieval/counterfactual/all": _reserve(cfg.retrieval.counterfactual),
+        MATCHED_ANCHOR: cfg.selection.matched,
+        **{f"builder {b}": quota for b, quota in cfg.retrieval.builders.items()},
+        COUNTERFACTUAL: cfg.retrieval.counterfactual,
     }
+
+
+def builder_name(builder: int | None) -> str:
+    """The name of a retrieval builder among the cells."""
+    return COUNTERFACTUAL if builder is None else f"builder {builder}"
+
+
+def _is_query_cell(name: str) -> bool:
+    return name == COUNTERFACTUAL or name.startswith("builder ")
 
 
 def _reserve(quota: Quota) -> Quota:
     return Quota(math.ceil(QUERY_RESERVE * quota.train), math.ceil(QUERY_RESERVE * quota.test))
-
-
-def _part_path(
-    folder: Path, cfg: BenchmarkConfig, scene_ids: ScenesOfSplit, name: str, quota: Quota
-) -> Path:
-    inputs = {
-        "versions": [GENERATOR_VERSION, BUILDERS_VERSION],
-        "seed": cfg.seed,
-        "scenes": scene_ids,
-        "cell": name,
-        "quota": asdict(quota),
-        "least": cfg.selection.min_displacement,
-        "hard negatives": cfg.retrieval.hard_negatives,
-    }
-    key = hashlib.sha256(json.dumps(inputs).encode()).hexdigest()
-    return folder / PARTS / f"{key[:32]}.json"
 
 
 _load = lru_cache(maxsize=CACHED_SCENES)(load_scene)
@@ -139,7 +142,6 @@ def _run_job(
     def scene_of(scene_id: str) -> Scene:
         return _load(scene_path(folder, scene_id))
 
-    track, group, subtype = name.split("/")
     cell = CellInputs(
         scene_ids,
         scene_of,
@@ -148,14 +150,15 @@ def _run_job(
         least=cfg.selection.min_displacement,
         hard_negatives=cfg.retrieval.hard_negatives,
     )
-    if track == "selection":
-        make_item = partial(item_families(cfg)[group].make_item, subtype)
-        made, dropped = fill_quota(subtype, make_item, cell)
-    elif track == "controls":
+    group, _, subtype = name.partition("/")
+    if group == MATCHED_ANCHOR:
         made, dropped = fill_pairs(cell)
-    elif group == "future":
-        made, dropped = future.make_queries(int(subtype), cell)
-    else:
+    elif group == COUNTERFACTUAL:
         made, dropped = counterfactual.make_queries(cell)
+    elif _is_query_cell(group):
+        made, dropped = future.make_queries(int(group.split()[1]), cell)
+    else:
+        family = item_families(cfg)[group]
+        made, dropped = fill_quota(subtype, family.timings, family.make_item, cell)
     part: dict[str, Any] = {"rows": [row.to_row() for row in made], "dropped": dropped}
     write_atomically(path, json.dumps(part).encode())

@@ -8,7 +8,7 @@ prefix of an existing item: they remove it or shuffle its frames.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,9 +16,8 @@ import numpy as np
 from data.records import SELECTION_SECOND, Scene, SelectionItem, sample_prefix_frames
 from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.selection import event, time
-from data.tracks.selection.distractors import DistractorPicker
-from data.tracks.selection.event import EventTiming
-from data.world.events import collisions_in
+from data.tracks.selection.distractors import Timing
+from data.world.events import collision_frames, collisions_in
 
 MATCHED_ANCHOR = "matched_anchor"
 """The suite of the pairs' items."""
@@ -29,33 +28,21 @@ EVENT_QUESTION = (
 SECONDS = (1, 2)
 
 
-def anchor_timings(scene: Scene) -> Iterator[EventTiming]:
-    """Timings where the next collision is whole seconds after a one-second observation."""
-    for target in dict.fromkeys(c.frame for c in scene.collisions):
-        for seconds in SECONDS:
-            stop = target - seconds * SELECTION_SECOND
-            start = stop - SELECTION_SECOND + 1
-            is_next = not collisions_in(scene, stop + 1, target - 1)
-            if start >= 0 and is_next and target <= scene.frames - 1 - event.TAIL:
-                yield EventTiming(target, start, stop, target)
-
-
-def make_item(
-    scene: Scene, rng: np.random.Generator, picker: DistractorPicker
-) -> SelectionItem | None:
-    """Make the item of a pair that names the time, at a random timing of the scene."""
-    timings = list(anchor_timings(scene))
-    attempts = (timings[k] for k in rng.permutation(len(timings)))
-    items = (
-        time.make_item_at(scene, (t.start, t.stop), t.target, rng, picker, event_frame=t.target)
-        for t in attempts
-    )
-    return next(filter(None, items), None)
+def timings(subtype: str, scene: Scene) -> list[Timing]:
+    """Where the next collision is whole seconds after a one-second observation."""
+    return [
+        Timing(stop - SELECTION_SECOND + 1, stop, target, event=target)
+        for target in collision_frames(scene)
+        for seconds in SECONDS
+        if (stop := target - seconds * SELECTION_SECOND) >= SELECTION_SECOND - 1
+        and not collisions_in(scene, stop + 1, target - 1)
+        and target <= scene.frames - 1 - event.TAIL
+    ]
 
 
 def fill_pairs(cell: CellInputs) -> tuple[list[SelectionItem], int]:
     """Make pairs up to the quota, as two items in a row; see `data.tracks.quota.fill_quota`."""
-    items, dropped = fill_quota(MATCHED_ANCHOR, make_item, cell)
+    items, dropped = fill_quota(MATCHED_ANCHOR, timings, time.make_item, cell)
     return [each for item in items for each in _pair(item)], dropped
 
 
@@ -95,8 +82,8 @@ def prefix_under_control(item: SelectionItem, count: int, control: str | None) -
     if control == "shuffled_prefix":
         digest = hashlib.sha256(item.item_id.encode()).digest()
         rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-        order = np.arange(len(frames))
-        while (order == np.arange(len(frames))).all():
-            order = rng.permutation(len(frames))
-        return [frames[k] for k in order]
+        shuffled = frames
+        while shuffled == frames:
+            shuffled = [frames[k] for k in rng.permutation(len(frames))]
+        return shuffled
     return frames

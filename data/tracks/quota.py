@@ -6,6 +6,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -15,8 +16,6 @@ from data.records import SPLITS, Scene, SelectionItem
 from data.tracks.selection.distractors import DistractorPicker
 
 Element = TypeVar("Element")
-ItemMaker = Callable[[Scene, np.random.Generator, DistractorPicker], SelectionItem | None]
-"""Makes at most one item of a cell from a scene, with the target as its first candidate."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +38,13 @@ class CellInputs:
 
 
 def fill_quota(
-    subtype: str, make_item: ItemMaker, cell: CellInputs
+    subtype: str, timings: Callable, make_item: Callable, cell: CellInputs
 ) -> tuple[list[SelectionItem], int]:
     """Make the items of one cell, at most one a scene, from scenes in a seeded order.
+
+    Args:
+        timings: As in a family; see `data.tracks.selection.distractors`.
+        make_item: The same. The timings of a scene are tried in a random order.
 
     Returns:
         Items of each split up to its quota, and the number of targets that were dropped because
@@ -56,23 +59,21 @@ def fill_quota(
         for index in rng.permutation(len(scene_ids)):
             if len(made) == getattr(cell.quota, split):
                 break
-            item = make_item(cell.scene_of(scene_ids[index]), rng, picker)
-            if item is not None:
-                made.append(item)
+            scene = cell.scene_of(scene_ids[index])
+            places = timings(subtype, scene)
+            order = rng.permutation(len(places))
+            attempts = (make_item(subtype, scene, places[k], rng, picker) for k in order)
+            made += islice(filter(None, attempts), 1)
         # Each letter is the answer equally often. The remainder starts at a random letter, because
         # otherwise the last letter would be right in fewer cells than the first.
         positions = rng.permutation((np.arange(len(made)) + rng.integers(4)) % 4)
-        items += [_shuffle(i, int(p), rng) for i, p in zip(made, positions, strict=True)]
+        for item, position in zip(made, positions.tolist(), strict=True):
+            target, *distractors = item.candidates
+            candidates = [distractors[k] for k in rng.permutation(3)]
+            candidates.insert(position, target)
+            items.append(replace(item, candidates=tuple(candidates), answer=position))
         dropped += picker.dropped
     return items, dropped
-
-
-def _shuffle(item: SelectionItem, position: int, rng: np.random.Generator) -> SelectionItem:
-    """Shuffle an item's distractors and move the target to `position`."""
-    target, *distractors = item.candidates
-    candidates = [distractors[k] for k in rng.permutation(3)]
-    candidates.insert(position, target)
-    return replace(item, candidates=tuple(candidates), answer=position)
 
 
 def named_rng(seed: int, *names: str) -> np.random.Generator:

@@ -7,7 +7,7 @@ from collections import Counter
 from conf.schema import BenchmarkConfig
 from data.records import SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from data.store import Store
-from data.tracks.build_items import family_quotas
+from data.tracks.build_items import builder_name, cell_quotas
 from data.tracks.controls import MATCHED_ANCHOR, pair_items
 
 
@@ -19,8 +19,10 @@ def count_records(
 ) -> dict[str, int]:
     """Count scenes, items by family, queries by builder and frames by database."""
     tally = Counter({f"scenes/{split}": len(names) for split, names in scene_ids.items()})
-    tally.update(f"{_track(i)}/{i.family}/{i.split}" for i in items)
-    tally.update(f"retrieval/{_builder(q)}/{q.split}" for q in queries)
+    for i in items:
+        track = MATCHED_ANCHOR if i.suite == MATCHED_ANCHOR else "selection"
+        tally[f"{track}/{i.family}/{i.split}"] += 1
+    tally.update(f"retrieval/{builder_name(q.builder)}/{q.split}" for q in queries)
     tally["retrieval/standard test"] = sum(q.standard for q in queries)
     tally.update({f"database/{name}": len(frames) for name, frames in databases.items()})
     return dict(tally)
@@ -35,43 +37,22 @@ def find_shortfalls(
     """Cells, builders and databases with fewer records than their quotas, as "n of quota"."""
     own = [item for item in items if item.suite != MATCHED_ANCHOR]
     pairs = pair_items([item for item in items if item.suite == MATCHED_ANCHOR])
-    counts = Counter((f"{item.family}/{item.subtype}", item.split) for item in own)
-    counts.update((MATCHED_ANCHOR, item.split) for item, _ in pairs)
-    counts.update((_builder(query), query.split) for query in queries)
+    counts = Counter(f"{item.family}/{item.subtype}/{item.split}" for item in own)
+    counts.update(f"{MATCHED_ANCHOR}/{item.split}" for item, _ in pairs)
+    counts.update(f"{builder_name(query.builder)}/{query.split}" for query in queries)
     wanted = {
-        **{
-            f"{family}/{cell}": quota
-            for family, quotas in family_quotas(cfg).items()
-            for cell, quota in quotas.items()
-        },
-        MATCHED_ANCHOR: cfg.selection.matched,
-        **{f"builder {b}": quota for b, quota in cfg.retrieval.builders.items()},
-        "counterfactual": cfg.retrieval.counterfactual,
-    }
-    short = {
-        f"{cell}/{split}": f"{counts[cell, split]} of {getattr(quota, split)}"
-        for cell, quota in wanted.items()
+        f"{cell}/{split}": getattr(quota, split)
+        for cell, quota in cell_quotas(cfg).items()
         for split in SPLITS
-        if counts[cell, split] < getattr(quota, split)
     }
     track = cfg.retrieval
-    sizes = {
-        "test": track.database,
-        "future": track.source,
-        "counterfactual": track.counterfactual_source,
+    sizes = (track.database, track.source, track.counterfactual_source)
+    for (name, frames), size in zip(databases.items(), sizes, strict=True):
+        counts[f"database/{name}"] = len(frames)
+        wanted[f"database/{name}"] = size if frames else 0
+    return {
+        name: f"{counts[name]} of {quota}" for name, quota in wanted.items() if counts[name] < quota
     }
-    for name, frames in databases.items():
-        if 0 < len(frames) < sizes[name]:
-            short[f"database/{name}"] = f"{len(frames)} of {sizes[name]}"
-    return short
-
-
-def _track(item: SelectionItem) -> str:
-    return MATCHED_ANCHOR if item.suite == MATCHED_ANCHOR else "selection"
-
-
-def _builder(query: RetrievalQuery) -> str:
-    return "counterfactual" if query.builder is None else f"builder {query.builder}"
 
 
 def summarize_store(store: Store) -> str:

@@ -45,26 +45,27 @@ def cross_scene_displacement(scene: Scene, frame: int, other: Scene, other_frame
     As `frame_displacements`, with objects matched by appearance. An object that is on screen in one
     scene and absent from the other counts as the image's diagonal.
     """
-    first, second = _positions_by_look(scene, frame), _positions_by_look(other, other_frame)
+    pair = ((scene, frame), (other, other_frame))
+    first, second = (_positions_by_appearance(*ends) for ends in pair)
     absent = (np.full(2, np.inf), False)
     displacement = 0.0
-    for look in first.keys() | second.keys():
-        position, on_screen = first.get(look, absent)
-        other_position, other_on_screen = second.get(look, absent)
+    for key in first.keys() | second.keys():
+        position, on_screen = first.get(key, absent)
+        other_position, other_on_screen = second.get(key, absent)
         if on_screen or other_on_screen:
             distance = float(np.linalg.norm(position - other_position))
             displacement = max(displacement, distance)
     return min(displacement, DIAGONAL)
 
 
-def _positions_by_look(
+def _positions_by_appearance(
     scene: Scene, frame: int
 ) -> dict[tuple[SceneObject, int], tuple[np.ndarray, bool]]:
-    """Position and visibility of each object, by its look and its index among equal looks."""
+    """Position and visibility of each object, by its appearance and its index among equals."""
     positions, on_screen = on_screen_positions(scene)
     return {
-        (look, scene.objects[:k].count(look)): (positions[frame, k], bool(on_screen[frame, k]))
-        for k, look in enumerate(scene.objects)
+        (each, scene.objects[:k].count(each)): (positions[frame, k], bool(on_screen[frame, k]))
+        for k, each in enumerate(scene.objects)
     }
 
 

@@ -18,6 +18,11 @@ REST_FRAMES = 10
 """Initial frames for which it must rest, within half of that distance."""
 
 
+def collision_frames(scene: Scene) -> list[int]:
+    """The frames of the scene's collisions, each once, in order."""
+    return list(dict.fromkeys(c.frame for c in scene.collisions))
+
+
 def collisions_in(scene: Scene, first: int, last: int) -> list[Collision]:
     """Collisions at frames first to last, inclusive."""
     return [c for c in scene.collisions if first <= c.frame <= last]

@@ -6,20 +6,21 @@
 from __future__ import annotations
 
 import ctypes
-import math
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations, pairwise
+from itertools import chain, combinations, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from data.records import FPS, FRAMES, Collision, Landing, SceneObject
-from data.world.shapes import BOUNDING_RADIUS, CUBE_HALF, RADIUS
+from data.world.events import first_contacts
+from data.world.shapes import CUBE_HALF, RADIUS
 
 if TYPE_CHECKING:
     from pybullet_utils.bullet_client import BulletClient
@@ -36,8 +37,6 @@ FRICTION_DECELERATION = GROUND_FRICTION * OBJECT_FRICTION * GRAVITY
 
 CONTACT_FREE_FRAMES = 5
 """A pair's contact is a new event only after more contact-free frames than this."""
-MAX_CLOSING_SPEED = 12.5
-"""Upper bound on the speed at which two objects approach, simulator units per second."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +53,6 @@ class Physics:
     rubber_restitution: float = 0.5
     metal_restitution: float = 0.7
 
-    @property
-    def reach(self) -> float:
-        """Largest distance of centres at which two objects may touch within the next frame."""
-        return 2 * max(BOUNDING_RADIUS.values()) + MAX_CLOSING_SPEED / self.fps
-
 
 STANDARD_PHYSICS = Physics()
 
@@ -67,10 +61,10 @@ STANDARD_PHYSICS = Physics()
 class Body:
     """An object and its initial state: ground position, yaw in radians, ground velocity."""
 
-    look: SceneObject
-    position: tuple[float, float]
+    object: SceneObject
+    position: Sequence[float] | np.ndarray
     yaw: float
-    velocity: tuple[float, float]
+    velocity: Sequence[float] | np.ndarray = (0.0, 0.0)
     height: float | None = None
     """Initial height of the centre of a body in the air; None for a body on the ground."""
 
@@ -82,15 +76,15 @@ class Motion:
     Attributes:
         states: (F, N, 13) positions, quaternions, linear and angular velocities as in `Scene`.
         collisions: First contacts.
-        touching_at_start: Whether any two bodies touch at the first frame.
         repeated_pair: Whether any pair collides more than once.
+        touching_at_start: Whether any two bodies touch at the first frame.
         landings: Landings of bodies that start in the air.
     """
 
     states: np.ndarray
     collisions: tuple[Collision, ...]
-    touching_at_start: bool
     repeated_pair: bool
+    touching_at_start: bool
     landings: tuple[Landing, ...] = ()
 
     @property
@@ -98,16 +92,8 @@ class Motion:
         return self.states[..., 0:3]
 
     @property
-    def quaternions(self) -> np.ndarray:
-        return self.states[..., 3:7]
-
-    @property
     def velocities(self) -> np.ndarray:
         return self.states[..., 7:10]
-
-    @property
-    def angular_velocities(self) -> np.ndarray:
-        return self.states[..., 10:13]
 
 
 def connect() -> BulletClient:
@@ -136,7 +122,7 @@ def silence(descriptor: int) -> Iterator[None]:
         os.close(kept)
 
 
-class World:
+class Simulator:
     """A Bullet client that runs one simulation after another."""
 
     def __init__(self) -> None:
@@ -147,30 +133,35 @@ class World:
     ) -> Motion:
         """Simulate bodies for `frames` frames; the result is bit-identical every time."""
         ground, handles = self._place(bodies, physics)
-        step = self._bullet.stepSimulation
         recorded = np.zeros((frames, len(bodies), 13))
-        contacts: dict[tuple[int, int], dict[int, None]] = {}
+        recorded[0] = self._state(handles)
+        touching_at_start = any(
+            self._bullet.getClosestPoints(a, b, 0.02) for a, b in combinations(handles, 2)
+        )
+        contacts: dict[tuple[int, int], list[int]] = defaultdict(list)
         in_air = {k for k, body in enumerate(bodies) if body.height is not None}
         landings = []
-        recorded[0] = self._state(handles)
-        touching_at_start = self._overlapping(handles)
         for frame in range(1, frames):
-            near = _near_pairs(recorded[frame - 1, :, :3], physics.reach)
+            # Bullet keeps the points of pairs that have separated, so only a force counts.
             for _ in range(physics.substeps):
-                step()
-                for i, j in near:
-                    if self._is_contact(handles[i], handles[j]):
-                        contacts.setdefault((i, j), {})[frame] = None
-                for k in [k for k in in_air if self._is_contact(ground, handles[k])]:
-                    in_air.remove(k)
-                    landings.append(Landing(frame, k))
+                self._bullet.stepSimulation()
+                for point in self._bullet.getContactPoints():
+                    if point[1] != ground and point[2] != ground and point[9] > 0:
+                        pair = sorted(map(handles.index, point[1:3]))
+                        contacts[tuple(pair)].append(frame)
+                for k in list(in_air):
+                    points = self._bullet.getContactPoints(ground, handles[k])
+                    if any(point[9] > 0 for point in points):
+                        in_air.remove(k)
+                        landings.append(Landing(frame, k))
             recorded[frame] = self._state(handles)
-        collisions, repeated = _debounce(contacts)
-        return Motion(recorded, collisions, touching_at_start, repeated, tuple(landings))
-
-    def _is_contact(self, one: int, two: int) -> bool:
-        # Bullet keeps the points of pairs that have separated, so only a force counts.
-        return any(point[9] > 0 for point in self._bullet.getContactPoints(one, two))
+        return Motion(
+            recorded,
+            first_contacts((at, pair) for pair, times in contacts.items() for at in times),
+            _has_repeated(contacts),
+            touching_at_start,
+            tuple(landings),
+        )
 
     def _place(self, bodies: list[Body], physics: Physics) -> tuple[int, list[int]]:
         """Reset the world, add the ground and the bodies, and return their handles."""
@@ -195,17 +186,16 @@ class World:
         return ground, [self._add(body, physics) for body in bodies]
 
     def _add(self, body: Body, physics: Physics) -> int:
-        bullet, shape, height = self._bullet, body.look.shape, body.height
+        bullet, shape, height = self._bullet, body.object.shape, body.height
         if height is None:
             height = CUBE_HALF if shape == "cube" else RADIUS
-        if shape == "sphere":
-            form = bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=RADIUS)
-        elif shape == "cube":
-            form = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=[CUBE_HALF] * 3)
-        else:
-            form = bullet.createCollisionShape(
-                bullet.GEOM_CYLINDER, radius=RADIUS, height=2 * RADIUS
-            )
+        sizes = {
+            "sphere": (bullet.GEOM_SPHERE, {"radius": RADIUS}),
+            "cube": (bullet.GEOM_BOX, {"halfExtents": [CUBE_HALF] * 3}),
+            "cylinder": (bullet.GEOM_CYLINDER, {"radius": RADIUS, "height": 2 * RADIUS}),
+        }
+        kind, size = sizes[shape]
+        form = bullet.createCollisionShape(kind, **size)
         turn = bullet.getQuaternionFromEuler([0, 0, body.yaw])
         handle = bullet.createMultiBody(1.0, form, -1, [*body.position, height], turn)
         bullet.changeDynamics(
@@ -214,11 +204,7 @@ class World:
             lateralFriction=physics.object_friction,
             rollingFriction=0,
             spinningFriction=0,
-            restitution=(
-                physics.metal_restitution
-                if body.look.material == "metal"
-                else physics.rubber_restitution
-            ),
+            restitution=getattr(physics, f"{body.object.material}_restitution"),
             linearDamping=0,
             angularDamping=0,
         )
@@ -227,46 +213,23 @@ class World:
 
     def _state(self, handles: list[int]) -> np.ndarray:
         pose, velocity = self._bullet.getBasePositionAndOrientation, self._bullet.getBaseVelocity
-        rows = []
-        for handle in handles:
-            position, turn = pose(handle)
-            linear, angular = velocity(handle)
-            rows.append([*position, *turn, *linear, *angular])
-        return np.array(rows)
-
-    def _overlapping(self, handles: list[int]) -> bool:
-        return any(
-            self._bullet.getClosestPoints(a, b, 0.02)
-            for k, a in enumerate(handles)
-            for b in handles[k + 1 :]
-        )
+        return np.array([list(chain(*pose(k), *velocity(k))) for k in handles])
 
 
 @cache
-def shared_world() -> World:
-    """The world of this process."""
-    return World()
+def shared_simulator() -> Simulator:
+    """The simulator of this process."""
+    return Simulator()
 
 
-def _near_pairs(positions: np.ndarray, reach: float) -> list[tuple[int, int]]:
-    """Pairs that may touch within the next frame."""
-    places = positions.tolist()
-    return [
-        (i, j)
-        for (i, one), (j, two) in combinations(enumerate(places), 2)
-        if math.dist(one, two) < reach
-    ]
+def _has_repeated(contacts: Mapping[tuple[int, int], Sequence[int]]) -> bool:
+    """Whether any pair has a second, separate contact.
 
-
-def _debounce(
-    contacts: Mapping[tuple[int, int], Iterable[int]],
-) -> tuple[tuple[Collision, ...], bool]:
-    """The first contact of each pair, and whether any pair has a later, separate contact."""
-    collisions, repeated = [], False
-    for pair, frames in contacts.items():
-        first, *later = frames
-        collisions.append(Collision(first, pair))
-        repeated |= any(
-            after - before > CONTACT_FREE_FRAMES + 1 for before, after in pairwise([first, *later])
-        )
-    return tuple(sorted(collisions, key=lambda c: (c.frame, c.objects))), repeated
+    Args:
+        contacts: The frames in which a pair is in contact, in order.
+    """
+    return any(
+        after - before > CONTACT_FREE_FRAMES + 1
+        for frames in contacts.values()
+        for before, after in pairwise(frames)
+    )

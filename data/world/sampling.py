@@ -20,7 +20,7 @@ from data.world.physics import (
     Body,
     Motion,
     Physics,
-    shared_world,
+    shared_simulator,
 )
 from data.world.shapes import BOUNDING_RADIUS, RADIUS
 from data.world.visibility import compute_visibility
@@ -47,40 +47,44 @@ def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> tuple[list[
     """
     rng = np.random.default_rng([seed, index])
     while True:
-        looks = sample_looks(rng, limits)
+        objects = sample_objects(rng, limits)
         goal = int(rng.choice(list(COLLISIONS), p=list(COLLISIONS.values())))
-        bodies = [_entering(looks[0], rng)]
-        motion = shared_world().simulate(bodies)
-        for look in looks[1:]:
-            extended = _add_body(bodies, motion, look, rng, goal, limits.max_collisions)
+        bodies = [_entering(objects[0], rng)]
+        motion = shared_simulator().simulate(bodies)
+        for added in objects[1:]:
+            attempts = (
+                _try_body(bodies, motion, added, rng, goal, limits.max_collisions)
+                for _ in range(PLACEMENTS)
+            )
+            extended = next(filter(None, attempts), None)
             if extended is None:
                 break
             bodies, motion = extended
-        if len(bodies) == len(looks) and motion.collisions:
+        if len(bodies) == len(objects) and motion.collisions:
             return bodies, motion
 
 
-def sample_looks(rng: np.random.Generator, limits: BenchmarkConfig) -> list[SceneObject]:
-    """Sample the number of objects in a scene and their distinct looks."""
-    every_look = [SceneObject(*look) for look in product(SHAPES, MATERIALS, COLORS)]
+def sample_objects(rng: np.random.Generator, limits: BenchmarkConfig) -> list[SceneObject]:
+    """Sample the number of objects in a scene and their distinct appearances."""
+    every = [SceneObject(*attributes) for attributes in product(SHAPES, MATERIALS, COLORS)]
     count = int(rng.integers(limits.min_objects, limits.max_objects + 1))
-    return [every_look[k] for k in rng.choice(len(every_look), count, replace=False)]
+    return [every[k] for k in rng.choice(len(every), count, replace=False)]
 
 
-def _entering(look: SceneObject, rng: np.random.Generator) -> Body:
+def _entering(added: SceneObject, rng: np.random.Generator) -> Body:
     """Sample a body that enters from outside the view, towards its middle."""
     bearing = rng.uniform(0, 2 * np.pi)
     start = np.array([-0.7, 0.0]) + rng.uniform(2.6, 4.0) * unit_vector(bearing)
     goal = np.array([-0.7, 0.0]) + rng.uniform(-1, 1, 2)
     direction = (goal - start) / np.linalg.norm(goal - start)
     speed = rng.uniform(*SPEED)
-    return Body(look, as_pair(start), rng.uniform(0, 2 * np.pi), as_pair(speed * direction))
+    return Body(added, start, rng.uniform(0, 2 * np.pi), speed * direction)
 
 
-def _add_body(
+def _try_body(
     bodies: list[Body],
     motion: Motion,
-    look: SceneObject,
+    added: SceneObject,
     rng: np.random.Generator,
     goal: int,
     most: int,
@@ -88,26 +92,23 @@ def _add_body(
     """Add a body that collides with another, or with none once the motion has `goal` collisions.
 
     Returns:
-        All bodies and their motion, or None where no attempt succeeded.
+        All bodies and their motion, or None where the sampled body does not fit.
     """
     is_colliding = len(motion.collisions) < min(goal, most)
-    for _ in range(PLACEMENTS):
-        body = (_colliding if is_colliding else _resting)(look, motion, rng)
-        if body is None:
-            continue
-        trial = [*bodies, body]
-        # A colliding body seldom stays clear of the others, so they are simulated together.
-        combined = None if is_colliding else _combine(motion, body)
-        result = combined or shared_world().simulate(trial)
-        has_collided = any(len(bodies) in c.objects for c in result.collisions)
-        if (
-            not result.touching_at_start
-            and not result.repeated_pair
-            and len(result.collisions) <= most
-            and has_collided == is_colliding
-        ):
-            return trial, result
-    return None
+    body = (_colliding if is_colliding else _resting)(added, motion, rng)
+    if body is None:
+        return None
+    extended = [*bodies, body]
+    # A colliding body seldom stays clear of the others, so they are simulated together.
+    combined = None if is_colliding else _combine(motion, body)
+    result = combined or shared_simulator().simulate(extended)
+    fits = (
+        not result.touching_at_start
+        and not result.repeated_pair
+        and len(result.collisions) <= most
+        and any(len(bodies) in c.objects for c in result.collisions) == is_colliding
+    )
+    return (extended, result) if fits else None
 
 
 def _combine(motion: Motion, body: Body) -> Motion | None:
@@ -116,14 +117,14 @@ def _combine(motion: Motion, body: Body) -> Motion | None:
     Bullet solves separate groups of bodies separately, so the result is bit-identical to a joint
     simulation.
     """
-    alone = shared_world().simulate([body]).states
+    alone = shared_simulator().simulate([body]).states
     distance = np.linalg.norm(motion.positions - alone[..., :3], axis=-1)
     if distance.min() < CLEAR:
         return None
     return replace(motion, states=np.concatenate([motion.states, alone], axis=1))
 
 
-def _colliding(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
+def _colliding(added: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
     """Sample a body that should collide with another one in view: at rest in its path, or aimed at
     its future position."""
     other = int(rng.integers(motion.positions.shape[1]))
@@ -134,7 +135,7 @@ def _colliding(look: SceneObject, motion: Motion, rng: np.random.Generator) -> B
     if rng.random() < AT_REST:
         if np.linalg.norm(motion.velocities[frame, other]) < 0.3:
             return None
-        return Body(look, as_pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
+        return Body(added, place, rng.uniform(0, 2 * np.pi))
     seconds = frame / FPS
     speed = rng.uniform(*SPEED)
     if speed - FRICTION_DECELERATION * seconds < 0.3:
@@ -142,16 +143,16 @@ def _colliding(look: SceneObject, motion: Motion, rng: np.random.Generator) -> B
     travel = speed * seconds - FRICTION_DECELERATION * seconds**2 / 2
     direction = unit_vector(rng.uniform(0, 2 * np.pi))
     start = place - travel * direction
-    return Body(look, as_pair(start), rng.uniform(0, 2 * np.pi), as_pair(speed * direction))
+    return Body(added, start, rng.uniform(0, 2 * np.pi), speed * direction)
 
 
-def _resting(look: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
+def _resting(added: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
     """Sample a body at rest on screen, clear of all paths."""
     place = np.array([rng.uniform(-3.5, 1.2), rng.uniform(-2.2, 2.2)])
     is_clear = np.linalg.norm(motion.positions[..., :2] - place, axis=-1).min() > 0.7
     if not (is_clear and is_on_screen(place)):
         return None
-    return Body(look, as_pair(place), rng.uniform(0, 2 * np.pi), (0.0, 0.0))
+    return Body(added, place, rng.uniform(0, 2 * np.pi))
 
 
 def is_on_screen(
@@ -171,10 +172,6 @@ def unit_vector(angle: float) -> np.ndarray:
     return np.array([np.cos(angle), np.sin(angle)])
 
 
-def as_pair(values: np.ndarray) -> tuple[float, float]:
-    return float(values[0]), float(values[1])
-
-
 def format_scene_id(seed: int, index: int) -> str:
     return f"s{seed}-{index:06d}"
 
@@ -190,7 +187,7 @@ def simulate_without(name: str, split: str, bodies: list[Body], removed: int) ->
     Objects that it never affects, directly or through others, move bit-identically.
     """
     rest = bodies[:removed] + bodies[removed + 1 :]
-    return record_scene(name, split, rest, shared_world().simulate(rest))
+    return record_scene(name, split, rest, shared_simulator().simulate(rest))
 
 
 def record_scene(
@@ -203,14 +200,16 @@ def record_scene(
     scenario: str = "",
 ) -> Scene:
     """Record a motion as a scene, with projection and visibility by a camera."""
-    objects = tuple(body.look for body in bodies)
-    in_view, fraction = compute_visibility(objects, motion.positions, motion.quaternions, camera)
+    objects = tuple(body.object for body in bodies)
+    states = np.split(motion.states, [3, 7, 10], axis=-1)
+    positions, quaternions, velocities, angular_velocities = states
+    in_view, fraction = compute_visibility(objects, positions, quaternions, camera)
     floats = {
-        "positions": motion.positions,
-        "quaternions": motion.quaternions,
-        "velocities": motion.velocities,
-        "angular_velocities": motion.angular_velocities,
-        "image_positions": camera.project(motion.positions)[0],
+        "positions": positions,
+        "quaternions": quaternions,
+        "velocities": velocities,
+        "angular_velocities": angular_velocities,
+        "image_positions": camera.project(positions)[0],
         "visible_fraction": fraction,
     }
     return Scene(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from data.parallel import Workers
 from data.records import SPLITS
 from data.releases.readers import READERS
 from data.releases.validation import RecordError
-from data.store import PARTS, save_scene, scene_path, write_atomically
+from data.store import part_path, save_scene, scene_path, write_atomically
 from data.tracks.retrieval import counterfactual
 from data.world.sampling import format_scene_id, record_scene, sample_bodies, simulate_without
 from data.world.standins import simulate_standin
@@ -45,12 +44,19 @@ def make_scenes(
         UserError: a split would be empty, the release is missing, or `strict` is set and one of
             its records is invalid.
     """
-    if cfg.simulator == "bullet":
-        names = [scene_name(cfg, index) for index in range(cfg.scenes)]
-        scene_ids = split_scenes(cfg, names)
-        simulate(cfg, folder, scene_ids, workers)
-        return scene_ids, {}
-    return read_release(cfg, folder, workers, strict)
+    if cfg.simulator != "bullet":
+        return read_release(cfg, folder, workers, strict)
+    names = [scene_name(cfg, index) for index in range(cfg.scenes)]
+    scene_ids = split_scenes(cfg, names)
+    split_of = {name: split for split, some in scene_ids.items() for name in some}
+    jobs = {
+        name: partial(_simulate_one, cfg, index, split_of[name], scene_path(folder, name))
+        for index, name in enumerate(names)
+        if not scene_path(folder, name).exists()
+    }
+    for _ in workers.run(jobs, "simulating scenes", "scene", done=cfg.scenes - len(jobs)):
+        pass
+    return scene_ids, {}
 
 
 def scene_name(cfg: BenchmarkConfig, index: int) -> str:
@@ -83,21 +89,6 @@ def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, l
                 code="empty-split",
             )
     return splits
-
-
-def simulate(
-    cfg: BenchmarkConfig, folder: Path, scene_ids: dict[str, list[str]], workers: Workers
-) -> None:
-    """Simulate every missing scene below `folder`."""
-    split_of = {name: split for split, names in scene_ids.items() for name in names}
-    jobs = {}
-    for index in range(cfg.scenes):
-        name = scene_name(cfg, index)
-        path = scene_path(folder, name)
-        if not path.exists():
-            jobs[name] = partial(_simulate_one, cfg, index, split_of[name], path)
-    for _ in workers.run(jobs, "simulating scenes", "scene", done=cfg.scenes - len(jobs)):
-        pass
 
 
 def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> None:
@@ -135,17 +126,16 @@ def read_release(
     split_of = {path: split for split, some in split_scenes(cfg, paths).items() for path in some}
     parts = {path: _part_path(folder, path, split_of[path]) for path in paths}
     jobs = {
-        str(path): partial(_read_one, cfg, path, split_of[path], folder, parts[path])
-        for path in paths
-        if not parts[path].exists()
+        str(path): partial(_read_one, cfg, path, split_of[path], folder, part)
+        for path, part in parts.items()
+        if not part.exists()
     }
-    done = len(paths) - len(jobs)
-    for _ in workers.run(jobs, f"reading {cfg.simulator}", "scene", done):
+    for _ in workers.run(jobs, f"reading {cfg.simulator}", "scene", done=len(paths) - len(jobs)):
         pass
     scene_ids: dict[str, list[str]] = {split: [] for split in SPLITS}
     problems = []
-    for path in paths:
-        outcome = json.loads(parts[path].read_bytes())
+    for path, part in parts.items():
+        outcome = json.loads(part.read_bytes())
         if "problem" in outcome:
             problems.append(outcome["problem"])
         else:
@@ -166,8 +156,7 @@ def _part_path(folder: Path, path: Path, split: str) -> Path:
     """The file with the outcome of reading a record; a record that changes is read again."""
     file = path if path.exists() else path.parent
     inputs = [str(path), split, file.stat().st_size, file.stat().st_mtime_ns]
-    key = hashlib.sha256(json.dumps(inputs).encode()).hexdigest()
-    return folder / PARTS / f"{key[:32]}.json"
+    return part_path(folder, inputs)
 
 
 def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: Path) -> None:

@@ -20,12 +20,12 @@ from conf.schema import BenchmarkConfig
 from data.records import Scene, SceneObject
 from data.render.appearance import STANDARD_VIEW, View
 from data.world.camera import Camera
-from data.world.physics import GENERATOR_VERSION, Body, Physics, shared_world
-from data.world.sampling import as_pair, is_on_screen, record_scene, sample_looks, unit_vector
+from data.world.physics import GENERATOR_VERSION, Body, Physics, shared_simulator
+from data.world.sampling import is_on_screen, record_scene, sample_objects, unit_vector
 from data.world.shapes import RADIUS
 
 STANDINS_VERSION = "2"
-"""Increment it whenever the scenes or the look of a stand-in change."""
+"""Increment it whenever the scenes or the appearance of a stand-in change."""
 
 ROW_STEP = (0.75, 1.1)
 """Range of distances between neighbours in a row, simulator units."""
@@ -43,51 +43,51 @@ class Standin:
     physics: Physics
     view: View
     start: Callable[[list[SceneObject], View, np.random.Generator], Start | None]
-    """Samples the initial bodies of objects with the given looks, or returns None if a sampled
+    """Samples the initial states of the given objects, or returns None if a sampled
     position is off screen."""
 
 
-def thrown(looks: list[SceneObject], view: View, rng: np.random.Generator) -> Start | None:
+def thrown(objects: list[SceneObject], view: View, rng: np.random.Generator) -> Start | None:
     """Sample objects in the air that move towards the middle of the view."""
     bodies = []
-    for look in looks:
+    for each in objects:
         place = rng.uniform([-1.5, -1.6], [0.9, 1.6])
         height = rng.uniform(0.5, 1.5)
         if not is_on_screen(place, height, view.camera):
             return None
         toward = rng.uniform(-0.5, 0.5, 2) - place
         velocity = rng.uniform(0.6, 1.6) * toward / np.linalg.norm(toward)
-        bodies.append(Body(look, as_pair(place), rng.uniform(0, np.pi), as_pair(velocity), height))
+        bodies.append(Body(each, place, rng.uniform(0, np.pi), velocity, height))
     return "", bodies
 
 
-def struck(looks: list[SceneObject], view: View, rng: np.random.Generator) -> Start | None:
+def struck(objects: list[SceneObject], view: View, rng: np.random.Generator) -> Start | None:
     """Sample a row of resting objects, and one more that strikes the first of them.
 
     The striking object slides along the row (scenario Collide) or falls (scenario Drop).
     """
-    last, *row = looks
+    last, *row = objects
     # The row runs across the view: in a row away from the camera, objects would hide each other.
     bearing = rng.choice([-1, 1]) * np.pi / 2 + rng.uniform(-0.7, 0.7)
     place = rng.uniform([-0.8, -1.0], [1.0, 1.0])
     first, bodies = place, []
-    for look in row:
+    for each in row:
         if not is_on_screen(place, RADIUS, view.camera):
             return None
-        bodies.append(Body(look, as_pair(place), rng.uniform(0, np.pi), (0.0, 0.0)))
+        bodies.append(Body(each, place, rng.uniform(0, np.pi)))
         place = place + rng.uniform(*ROW_STEP) * unit_vector(bearing + rng.normal(0, 0.15))
     if rng.random() < 0.5:
         start = first - rng.uniform(1.5, 3.0) * unit_vector(bearing + rng.normal(0, 0.05))
         velocity = first - start
         velocity *= rng.uniform(1.5, 3.0) / np.linalg.norm(velocity)
-        bodies.append(Body(last, as_pair(start), rng.uniform(0, np.pi), as_pair(velocity)))
+        bodies.append(Body(last, start, rng.uniform(0, np.pi), velocity))
         return "Collide", bodies
     start = first + rng.normal(0, 0.25, 2)
     height = rng.uniform(0.9, 1.6)
     if not is_on_screen(start, height, view.camera):
         return None
     velocity = rng.uniform(0.2, 0.8) * unit_vector(rng.uniform(0, 2 * np.pi))
-    bodies.append(Body(last, as_pair(start), rng.uniform(0, np.pi), as_pair(velocity), height))
+    bodies.append(Body(last, start, rng.uniform(0, np.pi), velocity, height))
     return "Drop", bodies
 
 
@@ -131,11 +131,11 @@ def simulate_standin(name: str, index: int, split: str, cfg: BenchmarkConfig) ->
     kind = STANDINS[cfg.standin]
     rng = np.random.default_rng([cfg.seed, index])
     while True:
-        start = kind.start(sample_looks(rng, cfg), kind.view, rng)
+        start = kind.start(sample_objects(rng, cfg), kind.view, rng)
         if start is None:
             continue
         scenario, bodies = start
-        motion = shared_world().simulate(bodies, kind.frames, kind.physics)
+        motion = shared_simulator().simulate(bodies, kind.frames, kind.physics)
         if motion.collisions and not motion.touching_at_start:
             return record_scene(
                 name, split, bodies, motion, kind.physics, kind.view.camera, scenario

@@ -18,6 +18,7 @@ import numpy as np
 
 from conf.schema import BenchmarkConfig
 from data.records import POOLS, FrameRef, RetrievalQuery, Scene
+from data.tracks.build_items import builder_name, cell_quotas
 from data.tracks.quota import named_rng, round_robin
 from data.world.displacement import on_screen_positions
 
@@ -91,24 +92,20 @@ def make_databases(
         The queries whose target has no twin in its database, with the standard test marked; frames
         by database; and counts of the queries and frames that were left out.
     """
-    unique = {pool: UniqueFrames(scene_of) for pool in POOLS}
-    kept = {
-        pool: drop_twins(cfg, [q for q in queries if q.pool == pool], unique[pool])
-        for pool in POOLS
-    }
-    dropped = sum(frames.left_out for frames in unique.values())
+    unique, kept, twins = {}, {}, {}
+    for pool in POOLS:
+        unique[pool] = UniqueFrames(scene_of)
+        kept[pool] = drop_twins(cfg, [q for q in queries if q.pool == pool], unique[pool])
+        twins[pool] = unique[pool].left_out
     kept["future"] = mark_standard(kept["future"], cfg.retrieval.standard)
     test, source = future_databases(cfg, kept["future"], scene_ids, unique["future"])
     absent = counterfactual_database(cfg, kept["counterfactual"], unique["counterfactual"])
     counts = {
-        "queries dropped, target has a twin": dropped,
-        "frames left out, twins": sum(frames.left_out for frames in unique.values()) - dropped,
+        "queries dropped, target has a twin": sum(twins.values()),
+        "frames left out, twins": sum(unique[p].left_out - twins[p] for p in POOLS),
     }
-    return (
-        [*kept["future"], *kept["counterfactual"]],
-        {"test": test, "future": source, "counterfactual": absent},
-        counts,
-    )
+    databases = {"test": test, "future": source, "counterfactual": absent}
+    return [*kept["future"], *kept["counterfactual"]], databases, counts
 
 
 def future_databases(
@@ -154,15 +151,12 @@ def drop_twins(
 ) -> list[RetrievalQuery]:
     """Queries up to their quotas whose target is not a twin of another target, because both frames
     would be right answers. The test split has precedence."""
-    kept: Counter[tuple[int | None, str]] = Counter()
-    chosen = set()
+    quotas, kept, chosen = cell_quotas(cfg), Counter(), set()
     for query in sorted(queries, key=lambda q: q.split != "test"):
-        quota = cfg.retrieval.counterfactual
-        if query.builder is not None:
-            quota = cfg.retrieval.builders[str(query.builder)]
-        full = kept[query.builder, query.split] >= getattr(quota, query.split)
-        if not full and (query.target in unique.frames or unique.add(query.target)):
-            kept[query.builder, query.split] += 1
+        cell = builder_name(query.builder), query.split
+        is_full = kept[cell] >= getattr(quotas[cell[0]], query.split)
+        if not is_full and (query.target in unique.frames or unique.add(query.target)):
+            kept[cell] += 1
             chosen.add(query.query_id)
     return [q for q in queries if q.query_id in chosen]
 
@@ -171,14 +165,9 @@ def mark_standard(queries: list[RetrievalQuery], total: int) -> list[RetrievalQu
     """Mark `total` test queries as the standard test: the first ones of each builder, with equal
     counts."""
     builders = sorted({q.builder for q in queries if q.split == "test"})
-    left = {
-        builder: total * (k + 1) // len(builders) - total * k // len(builders)
-        for k, builder in enumerate(builders)
-    }
-    marked = []
-    for query in queries:
-        standard = query.split == "test" and left[query.builder] > 0
-        if standard:
-            left[query.builder] -= 1
-        marked.append(replace(query, standard=standard))
-    return marked
+    standard: set[str] = set()
+    for k, builder in enumerate(builders):
+        count = total * (k + 1) // len(builders) - total * k // len(builders)
+        own = [q.query_id for q in queries if q.split == "test" and q.builder == builder]
+        standard.update(own[:count])
+    return [replace(query, standard=query.query_id in standard) for query in queries]

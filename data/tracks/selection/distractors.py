@@ -1,12 +1,14 @@
-"""Distractors that differ visibly from the target, and items made of them.
+"""Selection items with distractors that differ visibly from the target.
 
-A family's module has `CELLS`, its cells by subtype, and `make_item(subtype, scene, ...)`, which
-makes at most one item of a cell from a scene.
+A family is a module (or an object) with `CELLS`, its cells by subtype, and two functions:
+
+    timings(subtype, scene) -> list[Timing]                          where an item of a cell may lie
+    make_item(subtype, scene, timing, rng, picker) -> item or None   the item at one of these
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -23,13 +25,27 @@ from data.world.displacement import (
 BUILDERS_VERSION = "5"
 """Version of the item and query builders: changes whenever the same scenes would give others."""
 
-Picked = tuple[tuple[Candidate, ...], float]
-"""Three distractors, and the smallest displacement between two of the four candidates (px)."""
+Pool = tuple[Iterable[Candidate], int]
+"""Possible distractors, best first, and how many of them to use at most."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The inclusive prefix of an item, its target frame, and the frame of its event, if any."""
+
+    start: int
+    stop: int
+    target: int
+    event: int | None = None
+
+    def outside_prefix(self, frames: Iterable[int]) -> list[int]:
+        """The frames that are not in the prefix: a frame of it is recognisable by comparison."""
+        return [int(f) for f in frames if not self.start <= f <= self.stop]
 
 
 @dataclass
 class DistractorPicker:
-    """Picks three distractors that differ visibly from the target and from each other.
+    """Makes items whose candidates differ visibly from each other.
 
     Attributes:
         least: Smallest displacement between two candidates, px at 336 x 336, in some object.
@@ -43,131 +59,103 @@ class DistractorPicker:
     scene_of: Callable[[str], Scene]
     dropped: int = 0
 
-    def pick(
+    def make_item(
         self,
-        target: FrameRef,
-        pool: Iterable[Candidate],
+        scene: Scene,
+        timing: Timing,
+        pools: Sequence[Pool],
         about: tuple[int, ...] | None = None,
-        earlier: int | None = None,
-    ) -> Picked | None:
-        """Pick the first three of `pool` that differ enough; None where there are fewer.
+        *,
+        family: str,
+        subtype: str,
+        suite: str = "dynapix",
+        **fields: Any,
+    ) -> SelectionItem | None:
+        """Make an item from the first distractors of each pool that differ enough.
 
         Args:
             about: Indices of the objects that must differ; any object by default.
-            earlier: How many of the three come from before the target, as far as the pool has
-                such frames. Without this balance the target's place in time among the candidates
-                would reveal the answer.
-        """
-        if earlier is None:
-            return self.pick_each(target, (pool, 3), about=about)
-        pool = list(pool)
-        before = [c for c in pool if c.frame < target.frame]
-        after = [c for c in pool if c.frame > target.frame]
-        chosen = self._extend([target], before, earlier, about)
-        chosen = self._extend(chosen, after, 3 - earlier, about)
-        return self._finish(self._extend(chosen, pool, 4 - len(chosen), about))
+            fields: The question and the construction axes that apply.
 
-    def pick_each(
-        self,
-        target: FrameRef,
-        *pools: tuple[Iterable[Candidate], int],
-        about: tuple[int, ...] | None = None,
-    ) -> Picked | None:
-        """Pick the given number of distractors from each of several pools."""
-        chosen: list[FrameRef] = [target]
-        for pool, count in pools:
-            wanted = len(chosen) + count
-            chosen = self._extend(chosen, pool, count, about)
-            if len(chosen) < wanted:
+        Returns:
+            An item whose first candidate is the target (`data.tracks.quota.fill_quota` shuffles
+            them), or None where the pools have fewer than three such distractors.
+        """
+        chosen = [Candidate(scene.scene_id, timing.target)]
+        for k, (pool, count) in enumerate(pools):
+            if len(chosen) + sum(most for _, most in pools[k:]) < 4:
                 break
-        return self._finish(chosen)
+            self._extend(chosen, pool, min(len(chosen) + count, 4), about)
+        if len(chosen) < 4:
+            self.dropped += 1
+            return None
+        return SelectionItem(
+            item_id=f"{family}-{subtype}-{scene.scene_id}-{timing.target}",
+            split=scene.split,
+            suite=suite,
+            family=family,
+            subtype=subtype,
+            scene_id=scene.scene_id,
+            prefix_start=timing.start,
+            prefix_stop=timing.stop,
+            target_frame=timing.target,
+            event_frame=timing.event,
+            candidates=tuple(chosen),
+            answer=0,
+            min_displacement=min(self._displacement(a, b) for a, b in combinations(chosen, 2)),
+            **fields,
+        )
 
     def sample_scenes(self, scene: Scene, rng: np.random.Generator, count: int) -> list[Scene]:
         """Sample other scenes of the split, sorted by how many objects they share with `scene`."""
         names = rng.choice(self.scene_ids, min(count + 1, len(self.scene_ids)), replace=False)
         scenes = [self.scene_of(str(name)) for name in names if name != scene.scene_id]
-        looks = set(scene.objects)
-        return sorted(scenes, key=lambda s: -len(looks & set(s.objects)))
+        return sorted(scenes, key=lambda s: -len({*scene.objects} & {*s.objects}))
 
     def _extend(
         self,
-        chosen: list[FrameRef],
+        chosen: list[Candidate],
         pool: Iterable[Candidate],
-        count: int,
+        size: int,
         about: tuple[int, ...] | None,
-    ) -> list[FrameRef]:
-        """Append the first `count` frames of a pool that differ from all chosen ones."""
-        extended = list(chosen)
-        for candidate in pool if count else ():
-            if all(self._displacement(candidate, c, about) >= self.least for c in extended):
-                extended.append(candidate)
-                if len(extended) == len(chosen) + count:
-                    break
-        return extended
+    ) -> None:
+        """Append the first frames of a pool that differ from all chosen ones, up to `size`."""
+        pool = iter(pool)
+        while len(chosen) < size and (candidate := next(pool, None)) is not None:
+            if all(self._displacement(candidate, c, about) >= self.least for c in chosen):
+                chosen.append(candidate)
 
-    def _finish(self, chosen: list[FrameRef]) -> Picked | None:
-        if len(chosen) < 4:
-            self.dropped += 1
-            return None
-        least = min(self._displacement(a, b, None) for a, b in combinations(chosen, 2))
-        return tuple(chosen[1:]), least
-
-    def _displacement(self, one: FrameRef, two: FrameRef, about: tuple[int, ...] | None) -> float:
+    def _displacement(
+        self, one: FrameRef, two: FrameRef, about: tuple[int, ...] | None = None
+    ) -> float:
         scene = self.scene_of(one.scene_id)
         if one.scene_id == two.scene_id:
             return float(frame_displacements(scene, about)[one.frame, two.frame])
         return cross_scene_displacement(scene, one.frame, self.scene_of(two.scene_id), two.frame)
 
 
-def new_item(
-    scene: Scene,
-    family: str,
-    subtype: str,
-    question: str,
-    prefix: tuple[int, int],
-    target: int,
-    picked: Picked,
-    suite: str = "dynapix",
-    **axes: Any,
-) -> SelectionItem:
-    """An item with the target as its first candidate; `axes` are the construction axes that apply.
+def balance_in_time(
+    pool: Iterable[Candidate], target: int, rng: np.random.Generator
+) -> tuple[Pool, Pool, Pool]:
+    """Divide a scene's pool so that 0 to 3 distractors, at random, precede the target.
 
-    `data.tracks.quota.fill_quota` shuffles the candidates.
+    Without this balance the target's place in time among the candidates would reveal the answer.
+    The last pool replaces frames that the other two lack.
     """
-    distractors, least = picked
-    return SelectionItem(
-        item_id=f"{family}-{subtype}-{scene.scene_id}-{target}",
-        split=scene.split,
-        suite=suite,
-        family=family,
-        subtype=subtype,
-        question=question,
-        scene_id=scene.scene_id,
-        prefix_start=prefix[0],
-        prefix_stop=prefix[1],
-        target_frame=target,
-        candidates=(Candidate(scene.scene_id, target), *distractors),
-        answer=0,
-        min_displacement=least,
-        **axes,
-    )
+    pool = list(pool)
+    earlier = int(rng.integers(4))
+    before = [c for c in pool if c.frame < target]
+    after = [c for c in pool if c.frame > target]
+    return (before, earlier), (after, 3 - earlier), (pool, 3)
 
 
-def visible_objects(scene: Scene, prefix: tuple[int, int]) -> tuple[int, ...]:
+def visible_objects(scene: Scene, timing: Timing) -> tuple[int, ...]:
     """Indices of the objects on screen in a prefix.
 
     Only these may distinguish candidates, because the entry of another object is unpredictable.
     """
-    start, stop = prefix
-    return tuple(
-        np.flatnonzero(on_screen_positions(scene)[1][start : stop + 1].any(axis=0)).tolist()
-    )
-
-
-def outside_prefix(frames: Iterable[int], prefix: tuple[int, int]) -> list[int]:
-    """The frames that are not part of a prefix: a frame of it is recognisable by comparison."""
-    start, stop = prefix
-    return [int(f) for f in frames if not start <= f <= stop]
+    on_screen = on_screen_positions(scene)[1][timing.start : timing.stop + 1]
+    return tuple(np.flatnonzero(on_screen.any(axis=0)).tolist())
 
 
 def scene_candidates(scene: Scene, frames: Iterable[int], source: str) -> Iterator[Candidate]:

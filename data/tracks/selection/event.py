@@ -6,20 +6,21 @@ frame. Framing *contact*: the prefix ends at the collision and the target is `ga
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from data.records import Candidate, FrameRef, Scene, SelectionItem
+from data.records import Candidate, Scene, SelectionItem
 from data.tracks.selection.distractors import (
     DistractorPicker,
-    new_item,
-    outside_prefix,
+    Timing,
+    balance_in_time,
     scene_candidates,
     visible_objects,
 )
 from data.world.displacement import object_match_scores
+from data.world.events import collision_frames
 
 QUESTION = "Which image is closest to the correct future state of the whole scene?"
 PREFIX_STEP = 20
@@ -51,80 +52,48 @@ CELLS = {
 """The paper's seven subtypes (paper, Table "The seven event-anchored subtypes")."""
 
 
-@dataclass(frozen=True)
-class EventTiming:
-    """Frames of an item around an event: the event, the prefix's first and last, the target."""
-
-    event: int
-    start: int
-    stop: int
-    target: int
-
-
-def event_timings(scene: Scene, cell: EventCell) -> Iterator[EventTiming]:
-    """The timings of a scene's collisions that leave room for prefix and target, in order."""
-    for event in dict.fromkeys(c.frame for c in scene.collisions):
-        stop = event - cell.gap if cell.framing == "future" else event
-        timing = EventTiming(event, stop - PREFIX_STEP, stop, stop + cell.gap)
-        if timing.start >= 0 and timing.target <= scene.frames - 1 - TAIL:
-            yield timing
+def timings(subtype: str, scene: Scene) -> list[Timing]:
+    """The scene's collisions that leave room for prefix and target, in order."""
+    cell = CELLS[subtype]
+    lead = cell.gap if cell.framing == "future" else 0
+    return [
+        Timing(stop - PREFIX_STEP, stop, stop + cell.gap, event)
+        for event in collision_frames(scene)
+        if (stop := event - lead) >= PREFIX_STEP and stop + cell.gap <= scene.frames - 1 - TAIL
+    ]
 
 
 def make_item(
-    subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
+    subtype: str, scene: Scene, timing: Timing, rng: np.random.Generator, picker: DistractorPicker
 ) -> SelectionItem | None:
-    """Make an item of a cell around one of the scene's collisions, tried in a random order."""
+    """Make an item of a cell around a collision."""
     cell = CELLS[subtype]
-    timings = list(event_timings(scene, cell))
-    for k in rng.permutation(len(timings)):
-        timing = timings[k]
-        prefix = (timing.start, timing.stop)
-        picked = picker.pick(
-            FrameRef(scene.scene_id, timing.target),
-            wrong_frames(cell, scene, timing, rng, picker),
-            visible_objects(scene, prefix),
-            None if cell.distractors == "cross_scene" else int(rng.integers(4)),
-        )
-        if picked is not None:
-            return new_item(
-                scene,
-                "event",
-                subtype,
-                QUESTION,
-                prefix,
-                timing.target,
-                picked,
-                event_frame=timing.event,
-                framing=cell.framing,
-                distractors=cell.distractors,
-                gap=cell.gap,
-            )
-    return None
+    if cell.distractors == "cross_scene":
+        scenes = picker.sample_scenes(scene, rng, CROSS_SCENES)
+        targets = ((other, [t.target for t in timings(subtype, other)]) for other in scenes)
+        pools = [((Candidate(o.scene_id, t[0], "cross_scene") for o, t in targets if t), 3)]
+    else:
+        wrong = scene_candidates(scene, _wrong_frames(cell, scene, timing, rng), cell.distractors)
+        pools = balance_in_time(wrong, timing.target, rng)
+    return picker.make_item(
+        scene,
+        timing,
+        pools,
+        visible_objects(scene, timing),
+        family="event",
+        subtype=subtype,
+        question=QUESTION,
+        **asdict(cell),
+    )
 
 
-def wrong_frames(
-    cell: EventCell,
-    scene: Scene,
-    timing: EventTiming,
-    rng: np.random.Generator,
-    picker: DistractorPicker,
-) -> Iterable[Candidate]:
-    """Candidate distractors of the cell's source, best first.
-
-    Sources: frames at fixed offsets from the target, the scene's frames most similar to the
-    target, or the targets of other scenes.
-    """
-    target, prefix = timing.target, (timing.start, timing.stop)
+def _wrong_frames(
+    cell: EventCell, scene: Scene, timing: Timing, rng: np.random.Generator
+) -> Iterable[int]:
+    """Frames at fixed offsets from the target in random order, or the most similar ones first."""
+    target = timing.target
     if cell.distractors == "same_offset":
         pool = [f for o in OFFSETS for f in (target - o, target + o) if 0 <= f < scene.frames]
-        wrong = rng.permutation(outside_prefix(pool, prefix))
-        return scene_candidates(scene, wrong, cell.distractors)
-    if cell.distractors == "same_obj_match":
-        similar = np.argsort(object_match_scores(scene, target), kind="stable")
-        wrong = outside_prefix(similar[similar != target], prefix)
-        return scene_candidates(scene, wrong, cell.distractors)
-    return (
-        Candidate(other.scene_id, first.target, cell.distractors)
-        for other in picker.sample_scenes(scene, rng, CROSS_SCENES)
-        for first in list(event_timings(other, cell))[:1]
-    )
+        return rng.permutation(timing.outside_prefix(pool))
+    similar = np.argsort(object_match_scores(scene, target), kind="stable")
+    return timing.outside_prefix(similar[similar != target])

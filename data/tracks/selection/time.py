@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from data.records import SELECTION_SECOND, FrameRef, Scene, SelectionItem
+from data.records import SELECTION_SECOND, Scene, SelectionItem
 from data.tracks.selection.distractors import (
     DistractorPicker,
-    new_item,
+    Timing,
+    balance_in_time,
     scene_candidates,
     visible_objects,
 )
@@ -26,38 +25,30 @@ def question(seconds: int) -> str:
     )
 
 
+def timings(subtype: str, scene: Scene) -> list[Timing]:
+    """The prefix is the scene's first second."""
+    return [Timing(0, SELECTION_SECOND - 1, SELECTION_SECOND * (1 + CELLS[subtype]))]
+
+
 def make_item(
-    subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
+    subtype: str, scene: Scene, timing: Timing, rng: np.random.Generator, picker: DistractorPicker
 ) -> SelectionItem | None:
-    """Make an item whose prefix is the scene's first second."""
-    stop = SELECTION_SECOND - 1
-    target = SELECTION_SECOND + SELECTION_SECOND * CELLS[subtype]
-    return make_item_at(scene, (0, stop), target, rng, picker)
+    """Make an item whose distractors are other frames after the prefix.
 
-
-def make_item_at(
-    scene: Scene,
-    prefix: tuple[int, int],
-    target: int,
-    rng: np.random.Generator,
-    picker: DistractorPicker,
-    **axes: Any,
-) -> SelectionItem | None:
-    """Make an item whose question gives the seconds from the prefix's end to `target`.
-
-    The distractors are other frames after the prefix. `axes` are those of `new_item`.
+    Its question gives the whole seconds from the prefix's end to the target, as its subtype does.
     """
-    horizon = target - prefix[1]
+    horizon = timing.target - timing.stop
     seconds = horizon // SELECTION_SECOND
-    later = rng.permutation(np.arange(prefix[1] + 1, scene.frames))
-    picked = picker.pick(
-        FrameRef(scene.scene_id, target),
-        scene_candidates(scene, later[later != target], "same_time"),
-        visible_objects(scene, prefix),
-        int(rng.integers(4)),
+    later = rng.permutation(np.arange(timing.stop + 1, scene.frames))
+    wrong = scene_candidates(scene, later[later != timing.target], "same_time")
+    return picker.make_item(
+        scene,
+        timing,
+        balance_in_time(wrong, timing.target, rng),
+        visible_objects(scene, timing),
+        family="time",
+        subtype=f"in_{seconds}s",
+        question=question(seconds),
+        distractors="same_time",
+        horizon=horizon,
     )
-    if picked is None:
-        return None
-    axes |= {"distractors": "same_time", "horizon": horizon}
-    subtype = f"in_{seconds}s"
-    return new_item(scene, "time", subtype, question(seconds), prefix, target, picked, **axes)

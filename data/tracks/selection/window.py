@@ -8,17 +8,17 @@ random part of the less similar half. Similarity and displacement count those ob
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import product
 
 import numpy as np
 
 from conf.schema.benchmark import WINDOW_DIFFICULTIES, WINDOW_FAMILIES, WINDOW_HORIZONS
-from data.records import FrameRef, Scene, SelectionItem
+from data.records import Scene, SelectionItem
 from data.tracks.selection.distractors import (
     DistractorPicker,
-    new_item,
-    outside_prefix,
+    Timing,
+    balance_in_time,
     scene_candidates,
     visible_objects,
 )
@@ -44,60 +44,51 @@ CELLS = {
 }
 
 
+def timings(subtype: str, scene: Scene) -> list[Timing]:
+    """Every window of the cell's horizon, whatever its group."""
+    horizon = CELLS[subtype].horizon
+    stops = range(PREFIX_FRAMES - 1, scene.frames - horizon)
+    return [Timing(stop - PREFIX_FRAMES + 1, stop, stop + horizon) for stop in stops]
+
+
 def make_item(
-    subtype: str, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
+    subtype: str, scene: Scene, timing: Timing, rng: np.random.Generator, picker: DistractorPicker
 ) -> SelectionItem | None:
-    """Make an item at one of the scene's windows of the cell's group, tried in a random order."""
+    """Make an item at a window; None where the window is of another group or shows no subject."""
     cell = CELLS[subtype]
-    last_start = scene.frames - PREFIX_FRAMES - cell.horizon
-    for start in rng.permutation(last_start + 1).tolist():
-        prefix = (start, stop) = (start, start + PREFIX_FRAMES - 1)
-        if window_group(scene, start, stop, cell.horizon) != cell.group:
-            continue
-        target = stop + cell.horizon
-        visible = visible_objects(scene, prefix)
-        subjects = subject_objects(cell, scene, stop, target)
-        about = visible if subjects is None else tuple(k for k in subjects if k in visible)
-        if not about:
-            continue
-        similar = np.argsort(object_match_scores(scene, target, about), kind="stable")
-        pool = np.array(outside_prefix(similar[similar != target], prefix))
-        source = "same_near"
-        if cell.difficulty == "easy":
-            # A random order, because the most different frames are neighbours of each other, which
-            # would make the target the odd one out.
-            pool, source = rng.permutation(pool[len(pool) // 2 :]), "same_far"
-        picked = picker.pick(
-            FrameRef(scene.scene_id, target),
-            scene_candidates(scene, pool, source),
-            about,
-            int(rng.integers(4)),
-        )
-        if picked is not None:
-            return new_item(
-                scene,
-                "window",
-                subtype,
-                QUESTION,
-                prefix,
-                target,
-                picked,
-                distractors=source,
-                horizon=cell.horizon,
-                group=cell.group,
-                window_family=cell.window_family,
-                difficulty=cell.difficulty,
-            )
-    return None
+    if window_group(scene, timing.start, timing.stop, cell.horizon) != cell.group:
+        return None
+    visible = visible_objects(scene, timing)
+    subjects = subject_objects(cell, scene, timing)
+    about = visible if subjects is None else tuple(k for k in subjects if k in visible)
+    if not about:
+        return None
+    similar = np.argsort(object_match_scores(scene, timing.target, about), kind="stable")
+    frames = np.array(timing.outside_prefix(similar[similar != timing.target]))
+    source = "same_near"
+    if cell.difficulty == "easy":
+        # A random order, because the most different frames are neighbours of each other, which
+        # would make the target the odd one out.
+        frames, source = rng.permutation(frames[len(frames) // 2 :]), "same_far"
+    return picker.make_item(
+        scene,
+        timing,
+        balance_in_time(scene_candidates(scene, frames, source), timing.target, rng),
+        about,
+        family="window",
+        subtype=subtype,
+        question=QUESTION,
+        distractors=source,
+        **asdict(cell),
+    )
 
 
-def subject_objects(
-    cell: WindowCell, scene: Scene, stop: int, target: int
-) -> tuple[int, ...] | None:
+def subject_objects(cell: WindowCell, scene: Scene, timing: Timing) -> tuple[int, ...] | None:
     """Indices of the objects that an item is about.
 
     None stands for the whole scene; the tuple is empty where the window has no such object.
     """
+    stop, target = timing.stop, timing.target
     if cell.window_family == "A":
         return None
     if cell.window_family == "B":

@@ -78,8 +78,8 @@ def with_one_negative(rows: Rows) -> Rows:
     ("edit", "code", "name"),
     [
         (duplicated, "duplicate-record", "retrieval.parquet"),
-        (about_test_scene, "split-leak", "training query"),
-        (ranking_test_frame, "split-leak", "training query"),
+        (about_test_scene, "split-leak", "train split"),
+        (ranking_test_frame, "split-leak", "train split"),
         (with_one_negative, "too-few-negatives", "train.hard_negatives=2"),
     ],
 )
