@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 from tqdm import tqdm
@@ -76,6 +77,12 @@ class Workers:
                             code="dying-workers",
                         ) from error
                     log.warning("a worker died; retrying its jobs")
+
+    def write_files(self, jobs: Mapping[Path, Job], title: str, unit: str) -> None:
+        """Run the jobs whose files do not exist; see `run`. A job writes its file last."""
+        missing = {str(path): job for path, job in jobs.items() if not path.exists()}
+        for _ in self.run(missing, title, unit, done=len(jobs) - len(missing)):
+            pass
 
     def _results(self, jobs: Mapping[str, Job]) -> Iterator[tuple[str, Any]]:
         from joblib import Parallel, delayed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -58,40 +59,35 @@ def _revolve(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The surface of revolution of a profile of (radius, height) about the z axis."""
     turns = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
-    around = np.stack([np.cos(turns), np.sin(turns)], axis=1)
 
     def spin(profile: np.ndarray) -> np.ndarray:
-        flat = profile[:, None, 0, None] * around[None]
-        return np.concatenate(
-            [flat, np.broadcast_to(profile[:, None, 1:], (*flat.shape[:2], 1))], -1
-        )
+        radius, height = profile.T[..., None]
+        around = np.broadcast_arrays(radius * np.cos(turns), radius * np.sin(turns), height)
+        return np.stack(around, axis=-1).reshape(-1, 3)
 
     uvs = np.stack(np.broadcast_arrays(turns[None] / (2 * np.pi), down[:, None]), axis=-1)
     row, column = np.meshgrid(np.arange(len(points) - 1), np.arange(SEGMENTS), indexing="ij")
     a = (row * (SEGMENTS + 1) + column).ravel()
     b = a + SEGMENTS + 1
     triangles = np.concatenate([np.stack([a, b, a + 1], 1), np.stack([a + 1, b, b + 1], 1)])
-    return spin(points).reshape(-1, 3), spin(normals).reshape(-1, 3), uvs.reshape(-1, 2), triangles
+    return spin(points), spin(normals), uvs.reshape(-1, 2), triangles
 
 
 def _cube() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)
-    vertices, normals, triangles = [], [], []
-    for axis in range(3):
-        for side in (-1.0, 1.0):
-            face = np.insert(corners, axis, side, axis=1)
-            first, second, third = face[0], face[1], face[2]
-            outward = np.cross(second - first, third - second)[axis] * side > 0
-            base = 4 * len(vertices)
-            vertices.append(face if outward else face[::-1])
-            normals.append(np.tile(np.insert(np.zeros(2), axis, side), (4, 1)))
-            triangles += [[base, base + 1, base + 2], [base, base + 2, base + 3]]
+    vertices, normals = [], []
+    for axis, side in product(range(3), (-1.0, 1.0)):
+        face = np.insert(corners, axis, side, axis=1)
+        is_outward = np.cross(face[1] - face[0], face[2] - face[1])[axis] * side > 0
+        vertices.append(face if is_outward else face[::-1])
+        normals.append(np.tile(np.insert(np.zeros(2), axis, side), (4, 1)))
+    triangles = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(6)[:, None, None]
     uvs = np.tile((corners + 1) / 2, (6, 1))
     return (
         CUBE_HALF * np.concatenate(vertices),
         np.concatenate(normals),
         uvs,
-        np.array(triangles),
+        triangles.reshape(-1, 3),
     )
 
 

@@ -63,13 +63,10 @@ def make_items_and_queries(
     }
     # Largest quotas first, so that no single worker is left with a large job at the end.
     jobs = {
-        name: partial(_run_job, cfg, folder, scene_ids, name, quota, paths[name])
+        paths[name]: partial(_run_job, cfg, folder, scene_ids, name, quota, paths[name])
         for name, quota in sorted(quotas.items(), key=lambda job: -job[1].train)
-        if not paths[name].exists()
     }
-    done = len(quotas) - len(jobs)
-    for _ in workers.run(jobs, "making items and queries", "cell", done):
-        pass
+    workers.write_files(jobs, "making items and queries", "cell")
     items: list[SelectionItem] = []
     queries: list[RetrievalQuery] = []
     dropped: Counter[str] = Counter()

@@ -49,13 +49,12 @@ def make_scenes(
     names = [scene_name(cfg, index) for index in range(cfg.scenes)]
     scene_ids = split_scenes(cfg, names)
     split_of = {name: split for split, some in scene_ids.items() for name in some}
+    paths = [scene_path(folder, name) for name in names]
     jobs = {
-        name: partial(_simulate_one, cfg, index, split_of[name], scene_path(folder, name))
-        for index, name in enumerate(names)
-        if not scene_path(folder, name).exists()
+        path: partial(_simulate_one, cfg, index, split_of[path.stem], path)
+        for index, path in enumerate(paths)
     }
-    for _ in workers.run(jobs, "simulating scenes", "scene", done=cfg.scenes - len(jobs)):
-        pass
+    workers.write_files(jobs, "simulating scenes", "scene")
     return scene_ids, {}
 
 
@@ -126,12 +125,10 @@ def read_release(
     split_of = {path: split for split, some in split_scenes(cfg, paths).items() for path in some}
     parts = {path: _part_path(folder, path, split_of[path]) for path in paths}
     jobs = {
-        str(path): partial(_read_one, cfg, path, split_of[path], folder, part)
+        part: partial(_read_one, cfg, path, split_of[path], folder, part)
         for path, part in parts.items()
-        if not part.exists()
     }
-    for _ in workers.run(jobs, f"reading {cfg.simulator}", "scene", done=len(paths) - len(jobs)):
-        pass
+    workers.write_files(jobs, f"reading {cfg.simulator}", "scene")
     scene_ids: dict[str, list[str]] = {split: [] for split in SPLITS}
     problems = []
     for path, part in parts.items():
