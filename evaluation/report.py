@@ -18,43 +18,43 @@ PAGE = "report.html"
 
 @command("evaluation.report", ReportCommand)
 def main(cfg: ReportCommand, run: Run) -> None:
-    from evaluation.reporting.runs import gather_runs
+    from evaluation.reporting.runs import RETRIEVAL_KINDS, SELECTION_KINDS, gather_runs
 
     root = Path(cfg.checkpoints)
     runs = gather_runs(root, cfg.runs)
 
-    from evaluation.reporting.comparisons import check_retrieval_sizes, check_same_build
+    from evaluation.metrics.results import RetrievalResult, SelectionResult
+    from evaluation.reporting.comparisons import check_comparable
     from evaluation.reporting.item_browser import browse_items
     from evaluation.reporting.measurements import deduplicate, read_measurements
     from evaluation.reporting.page import write_page
     from evaluation.reporting.sections import build_sections
 
-    selections, retrievals = read_measurements(runs, root)
-    check_same_build(m.run for m in (*selections, *retrievals))
-    check_retrieval_sizes(retrievals)
+    selections = read_measurements(runs, root, SELECTION_KINDS, SelectionResult)
+    retrievals = read_measurements(runs, root, RETRIEVAL_KINDS, RetrievalResult)
+    check_comparable(selections, retrievals)
     browser = browse_items(selections, Path(cfg.store), cfg.items, cfg.seed)
 
     # The previous report stays until the new one is complete.
     partial = run.folder / "partial"
     shutil.rmtree(partial, ignore_errors=True)
-    figures, tables = partial / "figures", partial / "tables"
-    for folder in (figures, tables):
-        folder.mkdir(parents=True)
+    for name in ("figures", "tables"):
+        (partial / name).mkdir(parents=True)
     try:
         rows = deduplicate(selections), deduplicate(retrievals)
-        sections = build_sections(*rows, runs, browser, figures)
-        for section in sections:
-            for table in (*section.tables, *section.details):
-                write_text(tables / f"{table.name}.md", table.as_markdown())
-                write_text(tables / f"{table.name}.tex", table.as_latex())
-        text = "\n\n".join(f"{t.caption}\n\n{t}" for section in sections for t in section.tables)
+        sections = build_sections(*rows, runs, browser)
+        tables = [table for section in sections for table in section.tables]
+        for figure in (figure for section in sections for figure in section.figures):
+            write_text(partial / "figures" / f"{figure.name}.svg", figure.svg)
+        for table in tables:
+            write_text(partial / "tables" / f"{table.name}.md", table.as_markdown())
+            write_text(partial / "tables" / f"{table.name}.tex", table.as_latex())
+        text = "\n\n".join(str(table) for table in tables if not table.folded)
         write_text(partial / "report.txt", text + "\n")
-        write_page(partial / PAGE, sections, browser, [f"{r.kind}/{r.name}" for r in runs])
-        for folder in (figures, tables):
-            shutil.rmtree(run.folder / folder.name, ignore_errors=True)
-            folder.rename(run.folder / folder.name)
-        for name in ("report.txt", PAGE):
-            (partial / name).replace(run.folder / name)
+        write_page(partial / PAGE, sections, browser, [r.title for r in runs])
+        for part in partial.iterdir():
+            shutil.rmtree(run.folder / part.name, ignore_errors=True)
+            part.replace(run.folder / part.name)
     finally:
         shutil.rmtree(partial)
 

@@ -37,7 +37,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
 
     from data.render.frame_cache import FrameReader
     from evaluation.embedders.base import embed_frames, embed_queries, open_embedders
-    from evaluation.metrics import breakdown
+    from evaluation.metrics import results
     from evaluation.reporting import tables
     from evaluation.retrieval import faiss_index, standard_test
     from models.precision import resolve_precision
@@ -64,10 +64,10 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
                 query_rows, targets, embeddings, names, preset.widths, cfg.probes, cfg.seed
             )
             indexes += [{"name": name, **summary} for summary in summaries]
-        rows += breakdown.retrieval_rows(store.name, name, ranks[name], queries, cfg.seed)
-        curves += breakdown.recall_curves(name, ranks[name], queries)
+        rows += results.retrieval_results(store.name, name, ranks[name], queries, cfg.seed)
+        curves.append(results.recall_curve(name, ranks[name]))
 
-    differences = breakdown.compare_retrievers(ranks, queries, cfg.seed)
+    differences = results.compare_retrievers(ranks, queries, cfg.seed)
     extra = [tables.rank_differences_table(differences)] if differences else []
     extra += [tables.index_table(indexes)] if indexes else []
     standard_test.write_ranks(run.folder, ranks, queries)

@@ -60,9 +60,19 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
             keys[mode, control] = responses.keys[mode]
 
     about = {"build": store.identity, "asked": [[*group, key] for group, key in keys.items()]}
-    metrics = selection_report.write_report(
-        answers, items, model.name, store.name, cfg, run.folder, about
+    choices = [
+        selection_report.Choices.from_answers(model.name, *variant, of_variant)
+        for variant, of_variant in answers.items()
+    ]
+    results = selection_report.write_report(
+        choices, items, store.name, cfg.seed, run.folder, cfg.suite, **about
     )
+    metrics = {
+        f"{r.mode}_{name}": value
+        for r in results
+        if r.control == cfg.control
+        for name, value in (*r.metrics.items(), ("parse_rate", r.parse_rate))
+    }
     letter = answers[modes[0], cfg.control][0].letter
     draw_item(items[0], letter, FrameReader(store), run.folder / "item.png")
     return metrics

@@ -36,9 +36,8 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from data.render.frame_cache import FrameReader
     from evaluation.embedders.base import open_embedders
     from evaluation.generators.base import open_generator
-    from evaluation.metrics import breakdown
+    from evaluation.metrics import results
     from evaluation.reporting import tables
-    from evaluation.reporting.results import UNTRAINED
     from evaluation.retrieval import predicted_texts, standard_test, text_matching
     from models.precision import resolve_precision
     from models.student.prompts import text_sample
@@ -64,10 +63,10 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         route = predicted_texts.ROUTES[key]
         log.info("matching %s with %s", route.title, matcher.name)
         ranks = text_matching.rank_by_text(cfg, route, matcher, texts, queries, database, store)
-        title = f"{name} {route.title}, {matcher.name.removeprefix(UNTRAINED).strip()}"
-        route_rows = breakdown.retrieval_rows(store.name, title, ranks, queries, cfg.seed)
+        title = f"{name} {route.title}, {matcher.name.removeprefix(results.UNTRAINED).strip()}"
+        route_rows = results.retrieval_results(store.name, title, ranks, queries, cfg.seed)
         rows += route_rows
-        curves += breakdown.recall_curves(title, ranks, queries)
+        curves.append(results.recall_curve(title, ranks))
         matched += text_matching.matched_texts(key, queries, texts[route.mode], ranks)
         measures = route_rows[0].measures
         metrics |= {f"{key}_{m}": i.value for m, i in measures.items() if m != "tie_rate"}
@@ -77,8 +76,8 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         run.folder,
         rows,
         curves,
-        [tables.parsing_table(counts, "Texts")],
-        "retrieval_two_stage",
+        [tables.parsing_table(counts)],
+        "two_stage",
         build=store.identity,
         indexes=[],
         texts=counts,

@@ -20,7 +20,7 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.experiments.experiment import Experiment, Job, create_parser
-from evaluation.reporting.results import RetrievalResult
+from evaluation.metrics.results import RetrievalResult, from_json
 
 RANKS = Path(__file__).with_name("ranks.parquet")
 VARIANTS: dict[str, list[str]] = {
@@ -51,7 +51,7 @@ def main() -> None:
 def read_ranks(folder: Path) -> list[dict[str, Any]]:
     """The results of a run over all builders, by width."""
     report = json.loads((folder / "report.json").read_text())
-    results = [RetrievalResult.from_dict(row) for row in report["rows"] if row["builder"] is None]
+    results = from_json(list[RetrievalResult], report["rows"])
     return [
         {
             "untrained": result.untrained, "width": result.width,
@@ -60,6 +60,7 @@ def read_ranks(folder: Path) -> list[dict[str, Any]]:
             "seconds": result.seconds,
         }
         for result in results
+        if result.builder is None
     ]  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from data.records import FrameRef, RetrievalQuery, SelectionItem
 from data.render.frame_cache import FrameReader, resize_frames
 from data.store import Store
 from evaluation.embedders.cache import EmbeddingCache
-from evaluation.reporting.results import UNTRAINED
+from evaluation.metrics.results import UNTRAINED
 from models.fingerprints import (
     image_model_id,
     model_id,

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from data.records import LETTERS
-from evaluation.metrics.intervals import Interval, wilson_interval
+from evaluation.metrics.intervals import Interval, mean_with_wilson
 
 BINS = 10
 """Confidence bins of equal width."""
@@ -44,34 +43,19 @@ class Calibration:
     n: int
     bins: list[Bin]
 
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Calibration:
-        bins = [Bin(**{**b, "accuracy": Interval(**b["accuracy"])}) for b in values["bins"]]
-        return cls(**{**values, "bins": bins})
-
 
 def measure_calibration(
     confidence: Sequence[float], correct: Sequence[float]
 ) -> Calibration | None:
-    """Compare reported confidences with correctness; None without answers.
-
-    Args:
-        confidence: Each answer's confidence, from 0 to 1.
-        correct: Whether each answer is right.
-
-    Raises:
-        ValueError: The arguments differ in length, or a confidence is not from 0 to 1.
-    """
+    """Compare confidences, each from 0 to 1, with whether the answers are right; None without
+    answers."""
     confidence, correct = np.asarray(confidence, float), np.asarray(correct, float)
-    if confidence.shape != correct.shape or not ((confidence >= 0) & (confidence <= 1)).all():
-        raise ValueError(f"{len(confidence)} confidences from 0 to 1 for {len(correct)} answers")
     if not len(confidence):
         return None
     bin_of = np.minimum((confidence * BINS).astype(int), BINS - 1)
     bins = []
     for k in np.unique(bin_of):
-        mean, hits = confidence[bin_of == k].mean(), correct[bin_of == k]
-        accuracy = Interval(hits.mean(), *wilson_interval(hits.sum(), len(hits)), len(hits))
+        mean, accuracy = confidence[bin_of == k].mean(), mean_with_wilson(correct[bin_of == k])
         bins.append(Bin(float(k / BINS), float((k + 1) / BINS), float(mean), accuracy))
     gaps = [b.accuracy.n * abs(b.confidence - b.accuracy.value) for b in bins]
     brier = float(((confidence - correct) ** 2).mean())
@@ -98,11 +82,7 @@ class PositionBias:
 
 
 def measure_position_bias(chosen: Sequence[str | None], right: Sequence[str]) -> PositionBias:
-    """Compare a model's letters, None for items without one, with the correct letters.
-
-    Raises:
-        ValueError: The arguments differ in length.
-    """
+    """Compare a model's letters, None for items without one, with the correct letters."""
     from scipy.stats import chisquare
 
     pairs = list(zip(chosen, right, strict=True))

@@ -29,6 +29,11 @@ def wilson_interval(successes: float, n: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def mean_with_wilson(values: np.ndarray) -> Interval:
+    """Return the mean of values from 0 to 1, such as credits, with its Wilson interval."""
+    return Interval(float(values.mean()), *wilson_interval(values.sum(), len(values)), len(values))
+
+
 class SceneBootstrap:
     """95% percentile intervals of means and medians, by resampling whole scenes.
 
@@ -37,14 +42,8 @@ class SceneBootstrap:
     """
 
     def __init__(self, scenes: Sequence[str], seed: int, resamples: int = 2000) -> None:
-        """`scenes` names the scene of each item.
-
-        Raises:
-            ValueError: There are no items.
-        """
+        """`scenes` names the scene of each item."""
         _, codes = np.unique(np.asarray(scenes), return_inverse=True)
-        if not len(codes):
-            raise ValueError("no items to resample")
         count = codes.max() + 1
         sampled = np.random.default_rng(seed).integers(count, size=(resamples, count))
         cells = sampled + count * np.arange(resamples)[:, None]
@@ -87,13 +86,8 @@ def macro_by_scene(
     Args:
         values: One number per item.
         groups, scenes: One name per item.
-
-    Raises:
-        ValueError: There are no items, or the arguments differ in length.
     """
     values, groups = np.asarray(values, float), np.asarray(groups)
-    if not len(values) == len(groups) == len(scenes):
-        raise ValueError(f"{len(values)} values for {len(groups)} groups, {len(scenes)} scenes")
     low, high = SceneBootstrap(scenes, seed).macro(values, groups)
     mean = np.mean([values[groups == g].mean() for g in np.unique(groups)])
     return Interval(float(mean), float(low), float(high), len(values))

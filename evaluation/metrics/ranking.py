@@ -7,34 +7,20 @@ frames, so that a constant scorer has chance accuracy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.special import digamma
 
 
 def target_scores(scores: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return each query's score of its target as fp32 (queries,), NaN for a query without one.
+    """Return each query's score of its target as fp32 (queries,).
 
     Args:
         scores: (queries, frames).
-        targets: (queries,) integer columns; negative for a query without a target.
-
-    Raises:
-        ValueError: The shapes do not match, or a column is out of range.
+        targets: (queries,) columns.
     """
-    scores, targets = np.asarray(scores, np.float32), np.asarray(targets, np.int64)
-    if scores.ndim != 2 or targets.shape != scores.shape[:1]:
-        raise ValueError(
-            f"scores {scores.shape} and targets {targets.shape}: "
-            "expected (queries, frames) and (queries,)"
-        )
-    if targets.size and targets.max() >= scores.shape[1]:
-        raise ValueError(f"target column {targets.max()} is out of range: {scores.shape[1]} frames")
-    found = np.full(len(targets), np.nan, np.float32)
-    (valid,) = np.nonzero(targets >= 0)
-    found[valid] = scores[valid, targets[valid]]
-    return found
+    return np.asarray(scores, np.float32)[np.arange(len(targets)), targets]
 
 
 def count_above_and_equal(scores: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -60,8 +46,7 @@ def count_above_and_equal(scores: np.ndarray, targets: np.ndarray) -> tuple[np.n
 def count_ranks(scores: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Count the frames strictly above each target, and the other frames tied with it (queries,).
 
-    Both are 0 for a query without a target score. Arguments and errors are those of
-    `target_scores`.
+    Both are 0 for a NaN target score. Arguments are those of `target_scores`.
     """
     greater, equal = count_above_and_equal(scores, target_scores(scores, targets))
     return greater, np.maximum(equal - 1, 0)
@@ -92,13 +77,8 @@ def query_metrics(
     Returns:
         `recall@k` for each k, `mrr`, `median_rank` (1 is best; ties count half) and `tie_rate`,
         whether the target ties with another frame.
-
-    Raises:
-        ValueError: There is no query.
     """
     greater, tied, valid = np.asarray(greater), np.asarray(tied), np.asarray(valid, bool)
-    if not len(greater):
-        raise ValueError("no queries to measure")
     # The mean of 1/rank over the tied ranks is a difference of harmonic numbers.
     harmonic = digamma(greater + tied + 2) - digamma(greater + 1)
     return {
@@ -107,16 +87,3 @@ def query_metrics(
         "median_rank": np.where(valid, greater + 1 + tied / 2, frames),
         "tie_rate": (valid & (tied > 0)).astype(float),
     }
-
-
-def aggregate(measure: str) -> Callable[[np.ndarray], float]:
-    """Return the statistic that summarizes a measure over queries."""
-    return np.median if measure == "median_rank" else np.mean
-
-
-def ranking_metrics(
-    greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, frames: int, ks: Sequence[int]
-) -> dict[str, float]:
-    """Summarize `query_metrics` over all queries, misses included."""
-    measures = query_metrics(greater, tied, valid, frames, ks)
-    return {name: float(aggregate(name)(values)) for name, values in measures.items()}

@@ -2,69 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from itertools import permutations
+from pathlib import Path
 
 from conf.errors import UserError
 from data.records import SelectionItem
-from evaluation.metrics.significance import PairedComparison, check_same_items, compare_runs
+from evaluation.metrics.results import SelectionResult, from_json
+from evaluation.metrics.significance import PairedComparison, compare_runs
 from evaluation.reporting.measurements import ABLATED_REGIMES, REGIMES, Measurement
-from evaluation.reporting.results import SelectionResult
 from evaluation.reporting.run_responses import Responses
-from evaluation.reporting.runs import FinishedRun, reading
+from evaluation.reporting.runs import reading
 
 
-def check_same_build(runs: Iterable[FinishedRun]) -> None:
-    """Refuse two builds of one benchmark: their items can differ although their ids agree.
+def check_comparable(selections: Sequence[Measurement], retrievals: Sequence[Measurement]) -> None:
+    """Refuse two builds of one benchmark, whose items can differ although their ids agree, and two
+    sizes of one retrieval test.
 
     Raises:
-        UserError: two runs measured different builds of a benchmark.
+        UserError: two runs measured different builds, or ranked other numbers of frames or queries.
     """
-    first: dict[str, tuple[str, FinishedRun]] = {}
-    for run in runs:
-        with reading(run.folder):
-            name, build = run.config["benchmark"]["name"], run.report["build"]
-        other_build, other = first.setdefault(name, (build, run))
-        if other_build != build:
+    builds: dict[str, tuple[str, Path]] = {}
+    for m in (*selections, *retrievals):
+        with reading(m.run.folder):
+            own = (m.run.report["build"], m.run.folder)
+        build, folder = builds.setdefault(m.row.benchmark, own)
+        if build != own[0]:
             raise UserError(
-                f"{other.folder} and {run.folder} measured different builds of benchmark {name}: "
-                "measure one of them again (run=NAME), or leave it out with runs=[...]",
+                f"{folder} and {m.run.folder} measured different builds of benchmark "
+                f"{m.row.benchmark}: measure one of them again (run=NAME), or leave it out with "
+                "runs=[...]",
                 code="different-builds",
             )
-
-
-def check_selection_items(rows: Sequence[Measurement], responses: Sequence[Responses]) -> None:
-    """Refuse rows of one table that are not of the same items.
-
-    Args:
-        responses: The responses of each row's model.
-
-    Raises:
-        UserError: two runs measured different items.
-    """
-    first: dict[str, int] = {}
-    for k, m in enumerate(rows):
-        j = first.setdefault(m.items, k)
-        names = (str(rows[j].run.folder), str(m.run.folder))
-        check_same_items(responses[j], responses[k], names)
-
-
-def check_retrieval_sizes(rows: Sequence[Measurement]) -> None:
-    """Refuse retrieval rows of one benchmark with different numbers of queries or frames.
-
-    Raises:
-        UserError: two runs ranked another number of frames or queries.
-    """
     first: dict[tuple, Measurement] = {}
-    for m in rows:
-        other = first.setdefault((m.benchmark, m.row.builder), m)
-        sizes = [(r.row.frames, r.row.queries) for r in (other, m)]
-        if sizes[0] != sizes[1]:
-            (frames, queries), (other_frames, other_queries) = sizes
+    for m in retrievals:
+        other = first.setdefault((m.row.benchmark, m.row.builder), m)
+        if (m.row.frames, m.row.queries) != (other.row.frames, other.row.queries):
             raise UserError(
-                f"{other.run.folder} and {m.run.folder} ranked {frames:,} and {other_frames:,} "
-                f"frames of {m.benchmark} for {queries:,} and {other_queries:,} queries: choose "
-                "runs of one test with runs=[...]",
+                f"{other.run.folder} and {m.run.folder} ranked {other.row.frames:,} and "
+                f"{m.row.frames:,} frames of {m.row.benchmark} for {other.row.queries:,} and "
+                f"{m.row.queries:,} queries: choose runs of one test with runs=[...]",
                 code="different-queries",
             )
 
@@ -77,16 +54,16 @@ def compare_models(
     """Paired comparisons of the models that the paper compares: by family, macro, and overall.
 
     Args:
-        models: Models of one benchmark by label, with their responses; responses to other items
-            are left out.
+        models: Models of one benchmark by label, with their responses.
         items: The benchmark's items by id.
         seed: Seed of the bootstrap over scenes.
     """
     comparisons = []
-    for pair in model_pairs({label: m for label, (m, _) in models.items()}):
+    for pair in permutations(models, 2):
+        if not _is_claim(*(models[label][0] for label in pair)):
+            continue
         credits = [
-            {k: r.credit(items[k].letter) for k, r in models[label][1].items() if k in items}
-            for label in pair
+            {k: r.credit(items[k].letter) for k, r in models[label][1].items()} for label in pair
         ]
         answered = [item for item_id, item in items.items() if item_id in credits[0]]
         if answered:
@@ -94,30 +71,21 @@ def compare_models(
     return comparisons
 
 
-def model_pairs(models: Mapping[str, Measurement]) -> Iterator[tuple[str, str]]:
-    """The pairs behind the paper's claims, by label: a student and its base in the same mode, a
-    student with rationales and one of answers alone, the full student and an ablated one, and a
-    retriever and its untrained base. Both students of a pair have the same base and seed."""
-    for label, m in models.items():
-        if m.run.kind == "similarity" and m.trained:
-            # The row of a common base is kept once, under the run that measured it first.
-            reported = [SelectionResult.from_dict(row) for row in m.run.report["rows"]]
-            yield from (
-                (label, name)
-                for name, other in models.items()
-                if not other.trained and replace(other.row, name=other.report_key) in reported
-            )
-        if m.regime not in REGIMES:
-            continue
-        same_base = [(name, other) for name, other in models.items() if other.base == m.base]
-        same_seed = [(name, other) for name, other in same_base if other.seed == m.seed]
-        others = [name for name, o in same_base if not o.trained and o.row.mode == m.row.mode]
-        if m.regime != "answer_only":
-            others += [name for name, o in same_seed if o.regime == "answer_only"]
-        if m.regime == "cot":
-            others += [
-                name
-                for name, o in same_seed
-                if o.regime in ABLATED_REGIMES and o.row.mode == m.row.mode
-            ]
-        yield from ((label, name) for name in others)
+def _is_claim(m: Measurement, other: Measurement) -> bool:
+    """Whether the paper compares such models: a student and its base in the same mode, a student
+    with rationales and one of answers alone, the full student and an ablated one, and a retriever
+    and its untrained base. Both students have the same base and seed."""
+    if m.run.kind == "similarity":
+        # The row of a common base is kept once, under the run that measured it first.
+        reported = from_json(list[SelectionResult], m.run.report["rows"])
+        return m.trained and not other.trained and other.row in reported
+    if m.regime not in REGIMES or other.base != m.base:
+        return False
+    same_mode = other.row.mode == m.row.mode
+    if not other.trained:
+        return same_mode
+    if other.seed != m.seed:
+        return False
+    if other.regime == "answer_only":
+        return m.regime != "answer_only"
+    return m.regime == "cot" and other.regime in ABLATED_REGIMES and same_mode

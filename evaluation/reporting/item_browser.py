@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,17 +17,12 @@ from data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, sample_pref
 from data.render.frame_cache import FrameReader
 from data.store import Store, open_store
 from data.tracks.controls import MATCHED_ANCHOR
-from evaluation.metrics.significance import PairedComparison
-from evaluation.reporting.comparisons import check_selection_items, compare_models
+from data.tracks.quota import interleave
+from evaluation.metrics.significance import PairedComparison, check_same_items
+from evaluation.reporting.comparisons import compare_models
 from evaluation.reporting.figures import count_confusions
 from evaluation.reporting.measurements import Measurement, deduplicate
-from evaluation.reporting.run_responses import (
-    Responses,
-    SimilarityResponse,
-    TextResponse,
-    Variant,
-    read_responses,
-)
+from evaluation.reporting.run_responses import ItemResponse, Responses, read_responses
 
 PREFIX_FRAMES = 6
 FRAME_WIDTH = 160
@@ -36,8 +30,6 @@ FRAME_WIDTH = 160
 WEBP_QUALITY = 70
 TEXT_LIMIT = 4000
 """Characters of a response."""
-
-RunResponses = Mapping[Path, Mapping[Variant, Responses]]
 
 
 @dataclass
@@ -68,31 +60,36 @@ def browse_items(
         UserError: two runs measured different items of one benchmark.
     """
     runs = {m.run.folder: m.run for m in selections}
-    responses = {folder: read_responses(run) for folder, run in runs.items()}
-    check_selection_items(selections, [_responses_of(m, responses) for m in selections])
-    browser = ItemBrowser()
-    for name in dict.fromkeys(m.benchmark for m in selections):
-        answered = [m for m in deduplicate(selections) if m.benchmark == name]
+    by_run = {folder: read_responses(run) for folder, run in runs.items()}
+    first: dict[str, tuple[str, Responses]] = {}
+    for m in selections:
+        own = (str(m.run.folder), by_run[m.run.folder].get(m.row.key, {}))
+        (other_folder, others), (folder, responses) = first.setdefault(m.items, own), own
+        check_same_items(others, responses, (other_folder, folder))
+    browser, kept = ItemBrowser(), deduplicate(selections)
+    for name in dict.fromkeys(m.row.benchmark for m in kept):
+        answered = [
+            (m, by_run[m.run.folder].get(m.row.key, {})) for m in kept if m.row.benchmark == name
+        ]
         try:
             store = open_store(stores / name)
         except UserError as error:
             browser.notes.append(f"The items of {name} cannot be shown: {error} benchmark={name}.")
             continue
-        if {m.run.report["build"] for m in answered} - {store.identity}:
+        if any(m.run.report["build"] != store.identity for m, _ in answered):
             # Its items can differ although their ids agree.
             browser.notes.append(
                 f"The items of {name} cannot be shown: {store.folder} was rebuilt since the runs."
             )
             continue
-        _add_benchmark(browser, store, answered, responses, limit, seed)
+        _add_benchmark(browser, store, answered, limit, seed)
     return browser
 
 
 def _add_benchmark(
     browser: ItemBrowser,
     store: Store,
-    answered: Sequence[Measurement],
-    responses: RunResponses,
+    answered: Sequence[tuple[Measurement, Responses]],
     limit: int,
     seed: int,
 ) -> None:
@@ -100,17 +97,14 @@ def _add_benchmark(
         i.item_id: i for suite in (None, MATCHED_ANCHOR) for i in store.selection("test", suite)
     }
     by_label: dict[str, Responses] = {}
-    unchanged: dict[str, tuple[Measurement, Responses]] = {}
-    for m in answered:
-        label, of_model = ", ".join([m.label, *m.variants]), _responses_of(m, responses)
-        by_label[label] = of_model
-        if not m.variants:
-            unchanged[label] = (m, of_model)
-        pairs = [(items[k].letter, r.answer.letter) for k, r in of_model.items() if k in items]
+    for m, responses in answered:
+        label = ", ".join([m.label, *m.variants])
+        by_label[label] = {k: r for k, r in responses.items() if k in items}
+        pairs = [(items[k].letter, r.letter) for k, r in by_label[label].items()]
         browser.confusions.setdefault(m.items, {})[label] = count_confusions(pairs)
     # Controls are compared by the run that measured them.
-    if unchanged:
-        browser.comparisons[store.name] = compare_models(unchanged, items, seed)
+    unchanged = {m.label: (m, by_label[m.label]) for m, _ in answered if not m.variants}
+    browser.comparisons[store.name] = compare_models(unchanged, items, seed)
     known = [i for k, i in items.items() if any(k in r for r in by_label.values())]
     shown = choose_items(known, by_label, limit, seed)
     browser.entries += page_entries(shown, by_label, store)
@@ -125,33 +119,22 @@ def _add_benchmark(
         browser.notes.append(f"Frames are missing: {errors[0]}{more}.")
 
 
-def _responses_of(m: Measurement, responses: RunResponses) -> Responses:
-    return responses.get(m.run.folder, {}).get((m.report_key, m.row.control), {})
-
-
 def choose_items(
     items: Sequence[SelectionItem], responses: Mapping[str, Responses], limit: int, seed: int
 ) -> list[SelectionItem]:
-    """At most `limit` items, chosen greedily so that the subtypes, and in them the correct and the
-    wrong answers of each model, are equally frequent; by family and subtype. `seed` orders ties."""
+    """At most `limit` random items with equally many of each subtype, and in a subtype of each
+    combination of correct and wrong answers; by family and subtype."""
+
+    def subtype(item: SelectionItem) -> tuple[int, str]:
+        return FAMILIES.index(item.family), item.subtype
+
+    def verdicts(item: SelectionItem) -> tuple:
+        of_item = [r.get(item.item_id) for r in responses.values()]
+        return *subtype(item), *(r and r.letter == item.letter for r in of_item)
+
     order = np.random.default_rng(seed).permutation(len(items))
-    remaining = {items[k].item_id: items[k] for k in order}
-    cells = {item_id: _cells(item, responses) for item_id, item in remaining.items()}
-    counts: Counter[tuple] = Counter()
-    chosen = []
-    while remaining and len(chosen) < limit:
-        best = max(remaining, key=lambda k: sum(1 / (1 + counts[c]) for c in cells[k]))
-        counts.update(cells[best])
-        chosen.append(remaining.pop(best))
-    return sorted(chosen, key=lambda item: (FAMILIES.index(item.family), item.subtype))
-
-
-def _cells(item: SelectionItem, responses: Mapping[str, Responses]) -> list[tuple]:
-    return [
-        (item.family, item.subtype, label, r[item.item_id].answer.letter == item.letter)
-        for label, r in responses.items()
-        if item.item_id in r
-    ]
+    spread = interleave([items[k] for k in order], verdicts)
+    return sorted(interleave(spread, subtype)[:limit], key=subtype)
 
 
 def page_entries(
@@ -201,21 +184,16 @@ def describe_truth(item: SelectionItem, store: Store) -> list[str]:
     return sentences
 
 
-def _response_entry(
-    label: str, response: TextResponse | SimilarityResponse, item: SelectionItem
-) -> dict[str, Any]:
-    answer, text = response.answer, response.text
+def _response_entry(label: str, response: ItemResponse, item: SelectionItem) -> dict[str, Any]:
+    text, letter = response.text, response.letter
     if len(text) > TEXT_LIMIT:
         text = (
             f"{text[:TEXT_LIMIT]}… (the first {TEXT_LIMIT:,} of {len(text):,} characters; the "
             "run's answers.jsonl has all of them)"
         )
-    if answer.letter is None:
-        verdict, reason = "unparsed", answer.reason and str(answer.reason)
-    else:
-        verdict, reason = "correct" if answer.letter == item.letter else "wrong", None
+    verdict = "correct" if letter == item.letter else "wrong" if letter else "unparsed"
     return {
-        "model": label, "letter": answer.letter, "verdict": verdict, "reason": reason,
+        "model": label, "letter": letter, "verdict": verdict, "reason": response.reason,
         "text": text, "truncated": response.truncated,
     }  # fmt: skip
 

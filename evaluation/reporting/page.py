@@ -41,7 +41,7 @@ def write_page(
     figures = [figure for section in sections for figure in section.figures]
     page = environment.get_template("page.html").render(
         sections=sections,
-        svgs={f.path: Markup(inline_svg(f.path, k)) for k, f in enumerate(figures)},
+        svgs={f.name: Markup(inline_svg(f.svg, k)) for k, f in enumerate(figures)},
         runs=runs,
         notes=browser.notes,
         has_items=bool(browser.entries),
@@ -58,9 +58,8 @@ def script_json(value: Any) -> Markup:
     return Markup(text.replace("<", "\\u003c").replace("\u2028", "\\u2028"))
 
 
-def inline_svg(path: Path, number: int) -> str:
+def inline_svg(svg: str, number: int) -> str:
     """An SVG file as an element in the page's colors; `number` makes its ids unique."""
-    svg = path.read_text(encoding="utf-8")
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>f{number}-", svg)

@@ -8,17 +8,18 @@ from typing import Any
 
 import yaml
 
+from data.records import FAMILIES
+from evaluation.reporting.table import DETAIL, FORMATS, Row
+
 SUITE = "dynapix"
 """The suite whose items the paper's selection tables cover."""
 COT_STUDENT = "Physics-grounded CoT"
 """The name of the paper's CoT student in `reference.yaml`."""
-NOT_MODELS = ("Chance", "Human, majority vote")
-"""Names of rows that are not compared with models for the best value of a column."""
 
 
 @cache
 def reference(group: str) -> Any:
-    """Return a group of `reference.yaml`: a list of rows, or a number.
+    """Return a group of `reference.yaml`, such as a list of rows.
 
     A row has a `name` and values by column heading.
     """
@@ -26,31 +27,35 @@ def reference(group: str) -> Any:
     return yaml.safe_load(text)[group]
 
 
-def cot_student() -> dict[str, Any]:
-    """Return the row of the paper's CoT student."""
-    return next(row for row in reference("selection_distilled") if row["name"] == COT_STUDENT)
+def cot_student() -> dict[str, float]:
+    """Return the accuracies (%) of the paper's CoT student by family and by time horizon."""
+    row = next(row for row in reference("selection_distilled") if row["name"] == COT_STUDENT)
+    return {family: row[family.capitalize()] for family in FAMILIES} | row["horizons"]
 
 
-def reference_rows(group: str, columns: list[str]) -> list[list[str]]:
-    """Return the rows of a group as table cells under `columns`.
+def reference_rows(group: str) -> list[Row]:
+    """Return the rows of a group for a table; a value that the paper does not print is None.
 
-    A cell is "-" if the paper prints no value for it, and empty if no row of the group has its
-    column. A row with `horizons`, its accuracies in the time family by seconds to the target, is
-    followed by one row for each of them.
+    A row with `horizons`, its accuracies in the time family by seconds to the target, is followed
+    by one row for each of them.
     """
-    rows, printed = [], {column for row in reference(group) for column in row}
+    rows, columns = [], {column for row in reference(group) for column in row} - {"horizons"}
     for row in reference(group):
-        cells = [_format(row.get(c), c) if c in printed else "" for c in columns]
-        rows.append([row["name"], *cells])
+        values = {column: _to_share(column, row.get(column)) for column in columns}
+        rows.append({**values, "ranked": row.get("ranked", True)})
         for horizon, percent in row.get("horizons", {}).items():
-            cells = [f"{percent:.1f}" if column == "Time" else "" for column in columns]
-            rows.append([f"  time, {horizon}", *cells])
+            name = f"{DETAIL}time, {horizon}"
+            rows.append({"name": name, "Time": percent / 100, "ranked": False})
     return rows
 
 
-def _format(value: float | None, column: str) -> str:
-    if value is None:
-        return "-"
-    if isinstance(value, int):
-        return f"{value:,}"
-    return f"{value:.3f}" if column == "MRR" else f"{value:.1f}"
+def table_reference(table: str) -> dict[str, list[Row]]:
+    """Return the rows of the paper in one of the report's tables by the label of their group."""
+    groups = reference("tables")[table]["paper"]
+    return {
+        label: [row for n in names for row in reference_rows(n)] for label, names in groups.items()
+    }
+
+
+def _to_share(column: str, value: Any) -> Any:
+    return value / 100 if isinstance(value, float) and column not in FORMATS else value

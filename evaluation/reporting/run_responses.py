@@ -4,66 +4,45 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 from data.records import LETTERS
+from evaluation.metrics.results import variant_name
 from evaluation.reporting.runs import FinishedRun, json_lines, reading
-from models.student.answer_parser import ParsedAnswer, Reason, parse_choice
+from models.student.answer_parser import Reason, parse_choice
 
 
 @dataclass(frozen=True)
-class TextResponse:
-    """A model's response to an item; `truncated` if generation stopped before its end."""
+class ItemResponse:
+    """What a model answered to an item.
+
+    Attributes:
+        text: The response, or the scores of a retriever.
+        letters: The chosen letters: several for tied scores, none for an unparsed response.
+        reason: Why the letter is unknown.
+        truncated: Whether generation stopped before the end of the text.
+    """
 
     text: str
-    truncated: bool
-
-    @cached_property
-    def answer(self) -> ParsedAnswer:
-        return parse_choice(self.text, cut=self.truncated)
-
-    def credit(self, letter: str) -> float:
-        """1 if the response is `letter`, else 0."""
-        return float(self.answer.letter == letter)
-
-
-@dataclass(frozen=True)
-class SimilarityResponse:
-    """A retriever's scores of an item's candidates by letter; None where a score is missing."""
-
-    scores: Mapping[str, float | None]
+    letters: str
+    reason: str | None = None
     truncated: bool = False
 
     @property
-    def text(self) -> str:
-        return ", ".join(
-            f"{letter} {'no score' if score is None else f'{score:.4f}'}"
-            for letter, score in self.scores.items()
-        )
-
-    @property
-    def answer(self) -> ParsedAnswer:
-        nearest = self._nearest
-        return ParsedAnswer(nearest) if len(nearest) == 1 else ParsedAnswer(None, Reason.SEVERAL)
+    def letter(self) -> str | None:
+        """The letter, if it is the only one."""
+        return self.letters if len(self.letters) == 1 else None
 
     def credit(self, letter: str) -> float:
-        """1/m if `letter` is one of the m candidates with the highest score, else 0."""
-        return (letter in self._nearest) / max(1, len(self._nearest))
-
-    @property
-    def _nearest(self) -> str:
-        known = {x: score for x, score in self.scores.items() if score is not None}
-        return "".join(x for x, score in known.items() if score == max(known.values()))
+        """1/m if `letter` is one of the m chosen letters, else 0."""
+        return (letter in self.letters) / max(1, len(self.letters))
 
 
-Responses = Mapping[str, TextResponse | SimilarityResponse]
+Responses = Mapping[str, ItemResponse]
 """Responses by item."""
-Variant = tuple[str, str | None]
-"""The mode of a model, or the name of an embedder, and the control."""
 
 
-def read_responses(run: FinishedRun) -> dict[Variant, Responses]:
-    """The responses that a run's report is about, by variant and item.
+def read_responses(run: FinishedRun) -> dict[str, Responses]:
+    """The responses that a run's report is about, by `SelectionResult.key` and item.
 
     Responses under other settings, and lines torn by a kill, are left out.
 
@@ -73,22 +52,37 @@ def read_responses(run: FinishedRun) -> dict[Variant, Responses]:
     return _read_scores(run) if run.kind == "similarity" else _read_texts(run)
 
 
-def _read_scores(run: FinishedRun) -> dict[Variant, Responses]:
-    responses: dict[Variant, dict[str, SimilarityResponse]] = {}
+def _read_scores(run: FinishedRun) -> dict[str, Responses]:
+    responses: dict[str, dict[str, ItemResponse]] = {}
     with reading(run.folder, "scores.jsonl"):
         for row in json_lines(run.folder / "scores.jsonl"):
-            scores = SimilarityResponse(dict(zip(LETTERS, row["scores"], strict=True)))
-            responses.setdefault((row["by"], None), {})[row["item_id"]] = scores
+            scores = dict(zip(LETTERS, row["scores"], strict=True))
+            responses.setdefault(row["by"], {})[row["item_id"]] = nearest_candidates(scores)
     return responses
 
 
-def _read_texts(run: FinishedRun) -> dict[Variant, Responses]:
+def nearest_candidates(scores: Mapping[str, float | None]) -> ItemResponse:
+    """The candidates with the highest score; a score is None if it is missing."""
+    known = [score for score in scores.values() if score is not None]
+    letters = "".join(x for x, score in scores.items() if known and score == max(known))
+    reason = None if len(letters) == 1 else str(Reason.SEVERAL)
+    shown = {x: "no score" if score is None else f"{score:.4f}" for x, score in scores.items()}
+    return ItemResponse(", ".join(f"{x} {score}" for x, score in shown.items()), letters, reason)
+
+
+def _read_texts(run: FinishedRun) -> dict[str, Responses]:
     with reading(run.folder):
-        variants = {key: (mode, control) for mode, control, key in run.report["asked"]}
-    responses: dict[Variant, dict[str, TextResponse]] = {v: {} for v in variants.values()}
+        variants = {key: variant_name(mode, control) for mode, control, key in run.report["asked"]}
+    responses: dict[str, dict[str, ItemResponse]] = {v: {} for v in variants.values()}
     with reading(run.folder, "answers.jsonl"):
         for row in json_lines(run.folder / "answers.jsonl"):
             if "text" in row and row["key"] in variants:
-                response = TextResponse(str(row["text"]), bool(row["cut"]))
+                response = parse_response(str(row["text"]), bool(row["cut"]))
                 responses[variants[row["key"]]][row["item_id"]] = response
     return responses
+
+
+def parse_response(text: str, truncated: bool) -> ItemResponse:
+    answer = parse_choice(text, cut=truncated)
+    reason = answer.reason and str(answer.reason)
+    return ItemResponse(text, answer.letter or "", reason, truncated)

@@ -40,6 +40,10 @@ class FinishedRun:
     report: dict[str, Any]
     started: str
 
+    @property
+    def title(self) -> str:
+        return f"{self.kind}/{self.name}"
+
 
 def gather_runs(root: Path, patterns: Sequence[str] | None) -> list[FinishedRun]:
     """The finished runs below `root`, oldest first.
@@ -50,17 +54,13 @@ def gather_runs(root: Path, patterns: Sequence[str] | None) -> list[FinishedRun]
     Raises:
         UserError: nothing is measured, a pattern names no run, or a run cannot be read.
     """
-    finished = [
-        path.parent
-        for kind in KINDS
-        # A sweep's jobs are one folder deeper.
-        for path in sorted([*root.glob(f"{kind}/*/metrics.json"),
-                            *root.glob(f"{kind}/*/*/metrics.json")])
-    ]  # fmt: skip
-    folders = finished
-    if patterns is not None:
-        folders = [folder for p in patterns for folder in _match(root, p, finished)]
-    runs = [_read_run(root, folder) for folder in dict.fromkeys(folders)]
+    # A sweep's jobs are one folder deeper.
+    depths = ("*/metrics.json", "*/*/metrics.json")
+    finished = [p.parent for k in KINDS for d in depths for p in sorted(root.glob(f"{k}/{d}"))]
+    chosen = (
+        finished if patterns is None else [f for p in patterns for f in _match(root, p, finished)]
+    )
+    runs = [_read_run(root, folder) for folder in dict.fromkeys(chosen)]
     if all(run.kind in TRAINING_KINDS for run in runs):
         raise UserError(
             f"no evaluation has finished below {root}: run python -m evaluation.select "
@@ -84,17 +84,10 @@ def _match(root: Path, pattern: str, finished: Sequence[Path]) -> list[Path]:
     if matched := [path for path in folders if path in finished]:
         return sorted(matched)
     if folders:
-        kind, *name = folders[0].relative_to(root).parts
-        if kind == "study" and name:
-            raise UserError(
-                f"runs: {folders[0]} is a study: export its votes with python -m "
-                f"evaluation.study.export run={'/'.join(name)}, and name that run below "
-                f"{root / 'export_study'}",
-                code="unfinished-run",
-            )
         raise UserError(
             f"runs: {folders[0]} is not a finished run of an evaluation or a training: run its "
-            "command again, which resumes it, or name another run",
+            "command again, which resumes it (or python -m evaluation.study.export, if it is a "
+            "study), or name another run",
             code="unfinished-run",
         )
     names = [path.relative_to(root).as_posix() for path in finished]
@@ -105,34 +98,19 @@ def _match(root: Path, pattern: str, finished: Sequence[Path]) -> list[Path]:
 
 def _read_run(root: Path, folder: Path) -> FinishedRun:
     kind, *name = folder.relative_to(root).parts
-    config, report = read_settings(folder, "measure again"), {}
+    report = {}
     with reading(folder, "run.json"):
         record = json.loads((folder / "run.json").read_text())
         started = min(map(str, [record["started"], *record["earlier_starts"]]))
     if kind not in TRAINING_KINDS:
         with reading(folder):
             report = dict(json.loads((folder / "report.json").read_text()))
-    return FinishedRun(folder, kind, "/".join(name), config, report, started)
+    return FinishedRun(folder, kind, "/".join(name), _read_settings(folder), report, started)
 
 
-def read_settings(folder: Path, remedy: str) -> dict[str, Any]:
-    """A run's config.yaml.
-
-    Raises:
-        UserError: it is missing or damaged; `remedy` says what to do once it is deleted.
-    """
-    path = folder / "config.yaml"
-    try:
-        settings = OmegaConf.to_container(OmegaConf.load(path))
-        if not isinstance(settings, dict):
-            raise YAMLError("no settings")
-    except (OSError, YAMLError, OmegaConfBaseException) as error:
-        raise UserError(
-            f"{path} is missing or damaged: delete {folder} and {remedy}, or leave the run out "
-            "with runs=[...]",
-            code="damaged-file",
-        ) from error
-    return settings
+def _read_settings(folder: Path) -> dict[str, Any]:
+    with reading(folder, "config.yaml"):
+        return dict(OmegaConf.to_container(OmegaConf.load(folder / "config.yaml")))
 
 
 def training_settings(run: FinishedRun, root: Path) -> dict[str, Any] | None:
@@ -150,21 +128,26 @@ def training_settings(run: FinishedRun, root: Path) -> dict[str, Any] | None:
     with reading(run.folder, "config.yaml"):
         path = Path(model)
     # If the runs have moved, or the report runs in another folder, the model is below `root`.
-    for folder in (path, root / Path(*path.parts[1:])):
-        if (folder / "config.yaml").is_file():
-            return read_settings(folder, "train again")
-    return {}
+    folders = [path, root / Path(*path.parts[1:])]
+    found = [folder for folder in folders if (folder / "config.yaml").is_file()]
+    return _read_settings(found[0]) if found else {}
 
 
 @contextmanager
-def reading(folder: Path, file: str = "report.json") -> Iterator[None]:
-    """Report any failure to read or to interpret a file of a run as a UserError that names it."""
+def reading(folder: Path, file: str = "report.json", remedy: str = "") -> Iterator[None]:
+    """Report any failure to read or to interpret a file of a run as a UserError that names it.
+
+    Args:
+        remedy: What to do, if not to run the command again.
+    """
+    failures = (OSError, ValueError, KeyError, TypeError, AttributeError)
     try:
         yield
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (*failures, YAMLError, OmegaConfBaseException) as error:
+        remedy = remedy or f"delete {folder} and run its command again"
         raise UserError(
-            f"{folder / file} is missing, damaged or of another version: delete {folder} and "
-            "measure again",
+            f"{folder / file} is missing, damaged or of another version: {remedy}, or leave the "
+            "run out with runs=[...]",
             code="damaged-file",
         ) from error
 

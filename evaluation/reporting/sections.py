@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import io
+import json
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
-from typing import Any, TypeVar
+from functools import cached_property, partial
+from typing import Any
 
+from conf.multirun.table import AT_START_SUFFIX
 from evaluation.metrics.calibration import Calibration, PositionBias
 from evaluation.metrics.intervals import Interval
+from evaluation.metrics.results import RetrieverDifference, from_json
 from evaluation.metrics.significance import PairedComparison
-from evaluation.reporting import figures, summary_tables, tables
+from evaluation.reporting import figures, tables
 from evaluation.reporting.item_browser import ItemBrowser
 from evaluation.reporting.measurements import (
     ABLATED_REGIMES,
     REGIMES,
     Measurement,
     group_by_items,
-    model_names,
+    shared_names,
     transfer_benchmarks,
-    widest_rows,
+    widest_results,
 )
 from evaluation.reporting.runs import (
     STUDY_KINDS,
@@ -30,127 +32,112 @@ from evaluation.reporting.runs import (
     json_lines,
     reading,
 )
-from evaluation.reporting.table import Table
+from evaluation.reporting.summary_tables import overall_table, summary_table
+from evaluation.reporting.table import Row, Table
 from train.common.curves import plot_curves
 
 Rows = Sequence[Measurement]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Figure:
-    """An SVG file and its caption."""
+    """A figure that is drawn on demand: `plot` writes the figure of `data` to a file."""
 
-    path: Path
+    name: str
     caption: str
+    plot: Callable[[Any, Any], None]
+    data: Any
+
+    @cached_property
+    def svg(self) -> str:
+        """An SVG file with its text as text; equal data give equal figures."""
+        import matplotlib
+
+        file = io.BytesIO()
+        style = {"savefig.format": "svg", "svg.fonttype": "none", "svg.hashsalt": self.name}
+        with matplotlib.rc_context(style):
+            self.plot(self.data, file)
+        return file.getvalue().decode()
 
 
 @dataclass
 class Section:
-    """A part of the report. `details` are tables that the page folds and the text leaves out."""
+    """A part of the report."""
 
     title: str
     tables: list[Table] = field(default_factory=list)
     figures: list[Figure] = field(default_factory=list)
-    details: list[Table] = field(default_factory=list)
 
 
 def build_sections(
-    selections: Rows,
-    retrievals: Rows,
-    runs: Sequence[FinishedRun],
-    browser: ItemBrowser,
-    folder: Path,
+    selections: Rows, retrievals: Rows, runs: Sequence[FinishedRun], browser: ItemBrowser
 ) -> list[Section]:
-    """The sections that have content, in the paper's order. Figures are written into `folder`.
+    """The sections that have content, in the paper's order.
 
     Args:
-        selections, retrievals: The rows of `runs`.
+        selections, retrievals: The results of `runs`.
 
     Raises:
         UserError: a report is damaged or of another version.
     """
-    draw = partial(_draw, folder)
     unchanged = [m for m in selections if not m.variants]
+    transfers = transfer_benchmarks(unchanged)
+    at_home = [m for m in unchanged if m.row.benchmark not in transfers]
     studies = [run for run in runs if run.kind in STUDY_KINDS]
+    widest = widest_results(retrievals)
     sections = [
-        zero_shot(unchanged, widest_rows(retrievals), studies, draw),
-        distillation(unchanged, widest_rows(retrievals), browser, draw),
+        zero_shot([m for m in at_home if not m.trained], widest, studies),
+        distillation(at_home, widest, browser),
         ablation(unchanged),
-        transfer(unchanged, browser, draw),
+        transfer(unchanged, transfers, browser),
         controls([m for m in selections if m.variants], runs),
-        *map(human_study, studies),
-        selection_details(unchanged, browser, draw),
-        retrieval_details([m for m in retrievals if m.row.builder is None], draw),
-        training([run for run in runs if run.kind in TRAINING_KINDS], draw),
+        Section("Human study", [_study_table(study) for study in studies]),
+        selection_details(unchanged, transfers, browser),
+        retrieval_details([m for m in retrievals if m.row.builder is None]),
+        training([run for run in runs if run.kind in TRAINING_KINDS]),
     ]
-    return [s for s in sections if s.tables or s.figures or s.details]
+    return [section for section in sections if section.tables or section.figures]
 
 
-def zero_shot(
-    selections: Rows, retrievals: Rows, studies: Sequence[FinishedRun], draw: Callable
-) -> Section:
+def zero_shot(selections: Rows, retrievals: Rows, studies: Sequence[FinishedRun]) -> Section:
     section = Section("Zero-shot")
-    transfers = transfer_benchmarks(selections)
-    for benchmark, rows in group_by_items(m for m in selections if not m.trained).items():
-        if benchmark not in transfers:
-            build = (benchmark, rows[0].run.report.get("build"))
-            on_build = [
-                s for s in studies if (s.report.get("benchmark"), s.report.get("build")) == build
-            ]
-            table = summary_tables.zero_shot_selection_table(benchmark, rows, on_build)
-            section.tables.append(table)
-            section.figures.append(_family_figure(draw, "zero-shot", rows))
-    for benchmark, rows in group_by_items(m for m in retrievals if not m.trained).items():
-        paper = {
-            "paper, Table 3: direct embedders (2,002 queries, 10,000 frames)": ["retrieval_direct"],
-            "paper, Table 3: two-stage (2,002 queries, 10,000 frames)": ["retrieval_two_stage"],
-        }
-        caption = f"Zero-shot retrieval (recall in %) on {benchmark}"
-        name, title = f"retrieval-{benchmark}", f"Zero-shot, {benchmark}"
-        table = summary_tables.retrieval_summary_table(name, caption, title, rows, paper)
-        section.tables.append(table)
+    for rows in group_by_items(selections).values():
+        people = [row for study in studies for row in _majority_rows(study, rows[0])]
+        section.tables.append(summary_table("selection", rows, people))
+        section.figures.append(_family_figure("zero-shot", rows))
+    for rows in group_by_items(m for m in retrievals if not m.trained).values():
+        section.tables.append(summary_table("retrieval", rows))
     return section
 
 
-def distillation(
-    selections: Rows, retrievals: Rows, browser: ItemBrowser, draw: Callable
-) -> Section:
+def _majority_rows(study: FinishedRun, m: Measurement) -> list[Row]:
+    """The majority vote of a study of the build that is measured."""
+    with reading(study.folder):
+        build = (study.report["benchmark"], study.report.get("build"))
+        votes = study.report["majority"]
+        if votes is None or build != (m.row.benchmark, m.run.report["build"]):
+            return []
+        return [tables.human_row(f"Majority vote, {study.name}", votes)]
+
+
+def distillation(selections: Rows, retrievals: Rows, browser: ItemBrowser) -> Section:
     section = Section("Distillation")
-    transfers = transfer_benchmarks(selections)
     for benchmark, rows in group_by_items(selections).items():
-        if benchmark not in transfers and any(m.trained for m in rows):
-            name = f"distillation-selection-{benchmark}"
-            caption = f"Distillation: selection accuracy (%) on {benchmark}"
-            paper = {"paper, Table 4a (Qwen3-VL-8B)": ["selection_distilled"]}
-            table = summary_tables.trained_selection_table(name, caption, rows, paper)
-            section.tables.append(table)
-            section.figures.append(_family_figure(draw, "families", rows))
-            _add_model_differences(section, benchmark, browser)
-    for benchmark, rows in group_by_items(retrievals).items():
-        trained = {m.run.folder: m.run for m in rows if m.trained}
-        if trained:
-            name = f"distillation-retrieval-{benchmark}"
-            caption = f"Distillation: retrieval (recall in %) on {benchmark}"
-            paper = {"paper, Table 4b (2,002 queries, 10,000 frames)": ["retrieval_distilled"]}
-            title = f"Distilled, {benchmark}"
-            table = summary_tables.retrieval_summary_table(name, caption, title, rows, paper)
-            section.tables.append(table)
-        if differences := _rank_differences(trained.values()):
-            table = tables.rank_differences_table(differences)
-            section.tables.append(_on_benchmark(table, benchmark))
+        if any(m.trained for m in rows):
+            section.tables.append(summary_table("distillation-selection", rows))
+            section.figures.append(_family_figure("families", rows))
+            section.tables += _model_differences(benchmark, browser)
+    for rows in group_by_items(retrievals).values():
+        if trained := {m.run.folder: m.run for m in rows if m.trained}:
+            section.tables.append(summary_table("distillation-retrieval", rows))
+        for run in trained.values():
+            with reading(run.folder):
+                reported = run.report.get("differences", [])
+                differences = from_json(list[RetrieverDifference], reported)
+            if differences:
+                table = tables.rank_differences_table(differences)
+                section.tables.append(_name_table(table, run.title))
     return section
-
-
-def _rank_differences(runs: Iterable[FinishedRun]) -> list[dict[str, Any]]:
-    """The reported differences between retrievers; equal names are followed by their run's."""
-    reported = [(run, run.report.get("differences", [])) for run in runs]
-    names = Counter(d["left"] for _, differences in reported for d in differences[:1])
-    return [
-        d if names[d["left"]] == 1 else {**d, "left": f"{d['left']}, {run.name}"}
-        for run, differences in reported
-        for d in differences
-    ]
 
 
 def ablation(selections: Rows) -> Section:
@@ -159,46 +146,39 @@ def ablation(selections: Rows) -> Section:
     if not any(m.regime in ABLATED_REGIMES for m in rows):
         return Section("Ablation")
     rows.sort(key=lambda m: list(REGIMES).index(m.regime))
-    names = zip(rows, model_names(rows), strict=True)
+    names = zip(rows, shared_names(rows), strict=True)
     labels = [f"{REGIMES[m.regime]} ({name})" for m, name in names]
-    caption = "Ablation: accuracy over all items (%) in reasoning mode"
-    paper = {"paper, Table 12": "ablation"}
-    table = summary_tables.overall_table("ablation", caption, rows, labels, paper)
-    return Section("Ablation", [table])
+    return Section("Ablation", [overall_table("ablation", rows, labels)])
 
 
-def transfer(selections: Rows, browser: ItemBrowser, draw: Callable) -> Section:
+def transfer(selections: Rows, transfers: Container[str], browser: ItemBrowser) -> Section:
     """Students on benchmarks that they were not trained on, and their bases."""
     section = Section("Transfer")
-    if not (transfers := transfer_benchmarks(selections)):
-        return section
-    models = {(m.model, m.row.mode) for m in selections if m.benchmark in transfers}
-    rows = [m for m in selections if (m.model, m.row.mode) in models]
-    names = zip(rows, model_names(rows), strict=True)
-    labels = [f"{name} ({m.row.mode})" for m, name in names]
-    caption = "Transfer: accuracy over all items (%)"
-    paper = {"paper, Section 5.3 (answer mode)": "transfer"}
-    section.tables.append(summary_tables.overall_table("transfer", caption, rows, labels, paper))
+    models = {(m.row.name, m.row.mode) for m in selections if m.row.benchmark in transfers}
+    if of_models := [m for m in selections if (m.row.name, m.row.mode) in models]:
+        names = zip(of_models, shared_names(of_models), strict=True)
+        labels = [f"{name} ({m.row.mode})" for m, name in names]
+        section.tables.append(overall_table("transfer", of_models, labels))
     for benchmark, rows in group_by_items(selections).items():
         if benchmark in transfers:
-            caption = f"Transfer: selection accuracy (%) on {benchmark}"
-            paper = {"paper, Section 5.3 (MoVi-A, answer mode)": ["movi_a_by_family"]}
-            name = f"transfer-{benchmark}"
-            table = summary_tables.trained_selection_table(name, caption, rows, paper)
-            section.tables.append(table)
+            section.tables.append(summary_table("transfer-selection", rows))
             # The paper's accuracies by family are on CLEVRER.
-            section.figures.append(_family_figure(draw, "families", rows, with_paper=False))
-            _add_model_differences(section, benchmark, browser)
+            section.figures.append(_family_figure("families", rows, with_paper=False))
+            section.tables += _model_differences(benchmark, browser)
     return section
 
 
-def _add_model_differences(section: Section, benchmark: str, browser: ItemBrowser) -> None:
-    """Add the differences between the benchmark's models, overall and, folded, by family."""
-    if comparisons := browser.comparisons.get(benchmark):
-        overall = tables.model_differences_table(comparisons)
-        by_family = tables.paired_table([(benchmark, pairs) for pairs in comparisons])
-        section.tables.append(_on_benchmark(overall, benchmark))
-        section.details.append(_on_benchmark(by_family, benchmark))
+def _model_differences(benchmark: str, browser: ItemBrowser) -> list[Table]:
+    """The differences between the benchmark's models, overall and, folded, by family."""
+    comparisons = browser.comparisons.get(benchmark)
+    if not comparisons:
+        return []
+    overall = tables.paired_table([("", pairs[-1:]) for pairs in comparisons])
+    by_family = tables.paired_table([("", pairs) for pairs in comparisons])
+    return [
+        _name_table(replace(overall, name="differences"), benchmark),
+        _name_table(replace(by_family, folded=True), benchmark),
+    ]
 
 
 def controls(selections: Rows, runs: Sequence[FinishedRun]) -> Section:
@@ -208,140 +188,125 @@ def controls(selections: Rows, runs: Sequence[FinishedRun]) -> Section:
         UserError: a report is of another version.
     """
     section = Section("Controls")
-    groups: dict[tuple[Path, str, str, str], list[PairedComparison]] = {}
     for run in runs:
+        groups: dict[tuple[str, ...], list[PairedComparison]] = {}
         with reading(run.folder):
             for entry in run.report.get("controls", []):
-                fields = {key: value for key, value in entry.items() if key != "mode"}
-                pair, row = PairedComparison(**fields), run.report["rows"][0]
-                model = [] if run.kind == "similarity" else [row["name"]]
-                label = ", ".join([row["benchmark"], *model, entry["mode"]])
-                groups.setdefault((run.folder, label, pair.left, pair.right), []).append(pair)
-    if groups:
-        counts = Counter(key[1:] for key in groups)
-        pairs = [
-            (label if counts[label, left, right] == 1 else f"{label}, {folder.name}", of)
-            for (folder, label, left, right), of in groups.items()
-        ]
-        caption = "Controls: paired differences of accuracy (%)"
-        section.tables.append(replace(tables.paired_table(pairs), name="controls", caption=caption))
-    for items, rows in group_by_items(selections).items():
-        name = f"control-{items.replace(', ', '-')}"
-        caption = f"Controls: selection accuracy (%) on {items}"
-        section.tables.append(summary_tables.trained_selection_table(name, caption, rows, {}))
+                pair = from_json(PairedComparison, entry)
+                groups.setdefault((entry["mode"], pair.left, pair.right), []).append(pair)
+        if groups:
+            table = tables.paired_table([(mode, of) for (mode, *_), of in groups.items()])
+            section.tables.append(_name_table(table, run.title))
+    section.tables += [
+        summary_table("control", rows) for rows in group_by_items(selections).values()
+    ]
     return section
 
 
-def human_study(run: FinishedRun) -> Section:
+def _study_table(run: FinishedRun) -> Table:
     """
     Raises:
         UserError: the study's report is of another version.
     """
     with reading(run.folder):
-        table = tables.human_table(run.report)
-        benchmark = run.report["benchmark"]
-    caption = f"{table.caption}: study {run.name} on benchmark {benchmark}"
-    name = f"human-{run.name.replace('/', '-')}"
-    return Section("Human study", [replace(table, name=name, caption=caption)])
+        title = f"study {run.name} on benchmark {run.report['benchmark']}"
+        return _name_table(tables.human_table(run.report), run.name, title)
 
 
-def selection_details(selections: Rows, browser: ItemBrowser, draw: Callable) -> Section:
+def selection_details(selections: Rows, transfers: Container[str], browser: ItemBrowser) -> Section:
     """
     Raises:
         UserError: a report is of another version.
     """
     section = Section("Selection in detail")
-    transfers = transfer_benchmarks(selections)
     for benchmark, rows in group_by_items(selections).items():
-        subtypes = _read_details(rows, "subtypes", _read_intervals)
-        horizons = {label: figures.accuracy_by_horizon(of) for label, of in subtypes.items()}
-        if horizons := {label: of for label, of in horizons.items() if of}:
-            with_paper = rows[0].benchmark not in transfers
-            plot = partial(figures.horizon_figure, with_paper=with_paper)
+        if horizons := {m.label: m.row.horizons for m in rows if m.row.horizons}:
+            plot = partial(figures.accuracy_figure, with_paper=benchmark not in transfers)
             caption = f"Accuracy by horizon on {benchmark}."
-            section.figures.append(draw(f"horizons-{benchmark}", plot, horizons, caption))
+            section.figures.append(Figure(f"horizons-{benchmark}", caption, plot, horizons))
         if confusions := browser.confusions.get(benchmark):
             plot = figures.confusion_figure
             caption = f"Chosen letters by correct letter on {benchmark} (% of a row)."
-            section.figures.append(draw(f"positions-{benchmark}", plot, confusions, caption))
+            section.figures.append(Figure(f"positions-{benchmark}", caption, plot, confusions))
         details = tables.detail_tables(
-            subtypes,
-            _read_details(rows, "readings", dict),
-            _read_details(rows, "positions", lambda entry: PositionBias(**entry)),
-            _read_details(rows, "calibration", Calibration.from_dict),
+            _read_details(rows, "subtypes", dict[str, Interval]),
+            _read_details(rows, "readings", dict[str, int]),
+            _read_details(rows, "positions", PositionBias),
+            _read_details(rows, "calibration", Calibration),
         )
-        section.details += [_on_benchmark(table, benchmark) for table in details]
+        section.tables += [_name_table(replace(t, folded=True), benchmark) for t in details]
     return section
 
 
-def _read_intervals(entry: Mapping[str, Any]) -> dict[str, Interval]:
-    return {name: Interval(**share) for name, share in entry.items()}
-
-
-def _read_details(rows: Rows, kind: str, read: Callable[[Any], T]) -> dict[str, T]:
+def _read_details(rows: Rows, key: str, kind: Any) -> dict[str, Any]:
     """One kind of details from the rows' reports, by the label of the model."""
     details = {}
     for m in rows:
         with reading(m.run.folder):
-            if entry := m.run.report.get(kind, {}).get(m.report_key):
-                details[m.label] = read(entry)
+            if entry := m.run.report.get(key, {}).get(m.row.key):
+                details[m.label] = from_json(kind, entry)
     return details
 
 
-def retrieval_details(retrievals: Rows, draw: Callable) -> Section:
+def retrieval_details(retrievals: Rows) -> Section:
     section = Section("Retrieval in detail")
     for benchmark, rows in group_by_items(retrievals).items():
-        results = [m.row for m in rows]
-        section.tables.append(_on_benchmark(tables.cost_table(results), benchmark))
-        widths = replace(tables.retrieval_table(results), name="widths")
-        section.details.append(_on_benchmark(widths, benchmark))
-        if any(row.width for row in results):
-            caption = f"Recall by width on {benchmark}."
-            plot = figures.retrieval_figure
-            section.figures.append(draw(f"widths-{benchmark}", plot, results, caption))
+        ordered = sorted(rows, key=lambda m: (-(m.row.width or 0), not m.row.untrained))
+        section.tables.append(replace(summary_table("widths", ordered), folded=True))
+        if any(m.row.width for m in rows):
+            plot, caption = figures.retrieval_figure, f"Recall by width on {benchmark}."
+            results = [(m.name, m.row) for m in rows]
+            section.figures.append(Figure(f"widths-{benchmark}", caption, plot, results))
         curves = {
-            (m.row.name, m.run.folder): {**curve, "name": m.row.name}
+            m.name: curve
             for m in rows
             for curve in m.run.report.get("curves", [])
-            if curve["builder"] is None and curve["name"] == m.model
+            if curve["name"] == m.row.name
         }
         if curves:
             caption = f"Recall by k on {benchmark}, at the largest width."
             plot = figures.recall_figure
-            section.figures.append(draw(f"recall-{benchmark}", plot, [*curves.values()], caption))
+            section.figures.append(Figure(f"recall-{benchmark}", caption, plot, curves))
     return section
 
 
-def training(runs: Sequence[FinishedRun], draw: Callable) -> Section:
-    section = Section("Training")
-    table = summary_tables.training_table(runs)
-    if table.groups:
-        section.tables.append(table)
+def training(runs: Sequence[FinishedRun]) -> Section:
+    """The metrics of each run on held-out training scenes, at its start and at its end.
+
+    Raises:
+        UserError: a run's metrics.json is damaged.
+    """
+    section, groups = Section("Training"), {}
     for run in runs:
+        remedy = "delete it and run the command again, which writes it without training again"
+        with reading(run.folder, "metrics.json", remedy):
+            metrics = dict(json.loads((run.folder / "metrics.json").read_text()))
+        groups[run.title] = [
+            {
+                "name": name.replace("_", " "), "End": f"{end:.3f}",
+                "Start": f"{metrics[name + AT_START_SUFFIX]:.3f}",
+            }
+            for name, end in metrics.items()
+            if name + AT_START_SUFFIX in metrics
+        ]  # fmt: skip
         journal = run.folder / "metrics.jsonl"
         if journal.exists() and (records := [*json_lines(journal)]):
-            name = f"training-{run.kind}-{run.name.replace('/', '-')}"
-            caption = f"Training of {run.kind}/{run.name}."
-            section.figures.append(draw(name, plot_curves, records, caption))
+            name = f"training-{run.title.replace('/', '-')}"
+            section.figures.append(Figure(name, f"Training of {run.title}.", plot_curves, records))
+    if any(groups.values()):
+        caption = "Training, on held-out scenes"
+        section.tables.append(Table("training", caption, ["Start", "End"], groups))
     return section
 
 
-def _on_benchmark(table: Table, benchmark: str) -> Table:
-    caption = f"{table.caption}, on {benchmark}"
-    return replace(table, name=f"{table.name}-{benchmark}", caption=caption)
+def _name_table(table: Table, name: str, title: str = "") -> Table:
+    """Name a table after what it is about, such as a benchmark or a run."""
+    caption, suffix = f"{table.caption}: {title or name}", name.replace("/", "-")
+    return replace(table, name=f"{table.name}-{suffix}", caption=caption)
 
 
-def _family_figure(draw: Callable, name: str, rows: Rows, with_paper: bool = True) -> Figure:
-    plot = partial(figures.selection_figure, with_paper=with_paper)
+def _family_figure(name: str, rows: Rows, with_paper: bool = True) -> Figure:
+    plot = partial(figures.accuracy_figure, with_paper=with_paper)
     caption = f"Accuracy by family on {rows[0].items}, with 95% intervals."
-    return draw(f"{name}-{rows[0].items}", plot, [m.row for m in rows], caption)
-
-
-def _draw(folder: Path, name: str, plot: Callable, data: Any, caption: str) -> Figure:
-    """Write a figure as SVG with its text as text; equal data give equal files."""
-    import matplotlib
-
-    path = folder / f"{name}.svg"
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
-        plot(data, path)
-    return Figure(path, caption)
+    shares = {m.label: m.row.families for m in rows}
+    return Figure(f"{name}-{rows[0].items}", caption, plot, shares)

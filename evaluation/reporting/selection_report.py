@@ -1,104 +1,109 @@
-"""The report of evaluation.select: report.txt, report.json and selection.png."""
+"""The report of evaluation.select and evaluation.similarity: report.txt, report.json and
+selection.png."""
 
 from __future__ import annotations
 
 import json
 import logging
 from collections import Counter
-from dataclasses import asdict, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from conf.runs import write_text
-from conf.schema import SelectCommand
 from data.records import SelectionItem
 from data.tracks.controls import MATCHED_ANCHOR
 from evaluation.generators.response_log import Answer
-from evaluation.metrics.breakdown import accuracy_by_subtype, selection_row
+from evaluation.metrics.accuracy import accuracy_by_group
 from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
+from evaluation.metrics.results import SelectionResult, selection_result
 from evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
 from evaluation.reporting import tables
-from evaluation.reporting.figures import selection_figure
+from evaluation.reporting.figures import accuracy_figure
 from evaluation.reporting.reference import SUITE
 
 log = logging.getLogger(__name__)
 
-Answers = dict[tuple[str, str | None], list[Answer]]
-"""The answers to all items by mode and control."""
+
+@dataclass(frozen=True)
+class Choices:
+    """The choices of a model on all items, in one mode and under one control.
+
+    Attributes:
+        credits: 1 for a correct choice, 1/m for a tie among m candidates, 0 for others.
+        letters: The chosen letters; None without one.
+        answers: The parsed answers; empty for a retriever.
+    """
+
+    name: str
+    mode: str
+    control: str | None
+    credits: Sequence[float]
+    letters: Sequence[str | None]
+    answers: Sequence[Answer] = ()
+
+    @classmethod
+    def from_answers(
+        cls, name: str, mode: str, control: str | None, answers: Sequence[Answer]
+    ) -> Choices:
+        credits = [float(answer.right) for answer in answers]
+        return cls(name, mode, control, credits, [a.letter for a in answers], answers)
+
+    @property
+    def parse_rate(self) -> float | None:
+        if not self.answers:
+            return None
+        return sum(letter is not None for letter in self.letters) / len(self.letters)
 
 
 def write_report(
-    answers: Answers,
-    items: list[SelectionItem],
-    name: str,
+    choices: Sequence[Choices],
+    items: Sequence[SelectionItem],
     benchmark: str,
-    cfg: SelectCommand,
+    seed: int,
     folder: Path,
-    provenance: dict[str, Any],
-) -> dict[str, float]:
-    """Write the report of the model `name` into `folder`.
+    suite: str | None = None,
+    **provenance: Any,
+) -> list[SelectionResult]:
+    """Write a report into `folder`, and return the result of each of `choices`.
 
     Args:
+        seed: Seed of the bootstrap over scenes.
+        suite: As in `SelectCommand`.
         provenance: Entries for report.json: the benchmark's build, and the keys of the log's lines.
-
-    Returns:
-        Accuracies and parse rates of each mode, under the control if there is one.
     """
-    labels = {variant: variant_label(*variant) for variant in answers}
-    by_label = {labels[variant]: of_variant for variant, of_variant in answers.items()}
-    rows, metrics = [], {}
-    for (mode, control), of_variant in answers.items():
-        correct = [a.right for a in of_variant]
-        parse_rate = sum(a.letter is not None for a in of_variant) / len(of_variant)
-        settings = (cfg.seed, cfg.suite, control)
-        row = selection_row(benchmark, name, mode, items, correct, parse_rate, *settings)
-        rows.append(row)
-        if control == cfg.control:
-            metrics |= {f"{mode}_{f}": share.value for f, share in row.families.items()}
-            metrics |= {f"{mode}_macro": row.macro, f"{mode}_micro": row.micro.value}
-            metrics[f"{mode}_parse_rate"] = parse_rate
-    letters = [item.letter for item in items]
+    results = [
+        selection_result(
+            benchmark, c.name, c.mode, items, c.credits, c.parse_rate, seed, suite, c.control
+        )
+        for c in choices
+    ]
+    by_key = {result.key: c for result, c in zip(results, choices, strict=True)}
+    subtypes, letters = [f"{i.family}/{i.subtype}" for i in items], [i.letter for i in items]
+    calibrations = {key: _calibrate(c.answers) for key, c in by_key.items()}
     details = {
-        "subtypes": {
-            label: accuracy_by_subtype(items, [a.right for a in of_variant])
-            for label, of_variant in by_label.items()
-        },
-        "readings": {label: count_readings(of_variant) for label, of_variant in by_label.items()},
-        "positions": {
-            label: measure_position_bias([a.letter for a in of_variant], letters)
-            for label, of_variant in by_label.items()
-        },
-        "calibration": {
-            label: calibration
-            for label, of_variant in by_label.items()
-            if (calibration := calibrate(of_variant))
-        },
+        "subtypes": {key: accuracy_by_group(subtypes, c.credits) for key, c in by_key.items()},
+        "readings": {key: count_readings(c.answers) for key, c in by_key.items() if c.answers},
+        "positions": {key: measure_position_bias(c.letters, letters) for key, c in by_key.items()},
+        "calibration": {key: of for key, of in calibrations.items() if of},
     }
-    differences = compare_variants(answers, items, cfg)
+    differences = _compare(by_key, items, seed)
 
-    suite = items[0].suite
-    labelled = [replace(r, mode=label) for r, label in zip(rows, by_label, strict=True)]
-    parts = [tables.selection_table(labelled, suite)]
+    parts = [tables.selection_table(results, items[0].suite)]
     parts += [tables.paired_table(differences)] if differences else []
     log.info("%s", "\n\n".join(map(str, parts)))
     parts += tables.detail_tables(*details.values())
     write_text(folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")
-    report = {
-        **provenance,
-        "rows": [row.to_dict() for row in rows],
-        "controls": [{"mode": label, **asdict(p)} for label, pairs in differences for p in pairs],
-        **details,
-    }
+    controls = [{"mode": label, **asdict(p)} for label, pairs in differences for p in pairs]
+    report = {**provenance, "rows": results, "controls": controls, **details}
     write_text(folder / "report.json", json.dumps(report, indent=1, default=asdict))
-    selection_figure(labelled, folder / "selection.png", suite == SUITE)
-    return metrics
+    shares = {f"{r.name} ({r.variant})": r.families for r in results}
+    accuracy_figure(shares, folder / "selection.png", items[0].suite == SUITE)
+    return results
 
 
-def variant_label(mode: str, control: str | None) -> str:
-    return mode if control is None else f"{mode}, {control}"
-
-
-def count_readings(answers: list[Answer]) -> dict[str, int]:
+def count_readings(answers: Sequence[Answer]) -> dict[str, int]:
     """Counts of parsed answers, of valid records among them if records were requested, and of the
     reasons why the other answers could not be parsed."""
     counts = {"with a letter": sum(a.letter is not None for a in answers)}
@@ -108,29 +113,24 @@ def count_readings(answers: list[Answer]) -> dict[str, int]:
     return counts | dict(reasons.most_common())
 
 
-def calibrate(answers: list[Answer]) -> Calibration | None:
+def _calibrate(answers: Sequence[Answer]) -> Calibration | None:
     """The calibration of the confidence in valid records; None without any."""
-    return measure_calibration(
-        [a.record.confidence for a in answers if a.valid], [a.right for a in answers if a.valid]
-    )
+    valid = [answer for answer in answers if answer.valid]
+    return measure_calibration([a.record.confidence for a in valid], [a.right for a in valid])
 
 
-def compare_variants(
-    answers: Answers, items: list[SelectionItem], cfg: SelectCommand
+def _compare(
+    choices: Mapping[str, Choices], items: Sequence[SelectionItem], seed: int
 ) -> list[tuple[str, list[PairedComparison]]]:
     """By label: the unchanged items less the items under the control, and in matched-anchor pairs
     the questions of the event less those of the time."""
-    credits = {
-        variant: {a.item_id: float(a.right) for a in of_variant}
-        for variant, of_variant in answers.items()
-    }
+    ids = [item.item_id for item in items]
+    credits = {key: dict(zip(ids, c.credits, strict=True)) for key, c in choices.items()}
     differences = []
-    for (mode, control), own in credits.items():
-        if control is not None:
-            names = ("unchanged", control)
-            pairs = compare_runs(items, credits[mode, None], own, names, cfg.seed)
-            differences.append((mode, pairs))
-        if cfg.suite == MATCHED_ANCHOR:
-            anchors = compare_anchors(items, own, cfg.seed)
-            differences.append((variant_label(mode, control), anchors))
+    for key, c in choices.items():
+        if c.control is not None:
+            pair, names = (credits[c.mode], credits[key]), ("unchanged", c.control)
+            differences.append((c.mode, compare_runs(items, *pair, names, seed)))
+        if items[0].suite == MATCHED_ANCHOR:
+            differences.append((key, compare_anchors(items, credits[key], seed)))
     return differences

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
-NAME_WIDTH = 40
-"""Longest row name in plain text, in characters."""
-SUFFIX_WIDTH = 14
-"""Characters that a shortened name keeps of its end, which names the mode."""
+import jinja2
+
+from evaluation.metrics.intervals import Interval
+
 NOTE_WIDTH = 100
+DETAIL = "  "
+"""Prefix of the name of a row that details the row above it."""
+FORMATS = {"MRR": (1, ".3f", ".2f"), "Median": (1, "g", ".0f")}
+"""Scale and digits of the values and of the ends of intervals in a column; others are percents."""
+PERCENT = (100, ".1f", ".0f")
 
 _LATEX = {
     **{c: f"\\{c}" for c in "&%$#_{}"},
@@ -24,6 +31,10 @@ _LATEX = {
     "…": r"\ldots{}",
 }
 
+Row = Mapping[str, Any]
+"""A row's `name` and its values by column: an `Interval`, a share, a count, text, or None for an
+unknown value. A column that the row lacks stays empty."""
+
 
 class Best(str):
     """A cell that holds the best value of its column: bold, except in plain text."""
@@ -33,144 +44,114 @@ class Best(str):
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of formatted cells, each row as long as the head.
-
-    A row whose name begins with two spaces belongs to the row above it.
+    """Rows in groups. A row with intervals is followed by a row of their ends.
 
     Attributes:
         name: Stem of the files that the table is written to.
         groups: Rows by the label of their group; an empty label is not printed, and neither is a
             group without rows.
+        paper: The paper's rows, as in `groups`.
+        best: `max` or `min` for each column whose best value is marked, separately for `groups`
+            and for `paper`. Rows with a false `ranked` do not compete.
+        signed: Whether the values are differences.
+        folded: Whether the page folds the table, and the text of the report leaves it out.
     """
 
     name: str
     caption: str
-    head: Sequence[str]
-    groups: Mapping[str, Sequence[Sequence[str]]]
+    columns: Sequence[str]
+    groups: Mapping[str, Sequence[Row]]
     notes: tuple[str, ...] = ()
+    paper: Mapping[str, Sequence[Row]] = field(default_factory=dict)
+    best: Mapping[str, Callable[..., str]] = field(default_factory=dict)
+    signed: bool = False
+    folded: bool = False
 
-    def __post_init__(self) -> None:
-        groups = {label: rows for label, rows in self.groups.items() if rows}
-        object.__setattr__(self, "groups", groups)
+    @cached_property
+    def body(self) -> list[tuple[str, list[list[str]]]]:
+        """The label and the formatted rows of each group that has some."""
+        return [*self._format_groups(self.groups), *self._format_groups(self.paper)]
+
+    def _format_groups(
+        self, groups: Mapping[str, Sequence[Row]]
+    ) -> Iterator[tuple[str, list[list[str]]]]:
+        ranked = [row for rows in groups.values() for row in rows if row.get("ranked", True)]
+        best = {}
+        for column, choose in self.best.items():
+            cells = [c for row in ranked if (c := self._format(row, column)) not in ("", "-")]
+            if len(cells) > 1:
+                best[column] = choose(cells, key=float)
+        for label, rows in groups.items():
+            if rows:
+                yield label, [line for row in rows for line in self._format_row(row, best)]
+
+    def _format_row(self, row: Row, best: Mapping[str, str]) -> list[list[str]]:
+        cells = {column: self._format(row, column) for column in self.columns}
+        if row.get("ranked", True):
+            cells = {c: Best(cell) if cell == best.get(c) else cell for c, cell in cells.items()}
+        ends = [self._format_ends(row, column) for column in self.columns]
+        below = [[f"{DETAIL}95% interval", *ends]] if any(ends) else []
+        return [[row["name"], *cells.values()], *below]
+
+    def _format(self, row: Row, column: str) -> str:
+        value = row.get(column, "")
+        value = value.value if isinstance(value, Interval) else value
+        if isinstance(value, str | int):
+            return value if isinstance(value, str) else f"{value:,}"
+        scale, digits, _ = FORMATS.get(column, PERCENT)
+        return "-" if value is None else f"{scale * value:{'+' * self.signed}{digits}}"
+
+    def _format_ends(self, row: Row, column: str) -> str:
+        value = row.get(column)
+        if not isinstance(value, Interval):
+            return ""
+        scale, digits, end_digits = FORMATS.get(column, PERCENT)
+        if self.signed:
+            return f"{scale * value.low:+{digits}} to {scale * value.high:+{digits}}"
+        return f"{scale * value.low:{end_digits}}-{scale * value.high:{end_digits}}"
 
     def __str__(self) -> str:
-        return self.as_text()
-
-    def as_text(self) -> str:
-        """Aligned columns, the first one to the left; long names lose their middle."""
-        head = [shorten(cell) for cell in self.head]
-        groups = {
-            label: [[shorten(name), *cells] for name, *cells in rows]
-            for label, rows in self.groups.items()
-        }
-        cells = [head, *(row for rows in groups.values() for row in rows)]
+        """The caption above aligned columns, the first one to the left."""
+        head = ["", *self.columns]
+        cells = [head, *(row for _, rows in self.body for row in rows)]
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+
+        def align(row: Sequence[str]) -> str:
+            cells = [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
+            return "  ".join([row[0].ljust(widths[0]), *cells]).rstrip()
+
         rule = "-" * (sum(widths) + 2 * len(widths) - 2)
-        lines = [_align(head, widths)]
-        for label, rows in groups.items():
-            lines += [rule, *([label] if label else []), *(_align(row, widths) for row in rows)]
-        notes = [textwrap.fill(note, NOTE_WIDTH) for note in self.notes]
-        return "\n".join([*lines, rule, *notes])
+        lines = [*textwrap.wrap(self.caption, NOTE_WIDTH), "", align(head)]
+        for label, rows in self.body:
+            lines += [rule, *([label] if label else []), *map(align, rows)]
+        return "\n".join([*lines, rule, *(textwrap.fill(note, NOTE_WIDTH) for note in self.notes)])
 
     def as_markdown(self) -> str:
         """A GitHub Markdown table below its caption."""
-        columns = len(self.head)
-        lines = [_markdown_row(self.head), f"|:--{'|--:' * (columns - 1)}|"]
-        for label, rows in self.groups.items():
-            lines += [f"| *{_markdown(label)}* |{'  |' * (columns - 1)}"] if label else []
-            lines += map(_markdown_row, rows)
-        notes = map(_markdown, self.notes)
-        return "\n\n".join([f"**{_markdown(self.caption)}**", "\n".join(lines), *notes]) + "\n"
+        return self._render("table.md", _escape_markdown, "**{}**")
 
     def as_latex(self) -> str:
         """A float; requires the packages booktabs and graphicx."""
-        columns = len(self.head)
-        body = [_latex_row(self.head)]
-        for label, rows in self.groups.items():
-            body.append(r"\midrule")
-            if label:
-                body.append(rf"\multicolumn{{{columns}}}{{@{{}}l}}{{\emph{{{_latex(label)}}}}} \\")
-            for row in rows:
-                indent = r"\quad " * (bool(label) + row[0].startswith("  "))
-                body.append(indent + _latex_row(row))
-        caption = _latex(" ".join([f"{self.caption.rstrip('.')}.", *self.notes]))
-        return "\n".join(
-            [
-                r"\begin{table}[t]",
-                r"\centering",
-                r"\small",
-                r"\resizebox{\columnwidth}{!}{%",
-                rf"\begin{{tabular}}{{@{{}}l{'r' * (columns - 1)}@{{}}}}",
-                r"\toprule",
-                *body,
-                r"\bottomrule",
-                r"\end{tabular}}",
-                rf"\caption{{{caption}}}",
-                rf"\label{{tab:{re.sub('[^A-Za-z0-9-]', '-', self.name)}}}",
-                r"\end{table}",
-                "",
-            ]
-        )
+        return self._render("table.tex", _escape_latex, r"\textbf{{{}}}")
+
+    def _render(self, template: str, escape: Callable[[str], str], bold: str) -> str:
+        def cell(text: str) -> str:
+            escaped = escape(text.strip())
+            return bold.format(escaped) if isinstance(text, Best) else escaped
+
+        environment = jinja2.Environment(
+            block_start_string="<%", block_end_string="%>", variable_start_string="<<",
+            variable_end_string=">>", loader=jinja2.PackageLoader("evaluation.reporting"),
+            undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True,
+        )  # fmt: skip
+        environment.filters["cell"] = cell
+        slug = re.sub("[^A-Za-z0-9-]", "-", self.name)
+        return environment.get_template(template).render(table=self, slug=slug)
 
 
-def shorten(name: str) -> str:
-    """A name without its middle if it is longer than `NAME_WIDTH`."""
-    if len(name) <= NAME_WIDTH:
-        return name
-    return f"{name[: NAME_WIDTH - SUFFIX_WIDTH - 1]}…{name[-SUFFIX_WIDTH:]}"
+def _escape_markdown(text: str) -> str:
+    return re.sub(r"([\\`*_\[\]<>|~#&$])", r"\\\1", text)
 
 
-def mark_best(
-    groups: Mapping[str, Sequence[Sequence[str]]],
-    head: Sequence[str],
-    best: Mapping[str, Callable[[Sequence[float]], float]],
-    skipped: Sequence[str] = (),
-) -> dict[str, list[list[str]]]:
-    """The rows of all groups with the best cells marked, if a column holds two values or more.
-
-    Args:
-        best: `max` or `min` for each column that has a best value.
-        skipped: Names of rows that do not compete.
-    """
-    groups = {label: [list(row) for row in rows] for label, rows in groups.items()}
-    rows = [row for group in groups.values() for row in group]
-    rows = [row for row in rows if not row[0].startswith("  ") and row[0] not in skipped]
-    for column, heading in enumerate(head):
-        filled = [row for row in rows if row[column] not in ("", "-")]
-        if heading in best and len(filled) > 1:
-            value = best[heading]([float(row[column]) for row in filled])
-            for row in filled:
-                if float(row[column]) == value:
-                    row[column] = Best(row[column])
-    return groups
-
-
-def _align(row: Iterable[str], widths: list[int]) -> str:
-    first, *rest = row
-    cells = [first.ljust(widths[0])]
-    cells += [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
-    return "  ".join(cells).rstrip()
-
-
-def _emphasize(row: Iterable[str], escape: Callable[[str], str], bold: str) -> list[str]:
-    """The escaped cells of a row, the best ones in the format `bold`."""
-    return [
-        bold.format(escape(cell.strip())) if isinstance(cell, Best) else escape(cell.strip())
-        for cell in row
-    ]
-
-
-def _markdown_row(row: Sequence[str]) -> str:
-    return f"| {' | '.join(_emphasize(row, _markdown, '**{}**'))} |"
-
-
-def _markdown(text: str) -> str:
-    return re.sub(r"([\\`*_\[\]<>|~#&$])", r"\\\1", text.strip())
-
-
-def _latex_row(row: Sequence[str]) -> str:
-    return " & ".join(_emphasize(row, _latex, r"\textbf{{{}}}")) + r" \\"
-
-
-def _latex(text: str) -> str:
+def _escape_latex(text: str) -> str:
     return re.sub(r"->|.", lambda found: _LATEX.get(found[0], found[0]), text)

@@ -21,7 +21,7 @@ import numpy as np
 from conf.errors import UserError
 from conf.runs import lock_folder
 from evaluation.embedders.cache import EmbeddingCache
-from evaluation.reporting.results import RECALLS
+from evaluation.metrics.results import RECALLS
 from evaluation.retrieval.exact_search import GridEmbeddings, Ranks, block_scores, kth_scores
 
 log = logging.getLogger(__name__)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,8 @@ from data.records import FrameRef, RetrievalQuery
 from data.store import Store
 from data.tracks.retrieval.checks import check_test
 from evaluation.embedders.cache import EmbeddingCache
+from evaluation.metrics.results import RetrievalResult
 from evaluation.reporting import figures, tables
-from evaluation.reporting.results import RetrievalResult
 from evaluation.reporting.table import Table
 from evaluation.retrieval.exact_search import Ranks, exact_ranks
 
@@ -79,21 +80,20 @@ def write_report(
     rows: Sequence[RetrievalResult],
     curves: Sequence[dict[str, Any]],
     extra_tables: Sequence[Table] = (),
-    reference_group: str = "retrieval_distilled",
+    command: str = "retrieve",
     **entries: Any,
 ) -> None:
     """Write report.txt, report.json and the figures.
 
     Args:
-        reference_group: The paper's rows beside them, see reference.yaml.
+        command: retrieve or two_stage, which have different reference rows.
         extra_tables: Tables for report.txt after the main one.
         entries: More entries of report.json.
     """
-    table = f"{tables.retrieval_table(rows, reference_group)}\n\n{tables.cost_table(rows)}"
+    table = str(tables.retrieval_table(rows, command))
     log.info("%s", table)
     page = "\n\n".join(map(str, [table, *extra_tables, *tables.builder_tables(rows)]))
     write_text(folder / "report.txt", page + "\n")
-    report = {"rows": [r.to_dict() for r in rows], "curves": curves, **entries}
-    write_text(folder / "report.json", json.dumps(report, indent=1))
-    figures.retrieval_figure(rows, folder / "retrieval.png")
-    figures.builders_figure(rows, curves, folder / "builders.png")
+    report = {"rows": rows, "curves": curves, **entries}
+    write_text(folder / "report.json", json.dumps(report, indent=1, default=asdict))
+    figures.retrieval_figure([(row.name, row) for row in rows], folder / "retrieval.png")

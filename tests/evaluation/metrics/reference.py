@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from evaluation.metrics.ranking import count_ranks, ranking_metrics, target_scores
+from evaluation.metrics.ranking import count_ranks, query_metrics, target_scores
 
 
 def scene_interval(
@@ -26,5 +26,17 @@ def scene_interval(
 
 def matrix_metrics(scores: np.ndarray, targets: np.ndarray, ks: Sequence[int]) -> dict[str, float]:
     """Ranking metrics of a score matrix (queries, frames) and its target columns (queries,)."""
+    scores = np.asarray(scores)
     valid = ~np.isnan(target_scores(scores, targets))
     return ranking_metrics(*count_ranks(scores, targets), valid, np.shape(scores)[1], ks)
+
+
+def ranking_metrics(
+    greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, frames: int, ks: Sequence[int]
+) -> dict[str, float]:
+    """Summarize `query_metrics` over all queries, misses included."""
+    measures = query_metrics(greater, tied, valid, frames, ks)
+    return {
+        name: float((np.median if name == "median_rank" else np.mean)(values))
+        for name, values in measures.items()
+    }

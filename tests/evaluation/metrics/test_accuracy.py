@@ -22,11 +22,3 @@ def test_macro_is_over_the_families_present():
 def test_groups_of_any_name():
     found = accuracy_by_group(["b", "a", "b"], [1, 1, 0])
     assert {k: (v.value, v.n) for k, v in found.items()} == {"a": (1, 1), "b": (0.5, 2)}
-
-
-@pytest.mark.parametrize(
-    ("families", "correct"), [([], []), (["event"], [1, 0]), (["motion"], [1])]
-)
-def test_wrong_tables_are_refused(families, correct):
-    with pytest.raises(ValueError, match=r"families|groups"):
-        accuracy_by_family(families, correct)

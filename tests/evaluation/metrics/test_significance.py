@@ -1,5 +1,4 @@
-"""What two runs over the same items are apart, held against definitions and an independent
-library."""
+"""Paired comparisons of two runs, against definitions and an independent library."""
 
 from __future__ import annotations
 
@@ -12,6 +11,7 @@ from scipy.stats import binomtest
 from data.records import FAMILIES, Candidate, SelectionItem
 from data.tracks.controls import MATCHED_ANCHOR
 from evaluation.metrics.accuracy import accuracy_by_family
+from evaluation.metrics.results import from_json
 from evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
 from evaluation.reporting.tables import paired_table
 from tests.user_errors import raises_user_error
@@ -19,7 +19,7 @@ from tests.user_errors import raises_user_error
 NAMES = ("one", "two")
 
 
-def made(number: int, family: str, scene: str) -> SelectionItem:
+def make_item(number: int, family: str, scene: str) -> SelectionItem:
     moments = tuple(Candidate(scene, frame, "x") for frame in (40, 50, 60, 70))
     return SelectionItem(
         f"{family}-{number}", "test", "dynapix", family, "any", "Which?", scene, 0, 20, 40,
@@ -29,16 +29,16 @@ def made(number: int, family: str, scene: str) -> SelectionItem:
 
 @pytest.fixture
 def items() -> list[SelectionItem]:
-    return [made(k, FAMILIES[k % 3], f"scene-{k // 4}") for k in range(120)]
+    return [make_item(k, FAMILIES[k % 3], f"scene-{k // 4}") for k in range(120)]
 
 
-def drawn(items, seed: int, share: float = 0.5) -> dict[str, float]:
+def random_credits(items, seed: int, share: float = 0.5) -> dict[str, float]:
     rng = np.random.default_rng(seed)
     return {item.item_id: float(rng.random() < share) for item in items}
 
 
 def test_differences_are_those_of_the_accuracies(items) -> None:
-    left, right = drawn(items, 0, 0.7), drawn(items, 1, 0.4)
+    left, right = random_credits(items, 0, 0.7), random_credits(items, 1, 0.4)
     found = {p.of: p for p in compare_runs(items, left, right, NAMES, seed=0)}
     assert list(found) == [*FAMILIES, "macro", "all"]
     one, two = (
@@ -59,8 +59,8 @@ def test_differences_are_those_of_the_accuracies(items) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_test_is_a_fair_coins(items, seed) -> None:
-    left, right = drawn(items, seed), drawn(items, seed + 100, 0.3 + 0.1 * seed)
+def test_p_is_that_of_a_fair_coin(items, seed) -> None:
+    left, right = random_credits(items, seed), random_credits(items, seed + 100, 0.3 + 0.1 * seed)
     for p in compare_runs(items, left, right, NAMES, seed=0):
         if p.of == "macro":
             continue
@@ -71,26 +71,28 @@ def test_the_test_is_a_fair_coins(items, seed) -> None:
         assert p.p == pytest.approx(coin.pvalue)
 
 
-def test_sides_are_alike(items) -> None:
-    left, right = drawn(items, 0, 0.7), drawn(items, 1)
-    there = compare_runs(items, left, right, NAMES, seed=3)
-    back = compare_runs(items, right, left, NAMES[::-1], seed=3)
-    for p, q in zip(there, back, strict=True):
+def test_swapping_the_sides_changes_the_signs(items) -> None:
+    left, right = random_credits(items, 0, 0.7), random_credits(items, 1)
+    forward = compare_runs(items, left, right, NAMES, seed=3)
+    backward = compare_runs(items, right, left, NAMES[::-1], seed=3)
+    for p, q in zip(forward, backward, strict=True):
         assert (p.left, p.only_left, p.p) == (q.right, q.only_right, q.p)
         assert (p.difference, p.low, p.high) == pytest.approx((-q.difference, -q.high, -q.low))
 
 
-def test_a_run_is_not_apart_from_itself(items) -> None:
-    credits = drawn(items, 0)
+def test_a_run_does_not_differ_from_itself(items) -> None:
+    credits = random_credits(items, 0)
     for p in compare_runs(items, credits, credits, NAMES, seed=0):
         assert (p.difference, p.low, p.high) == (0, 0, 0)
         assert p.of == "macro" or (p.only_left, p.only_right, p.p) == (0, 0, 1)
 
 
-def test_items_of_a_scene_say_no_more_than_the_scene(items) -> None:
-    left, right = drawn(items, 0), drawn(items, 1)
-    alone = [replace(item, scene_id=f"scene-{k}", candidates=made(k, "x", f"scene-{k}").candidates)
-             for k, item in enumerate(items)]  # fmt: skip
+def test_copies_of_a_scenes_items_do_not_narrow_the_interval(items) -> None:
+    left, right = random_credits(items, 0), random_credits(items, 1)
+    alone = [
+        replace(item, scene_id=f"scene-{k}", candidates=make_item(k, "x", f"scene-{k}").candidates)
+        for k, item in enumerate(items)
+    ]
     widths = []
     for scenes in (1, 4):
         copies = [
@@ -105,8 +107,8 @@ def test_items_of_a_scene_say_no_more_than_the_scene(items) -> None:
         p = compare_runs(copies, *sides, NAMES, seed=0)[-1]
         widths.append(p.high - p.low)
     assert widths[1] == pytest.approx(widths[0])
-    apart = np.array([left[i.item_id] - right[i.item_id] for i in items])
-    assert widths[0] == pytest.approx(2 * 1.96 * apart.std() / len(items) ** 0.5, rel=0.1)
+    differences = np.array([left[i.item_id] - right[i.item_id] for i in items])
+    assert widths[0] == pytest.approx(2 * 1.96 * differences.std() / len(items) ** 0.5, rel=0.1)
 
 
 def test_ties_count_for_the_side_with_more_credit(items) -> None:
@@ -119,12 +121,12 @@ def test_ties_count_for_the_side_with_more_credit(items) -> None:
 
 
 def test_runs_over_other_items_are_refused_with_the_difference(items) -> None:
-    left, right = drawn(items[:40], 0), drawn(items[2:41], 0)
+    left, right = random_credits(items[:40], 0), random_credits(items[2:41], 0)
     with raises_user_error("different-items", contains=("2 only in select/a", "time-40")):
         compare_runs(items[:40], left, right, ("select/a", "select/b"), seed=0)
 
 
-def test_anchors_hold_the_questions_of_a_pair_against_each_other(benchmark_store) -> None:
+def test_anchors_compare_the_questions_of_a_pair(benchmark_store) -> None:
     matched = benchmark_store.selection(suite=MATCHED_ANCHOR)
     by_family = {i.item_id: float(i.family == "event") for i in matched}
     [p] = compare_anchors(matched[::-1], by_family, seed=0)
@@ -134,11 +136,11 @@ def test_anchors_hold_the_questions_of_a_pair_against_each_other(benchmark_store
     assert p.p == pytest.approx(0.5 ** (p.n - 1))
 
 
-def test_what_is_apart_is_json_and_fits_a_page(items) -> None:
+def test_comparisons_survive_json_and_fit_a_page(items) -> None:
     found = compare_runs(
-        items, drawn(items, 0), drawn(items, 1), ("as they are", "shuffled_prefix"), 0
+        items, random_credits(items, 0), random_credits(items, 1), ("unchanged", "shuffled"), 0
     )
-    assert [PairedComparison(**asdict(p)) for p in found] == found
+    assert from_json(list[PairedComparison], [asdict(p) for p in found]) == found
     table = str(paired_table([("reasoning", found), ("answer, candidate_only", found)]))
     assert max(map(len, table.splitlines())) <= 100
     assert table.count("\nmacro ") == 2

@@ -14,8 +14,8 @@ from conf.schema import BenchmarkConfig, SelectCommand, ServerConfig, StudentCon
 from data.tracks.controls import MATCHED_ANCHOR, pair_items
 from evaluation import select
 from evaluation.generators.response_log import score_response
-from evaluation.reporting.results import SelectionResult
-from evaluation.reporting.selection_report import write_report
+from evaluation.metrics.results import SelectionResult, from_json
+from evaluation.reporting.selection_report import Choices, write_report
 from models.student.generation import GeneratedText
 from tests.user_errors import raises_user_error
 
@@ -52,7 +52,7 @@ def test_a_prefix_is_worth_what_its_items_lose_without_it(
     plain, control = (sum(i.letter == x for i in items) for x in "CB")
     told = json.loads((tmp_path / "report.json").read_text())
     name = micro_store.name
-    rows = [SelectionResult.from_dict(r) for r in told["rows"]]
+    rows = from_json(list[SelectionResult], told["rows"])
     assert [(r.benchmark, r.control, r.mode) for r in rows] == [
         (name, None, "answer"), (name, "candidate_only", "answer"),
     ]  # fmt: skip
@@ -103,17 +103,12 @@ def folder(root: Path, name: str) -> Path:
 def test_the_questions_of_a_pair_are_held_against_each_other(benchmark_store, tmp_path) -> None:
     items = benchmark_store.selection(suite=MATCHED_ANCHOR)
     said = {"event": "Answer: A", "time": "Answer: B"}
-    given = {
-        ("answer", control): [
-            score_response(i, "answer", GeneratedText(said[i.family], False)) for i in items
-        ]
+    answers = [score_response(i, "answer", GeneratedText(said[i.family], False)) for i in items]
+    choices = [
+        Choices.from_answers("one", "answer", control, answers)
         for control in (None, "candidate_only")
-    }
-    cfg = SelectCommand(
-        benchmark=BenchmarkConfig(name="any"), student=STUDENT, suite=MATCHED_ANCHOR,
-        control="candidate_only",
-    )  # fmt: skip
-    metrics = write_report(given, items, "one", "any", cfg, tmp_path, {})
+    ]
+    _, result = write_report(choices, items, "any", 0, tmp_path, MATCHED_ANCHOR)
     told = json.loads((tmp_path / "report.json").read_text())["controls"]
     truth = [by_event.letter for by_event, _ in pair_items(items)]
     matched = [p for p in told if p["left"] == "event"]
@@ -121,8 +116,8 @@ def test_the_questions_of_a_pair_are_held_against_each_other(benchmark_store, tm
     for p in matched:
         assert (p["right"], p["of"], p["n"]) == ("time", "all", len(truth))
         assert (p["only_left"], p["only_right"]) == (truth.count("A"), truth.count("B"))
-        assert p["left_accuracy"] == metrics["answer_event"]
-        assert p["right_accuracy"] == metrics["answer_time"]
+        assert p["left_accuracy"] == result.families["event"].value
+        assert p["right_accuracy"] == result.families["time"].value
     # What is said alike either way is apart by nothing.
     assert {p["difference"] for p in told if p["left"] != "event"} == {0}
 

@@ -34,8 +34,8 @@ from data.store import Store, open_store
 from evaluation import two_stage
 from evaluation.embedders.base import embed_queries, open_embedders, untrained_embedder
 from evaluation.embedders.joint_encoder import released_encoder
-from evaluation.metrics.breakdown import retrieval_rows
 from evaluation.metrics.ranking import query_metrics
+from evaluation.metrics.results import retrieval_results
 from evaluation.retrieval import text_matching
 from evaluation.retrieval.predicted_texts import ROUTES, future_text
 from evaluation.retrieval.standard_test import load_standard_test, rank_targets
@@ -120,14 +120,14 @@ def test_texts_rank_by_their_scores_and_a_missing_one_is_a_miss(ranks, store, cl
     scores = encoder.texts(said) @ encoder.frames(database, FrameReader(store, clip.image_size)).T
     gold = np.array([database.index(q.target) for q in queries])
     plain = matrix_metrics(scores, gold, [10])
-    row = retrieval_rows("micro", "x", found, queries, 0)[0]
+    row = retrieval_results("micro", "x", found, queries, 0)[0]
     assert row.mrr.value == pytest.approx(plain["mrr"], rel=0.01)
     assert row.median_rank.value == pytest.approx(plain["median_rank"], abs=1)
 
     missing = ranks("predict_image", ["", *said[1:-1], ""])
     assert missing.found.tolist() == [[False, *[True] * (len(said) - 2), False]] * 2
     assert (missing.greater[:, 1:-1] == found.greater[:, 1:-1]).all()
-    less = retrieval_rows("micro", "x", missing, queries, 0)[0]
+    less = retrieval_results("micro", "x", missing, queries, 0)[0]
     assert (less.queries, less.frames) == (len(queries), len(database))
     lost = query_metrics(found.greater[0], found.tied[0], found.found[0], len(database), [1])
     assert less.mrr.value == pytest.approx(lost["mrr"][1:-1].sum() / len(queries))
@@ -148,8 +148,8 @@ def test_repeating_the_question_ranks_as_seeing_no_prefix(ranks, store, clip, tm
     direct = rank_targets(clip, asked, targets, [shown])
     found = ranks("predict_image", [q.question for q in queries])
     for a, b in zip(
-        retrieval_rows("micro", "x", found, queries, 0),
-        retrieval_rows("micro", "x", direct, queries, 0),
+        retrieval_results("micro", "x", found, queries, 0),
+        retrieval_results("micro", "x", direct, queries, 0),
         strict=True,
     ):
         assert (a.width, a.builder, a.queries) == (b.width, b.builder, b.queries)
@@ -285,7 +285,7 @@ def test_a_student_writes_once_for_every_matcher(world, store, micro, clip, tmp_
     assert "Texts" in text
     matched = [json.loads(m) for m in (tmp_path / "one" / "matched.jsonl").read_text().splitlines()]
     assert len(matched) == 3 * len(queries)
-    for picture in ("retrieval.png", "builders.png"):
+    for picture in ("retrieval.png",):
         assert (tmp_path / "one" / picture).stat().st_size > 10_000
 
     # Killed in the middle of a line it writes what was lost, in whatever batches.

@@ -27,14 +27,18 @@ from conf.schema.training import SftTrainConfig
 from data.records import SelectionItem
 from data.store import Store
 from evaluation import report
-from evaluation.metrics.accuracy import accuracy_by_family, accuracy_by_group
-from evaluation.metrics.breakdown import compare_retrievers, recall_curves, retrieval_rows
-from evaluation.metrics.calibration import measure_position_bias
-from evaluation.reporting.results import SIMILARITY, SelectionResult
+from evaluation.generators.response_log import score_response
+from evaluation.metrics.results import (
+    SIMILARITY,
+    compare_retrievers,
+    recall_curve,
+    retrieval_results,
+)
+from evaluation.reporting.selection_report import Choices, write_report
 from evaluation.retrieval import nearest_candidate
 from evaluation.retrieval.exact_search import Ranks
 from evaluation.select import limit_items
-from models.student.answer_parser import parse_choice
+from models.student.generation import GeneratedText
 
 STUDENT = StudentConfig(name="small")
 Say = Callable[[SelectionItem], str]
@@ -49,12 +53,12 @@ def always_a(item: SelectionItem) -> str:
 
 
 def finish(
-    folder: Path, settings: object, report: dict | None, metrics: dict | None = None
+    folder: Path, settings: object, report: dict | None = None, metrics: dict | None = None
 ) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
     if report is not None:
-        (folder / "report.json").write_text(json.dumps(report))
+        (folder / "report.json").write_text(json.dumps(report, default=asdict))
     (folder / "metrics.json").write_text(json.dumps(metrics or {}))
     started = {"started": datetime.now(UTC).isoformat(), "earlier_starts": []}
     (folder / "run.json").write_text(json.dumps(started))
@@ -91,24 +95,11 @@ def select_run(
         benchmark=benchmark, student=STUDENT, store=str(store.folder.parent),
         model=None if model is None else f"{root}/sft/{model}", suite=suite,
     )  # fmt: skip
-    chosen = [parse_choice(say(item)).letter for item in items]
-    credits = [float(c == item.letter) for c, item in zip(chosen, items, strict=True)]
-    accuracy = accuracy_by_family([i.family for i in items], credits)
-    parsed = sum(c is not None for c in chosen)
-    name = model or "small base"
-    row = SelectionResult.of(store.name, name, mode, accuracy, parsed / len(items), suite=suite)
-    cells = accuracy_by_group([f"{i.family}/{i.subtype}" for i in items], credits)
-    letters = measure_position_bias(chosen, [i.letter for i in items])
-    report = {
-        "build": store.identity,
-        "asked": [[mode, None, "k1"]],
-        "rows": [row.to_dict()],
-        "subtypes": {mode: {cell: vars(found) for cell, found in cells.items()}},
-        "readings": {mode: {"with a letter": parsed}},
-        "positions": {mode: asdict(letters)},
-        "calibration": {},
-    }
-    finish(folder, settings, report)
+    finish(folder, settings)
+    answers = [score_response(item, mode, GeneratedText(say(item), False)) for item in items]
+    choices = Choices.from_answers(model or "small base", mode, None, answers)
+    about = {"build": store.identity, "asked": [[mode, None, "k1"]]}
+    write_report([choices], items, store.name, 0, folder, suite, **about)
     keys = {"key": "k1", "mode": mode}
     lines = [{**keys, "asked": {"control": None, "seed": 0}}]
     lines += [{**keys, "item_id": i.item_id, "text": say(i), "cut": False} for i in items]
@@ -136,17 +127,15 @@ def similarity_run(
     scores = {f"untrained {name}": np.tile(np.float32(untrained), (len(items), 1))}
     if model is not None:
         scores = {model: np.eye(4, dtype=np.float32)[answers], **scores}
-    rows, subtypes, lines = [], {}, []
+    choices, lines = [], []
     for title, of in scores.items():
         credits = nearest_candidate.credit_choices(of, answers)
-        accuracy = accuracy_by_family([i.family for i in items], credits)
-        rows.append(SelectionResult.of(store.name, title, SIMILARITY, accuracy, None))
-        cells = accuracy_by_group([f"{i.family}/{i.subtype}" for i in items], credits)
-        subtypes[title] = {cell: vars(found) for cell, found in cells.items()}
+        letters = nearest_candidate.choose_letters(of)
+        choices.append(Choices(title, SIMILARITY, None, credits, letters))
         lines += nearest_candidate.format_scores(title, items, of)
-    report = {"build": store.identity, "rows": [r.to_dict() for r in rows], "subtypes": subtypes}
     folder = root / "similarity" / (model or name)
-    finish(folder, settings, report)
+    finish(folder, settings)
+    write_report(choices, items, store.name, 0, folder, build=store.identity)
     (folder / "scores.jsonl").write_text("".join(f"{line}\n" for line in lines))
     return folder
 
@@ -156,7 +145,7 @@ def retrieve_run(
 ) -> Path:
     """A run of evaluation.retrieve of a trained retriever and of what it began from."""
     trained = ContrastiveCommand(benchmark=benchmark, retriever=RetrieverConfig(name="small"))
-    finish(root / "contrastive" / name, trained, None)
+    finish(root / "contrastive" / name, trained)
     queries = store.standard_test()
     rng = np.random.default_rng(0)
     rows, curves, found = [], [], {}
@@ -166,10 +155,9 @@ def retrieve_run(
         sizes = ((frames * 256, frames * 128), (0.5, 0.5))
         ranks = Ranks((64, 32), greater, np.zeros_like(greater), every, frames, *sizes)
         found[title] = ranks
-        rows += retrieval_rows(store.name, title, ranks, queries, 0)
-        curves += recall_curves(title, ranks, queries)
-    provenance = {"build": store.identity, "curves": curves, "indexes": []}
-    report = {"rows": [r.to_dict() for r in rows], **provenance}
+        rows += retrieval_results(store.name, title, ranks, queries, 0)
+        curves.append(recall_curve(title, ranks))
+    report = {"rows": rows, "build": store.identity, "curves": curves, "indexes": []}
     if kind == "retrieve":
         report["differences"] = compare_retrievers(found, queries, 0)
     settings = RetrieveCommand(

@@ -16,7 +16,7 @@ from data.records import LETTERS
 from data.render.frame_cache import FrameReader
 from evaluation.reporting import item_browser
 from evaluation.reporting.page import script_json
-from evaluation.reporting.run_responses import SimilarityResponse, TextResponse
+from evaluation.reporting.run_responses import nearest_candidates, parse_response
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,9 @@ def responses(items):
     """Two models that answer at random."""
     rng = np.random.default_rng(5)
     return {
-        label: {i.item_id: TextResponse(f"Answer: {rng.choice([*LETTERS])}", False) for i in items}
+        label: {
+            i.item_id: parse_response(f"Answer: {rng.choice([*LETTERS])}", False) for i in items
+        }
         for label in ("one", "other")
     }
 
@@ -39,7 +41,7 @@ def cells(items, responses):
     found = defaultdict(set)
     for item in items:
         for label, of_model in responses.items():
-            correct = of_model[item.item_id].answer.letter == item.letter
+            correct = of_model[item.item_id].letter == item.letter
             found[item.family, item.subtype, label, correct].add(item.item_id)
     return found
 
@@ -105,7 +107,7 @@ def test_missing_frames_are_reported_and_the_others_stay(micro_store, items, mon
 def test_a_response_has_the_verdict_of_its_parsed_answer(micro_store, items, text, verdict):
     item = items[0]
     wrong = next(letter for letter in LETTERS if letter != item.letter)
-    response = TextResponse(text.format(right=item.letter, wrong=wrong), False)
+    response = parse_response(text.format(right=item.letter, wrong=wrong), False)
     [entry] = item_browser.page_entries([item], {"one": {item.item_id: response}}, micro_store)
     [shown] = entry["responses"]
     assert (shown["model"], shown["verdict"]) == ("one", verdict)
@@ -114,7 +116,7 @@ def test_a_response_has_the_verdict_of_its_parsed_answer(micro_store, items, tex
 
 
 def test_a_long_response_is_shortened_with_a_note(micro_store, items):
-    response = TextResponse("Answer: A\n" + "word " * 200_000, True)
+    response = parse_response("Answer: A\n" + "word " * 200_000, True)
     by_label = {"one": {items[0].item_id: response}}
     [entry] = item_browser.page_entries(items[:1], by_label, micro_store)
     text = entry["responses"][0]["text"]
@@ -124,11 +126,11 @@ def test_a_long_response_is_shortened_with_a_note(micro_store, items):
 
 
 def test_tied_candidates_share_the_credit():
-    tie = SimilarityResponse(dict(zip(LETTERS, (0.5, None, 0.5, 0.25), strict=True)))
+    tie = nearest_candidates(dict(zip(LETTERS, (0.5, None, 0.5, 0.25), strict=True)))
     assert [tie.credit(x) for x in LETTERS] == [0.5, 0, 0.5, 0]
-    assert (tie.answer.letter, str(tie.answer.reason)) == (None, "several")
+    assert (tie.letter, tie.reason) == (None, "several")
     assert tie.text == "A 0.5000, B no score, C 0.5000, D 0.2500"
-    assert SimilarityResponse(dict.fromkeys(LETTERS)).credit("A") == 0
+    assert nearest_candidates(dict.fromkeys(LETTERS)).credit("A") == 0
 
 
 def test_embedded_json_reads_back_and_closes_no_script():

@@ -152,7 +152,8 @@ def test_the_report_covers_an_exported_study_without_models(tmp_path) -> None:
     run.folder.mkdir()
     report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path)), run)
     page = (run.folder / "report.txt").read_text()
-    assert page == f"Human accuracy (%): study pilot on benchmark tiny\n\n{human_table(found)}\n"
+    caption, _, cells = str(human_table(found)).partition("\n")
+    assert page == f"{caption}: study pilot on benchmark tiny\n{cells}\n"
     assert (run.folder / "tables" / "human-pilot.tex").exists()
 
     (exported / "report.json").write_text('{"benchmark": "tiny"}')
