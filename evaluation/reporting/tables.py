@@ -47,13 +47,13 @@ def selection_table(results: Sequence[SelectionResult], suite: str = SUITE) -> T
 
 
 def selection_rows(name: str, result: SelectionResult) -> list[Row]:
-    """A result under `SELECTION_COLUMNS`, and its accuracies by horizon."""
+    """A result under `SELECTION_COLUMNS`, and its accuracies by horizon of the time family."""
     row = accuracy_row(name, result.families, result.macro_interval, result.micro)
-    horizons = []
-    for horizon, share in result.horizons.items():
-        family = "Time" if horizon.endswith(" s") else "Window"
-        label = f"{DETAIL}{family.lower()}, {horizon}"
-        horizons.append({"name": label, family: share, "Items": share.n, "ranked": False})
+    horizons = [
+        {"name": f"{DETAIL}time, {horizon}", "Time": share, "Items": share.n, "ranked": False}
+        for horizon, share in result.horizons.items()
+        if horizon.endswith(" s")
+    ]
     return [{**row, "Parsed": result.parse_rate}, *horizons]
 
 

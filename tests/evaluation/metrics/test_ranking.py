@@ -41,21 +41,6 @@ def test_ties_are_the_mean_over_every_order():
             assert metrics[key] == pytest.approx(value)
 
 
-def test_without_ties_it_is_sorting():
-    rng = np.random.default_rng(1)
-    scores = rng.permuted(np.tile(np.arange(50.0), (30, 1)), axis=1)
-    target = rng.integers(50, size=30)
-    ranks = np.array(
-        [list(np.argsort(-s)).index(g) + 1 for s, g in zip(scores, target, strict=True)]
-    )
-    metrics = matrix_metrics(scores, target, KS)
-    assert metrics["mrr"] == pytest.approx((1 / ranks).mean())
-    assert metrics["median_rank"] == np.median(ranks)
-    assert metrics["tie_rate"] == 0
-    for k in KS:
-        assert metrics[f"recall@{k}"] == pytest.approx((ranks <= k).mean())
-
-
 def test_a_constant_scorer_gets_chance():
     metrics = matrix_metrics(np.zeros((5, 200)), np.arange(5), KS)
     for k in KS:

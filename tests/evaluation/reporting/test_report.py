@@ -248,14 +248,6 @@ def test_responses_are_not_judged_by_another_build_of_their_benchmark(runs, micr
     assert read_table(folder, "selection-micro")
 
 
-def test_without_the_benchmark_the_tables_are_still_written(runs, tmp_path):
-    folder = reported(runs, tmp_path / "nowhere")
-    assert read_table(folder, "selection-micro")
-    page = (folder / "report.html").read_text()
-    assert "The items of micro cannot be shown" in page
-    assert 'id="data"' not in page
-
-
 def test_a_failing_report_keeps_the_previous_one(runs, micro_store):
     folder = reported(runs, micro_store.folder.parent, items=1)
     before = {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}

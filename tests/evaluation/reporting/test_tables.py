@@ -27,8 +27,6 @@ from evaluation.metrics.results import (
 from evaluation.reporting import figures
 from evaluation.reporting.reference import COT_STUDENT
 from evaluation.reporting.tables import (
-    builder_tables,
-    index_table,
     rank_differences_table,
     retrieval_table,
     selection_table,
@@ -153,23 +151,6 @@ def test_retrieval_table_shows_the_untrained_row_and_the_cost_at_each_width(retr
     again = replace(retrievals[0], seconds=5.0)
     assert again == retrievals[0]
     assert hash(again) == hash(retrievals[0])
-
-
-def test_builder_tables_show_every_width_of_every_builder(retrievals):
-    trained, untrained = map(str, builder_tables(retrievals))
-    assert "contrastive" in trained
-    assert UNTRAINED in untrained
-    for builder in range(1, 7):
-        lines = [line for line in trained.splitlines() if line.startswith(f"builder {builder} ")]
-        assert [line.split()[4] for line in lines] == ["4096", "256", "64"]
-
-
-def test_index_table_shows_recall_size_and_time():
-    index = {"name": "one (faiss)", "width": 64, "bytes": 3 << 20, "seconds": 0.5}
-    table = str(index_table([index | {"recall@1": 0.981, "recall@10": 1.0, "recall@50": 0.5}]))
-    assert table.splitlines()[4].split() == [
-        "one", "(faiss)", "64", "98.1", "100.0", "50.0", "3.0", "0.50",
-    ]  # fmt: skip
 
 
 def test_differences_between_retrievers_are_paired_by_query():
