@@ -18,8 +18,8 @@ def scene_interval(
 ) -> tuple[float, float]:
     """The 95% percentile interval of a statistic of the rows of resampled scenes."""
     rows = [np.flatnonzero(np.asarray(scenes) == scene) for scene in np.unique(scenes)]
-    drawn = np.random.default_rng(seed).integers(len(rows), size=(resamples, len(rows)))
-    results = [statistic(values[np.concatenate([rows[i] for i in picks])]) for picks in drawn]
+    sampled = np.random.default_rng(seed).integers(len(rows), size=(resamples, len(rows)))
+    results = [statistic(values[np.concatenate([rows[i] for i in picks])]) for picks in sampled]
     low, high = np.percentile(results, [2.5, 97.5])
     return float(low), float(high)
 

@@ -26,7 +26,7 @@ def test_bootstrap_resamples_whole_scenes():
     spread = SceneBootstrap(np.arange(400), seed=1).mean(alone)
     half = 1.96 * alone.std() / 20
     assert spread == pytest.approx((alone.mean() - half, alone.mean() + half), abs=0.01)
-    # Twenty-five copies of 16 values say no more than the 16: scenes are resampled whole.
+    # Twenty-five copies of 16 values hold no more information than the 16.
     few, scenes = np.repeat(rng.random(16), 25), np.repeat(np.arange(16), 25)
     low, high = SceneBootstrap(scenes, seed=1).mean(few)
     assert high - low > 4 * (spread[1] - spread[0]) * 0.7

@@ -20,10 +20,10 @@ NAMES = ("one", "two")
 
 
 def make_item(number: int, family: str, scene: str) -> SelectionItem:
-    moments = tuple(Candidate(scene, frame, "x") for frame in (40, 50, 60, 70))
+    candidates = tuple(Candidate(scene, frame, "x") for frame in (40, 50, 60, 70))
     return SelectionItem(
         f"{family}-{number}", "test", "dynapix", family, "any", "Which?", scene, 0, 20, 40,
-        moments, 0, 12.0,
+        candidates, 0, 12.0,
     )  # fmt: skip
 
 

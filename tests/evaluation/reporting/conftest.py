@@ -28,8 +28,8 @@ def measured(tmp_path_factory, micro, micro_store) -> Path:
     for regime in ("answer_only", "cot", "cot_no_candidate_analysis"):
         trained_student(root, micro, regime, regime)
         mode = "answer" if regime == "answer_only" else "reasoning"
-        say = right if regime == "cot" else lambda item: HOSTILE
-        select_run(root, micro_store, micro, regime, say, model=regime, mode=mode)
+        respond = right if regime == "cot" else lambda item: HOSTILE
+        select_run(root, micro_store, micro, regime, respond, model=regime, mode=mode)
     similarity_run(root, micro_store, micro, "clip")
     retrieve_run(root, micro_store, micro, "emb")
     retrieve_run(root, micro_store, micro, "emb", kind="two_stage")

@@ -41,7 +41,7 @@ from evaluation.select import limit_items
 from models.student.generation import GeneratedText
 
 STUDENT = StudentConfig(name="small")
-Say = Callable[[SelectionItem], str]
+Respond = Callable[[SelectionItem], str]
 
 
 def right(item: SelectionItem) -> str:
@@ -81,7 +81,7 @@ def select_run(
     store: Store,
     benchmark,
     name: str,
-    say: Say,
+    respond: Respond,
     items: Sequence[SelectionItem] | None = None,
     model: str | None = None,
     mode: str = "answer",
@@ -96,13 +96,13 @@ def select_run(
         model=None if model is None else f"{root}/sft/{model}", suite=suite,
     )  # fmt: skip
     finish(folder, settings)
-    answers = [score_response(item, mode, GeneratedText(say(item), False)) for item in items]
+    answers = [score_response(item, mode, GeneratedText(respond(item), False)) for item in items]
     choices = Choices.from_answers(model or "small base", mode, None, answers)
     about = {"build": store.identity, "asked": [[mode, None, "k1"]]}
     write_report([choices], items, store.name, 0, folder, suite, **about)
     keys = {"key": "k1", "mode": mode}
     lines = [{**keys, "asked": {"control": None, "seed": 0}}]
-    lines += [{**keys, "item_id": i.item_id, "text": say(i), "cut": False} for i in items]
+    lines += [{**keys, "item_id": i.item_id, "text": respond(i), "cut": False} for i in items]
     (folder / "answers.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     return folder
 
