@@ -100,6 +100,9 @@ def main() -> None:
     parser.add_argument("--losses", action="store_true", help="compare losses instead")
     comparison.add_arguments(parser, steps=8, variants=VARIANTS)
     args = parser.parse_args()
+    has_trl = importlib.util.find_spec("trl") is not None
+    if args.losses and not has_trl:
+        parser.error("--losses needs TRL: pip install -e '.[bench]'")
     if args.losses:
         args.precision, args.quantization = "fp32", "none"
     overrides = [
@@ -114,12 +117,11 @@ def main() -> None:
         if args.losses:
             compare_losses(overrides, args.steps)
         else:
-            compare_speed(overrides, args)
+            names = [name for name, variant in VARIANTS.items() if has_trl or not variant.trl]
+            compare_speed(overrides, args, args.only or names)
 
 
-def compare_speed(overrides: list[str], args: argparse.Namespace) -> None:
-    has_trl = importlib.util.find_spec("trl") is not None
-    names = args.only or [name for name, variant in VARIANTS.items() if has_trl or not variant.trl]
+def compare_speed(overrides: list[str], args: argparse.Namespace, names: list[str]) -> None:
     results = comparison.compare(
         lambda name: measure_in_process(overrides, VARIANTS[name], args.steps),
         names,
