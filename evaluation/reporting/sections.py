@@ -257,12 +257,12 @@ def retrieval_details(retrievals: Rows) -> Section:
             plot, caption = figures.retrieval_figure, f"Recall by width on {benchmark}."
             results = [(m.name, m.row) for m in rows]
             section.figures.append(Figure(f"widths-{benchmark}", caption, plot, results))
-        curves = {
-            m.name: curve
-            for m in rows
-            for curve in m.run.report.get("curves", [])
-            if curve["name"] == m.row.name
-        }
+        curves: dict[str, Any] = {}
+        for m in rows:
+            with reading(m.run.folder):
+                for curve in m.run.report.get("curves", []):
+                    if curve["name"] == m.row.name:
+                        curves.setdefault(m.name, curve)
         if curves:
             caption = f"Recall by k on {benchmark}, at the largest width."
             plot = figures.recall_figure

@@ -13,20 +13,27 @@ from evaluation.reporting.page import write_page
 from evaluation.reporting.sections import Section
 from evaluation.reporting.table import Table
 
-NAMES = (
-    "a & b | c_d # 100% $x$",
-    r"\input{secret} ~ ^ {open",
-    "<script>alert(1)</script>",
-    "*bold* [link](there) `code`",
-    "Qwen3-VL-8B CoT -> text",
-    "run … (answer)",
-)
+ESCAPED = {
+    "a & b | c_d # 100% $x$": (r"a \& b \| c\_d \# 100% \$x\$", r"a \& b | c\_d \# 100\% \$x\$"),
+    r"\input{secret} ~ ^ {open": (
+        r"\\input{secret} \~ ^ {open",
+        r"\textbackslash{}input\{secret\} \textasciitilde{} \textasciicircum{} \{open",
+    ),
+    "<script>alert(1)</script>": (
+        r"\<script\>alert(1)\</script\>",
+        r"\textless{}script\textgreater{}alert(1)\textless{}/script\textgreater{}",
+    ),
+    "*bold* [a](b) `code`": (r"\*bold\* \[a\](b) \`code\`", "*bold* [a](b) `code`"),
+    "CoT -> text": (r"CoT -\> text", r"CoT $\rightarrow$ text"),
+    "run … (answer)": ("run … (answer)", r"run \ldots{} (answer)"),
+}
+"""Names in Markdown and in LaTeX."""
 TABLE = Table(
     "hostile & name",
     "A caption with 100% of <b>everything</b>",
     ["R@1", "of_what"],
     {
-        "": [{"name": name, "R@1": 0.01, "of_what": None} for name in NAMES],
+        "": [{"name": name, "R@1": 0.01, "of_what": None} for name in ESCAPED],
         "others & more": [{"name": "one", "R@1": Interval(0.02, 0.01, 0.03, 9)}],
         "empty": [],
     },
@@ -35,40 +42,20 @@ TABLE = Table(
 )
 ROWS = [
     ["", *TABLE.columns],
-    *([name, "1.0", "-"] for name in NAMES),
+    *([name, "1.0", "-"] for name in ESCAPED),
     ["one", "2.0", ""],
     ["95% interval", "1-3", ""],
 ]
 
 
-def markdown_cells(text: str) -> list[list[str]]:
-    lines = [line for line in text.splitlines() if re.match(r"\|[^:]", line)]
-    rows = [
-        re.split(r"(?<!\\)\|", line)[1:-1] for line in lines if not line.startswith("| *others")
-    ]
-    plain = [[re.sub(r"^\*\*(.*)\*\*$", r"\1", cell.strip()) for cell in row] for row in rows]
-    return [[re.sub(r"\\(.)", r"\1", cell) for cell in row] for row in plain]
-
-
-def latex_cells(text: str) -> list[list[str]]:
-    body = text.partition(r"\toprule")[2].partition(r"\bottomrule")[0]
-    lines = [line.removesuffix(r" \\") for line in body.splitlines() if line.endswith(r" \\")]
-    rows = [re.split(r"(?<!\\)&", line) for line in lines if "multicolumn" not in line]
-    return [[unescape(cell.replace(r"\quad", "").strip()) for cell in row] for row in rows]
-
-
-def unescape(text: str) -> str:
-    words = {
-        "textbackslash": "\\", "textasciitilde": "~", "textasciicircum": "^",
-        "textless": "<", "textgreater": ">", "ldots": "…",
-    }  # fmt: skip
-    text = re.sub(r"^\\textbf\{(.*)\}$", r"\1", text.replace(r"$\rightarrow$", "->"))
-    return re.sub(r"\\(?:([a-z]+)\{\}|([&%$#_{}]))", lambda f: words[f[1]] if f[1] else f[2], text)
-
-
 def test_markdown_and_latex_show_every_cell():
-    assert markdown_cells(TABLE.as_markdown()) == ROWS
-    assert latex_cells(TABLE.as_latex()) == ROWS
+    markdown, latex = TABLE.as_markdown(), TABLE.as_latex()
+    for in_markdown, in_latex in ESCAPED.values():
+        assert f"\n| {in_markdown} | 1.0 | - |\n" in markdown
+        assert f"\n{in_latex} & 1.0 & - \\\\\n" in latex
+    assert "\n| one | **2.0** |  |\n| 95% interval | 1-3 |  |\n" in markdown
+    assert r"\quad one & \textbf{2.0} &  \\" in latex
+    assert r"\quad \quad 95\% interval & 1-3 &  \\" in latex
 
 
 def test_html_shows_every_cell_as_text(tmp_path):
@@ -119,7 +106,7 @@ def test_latex_closes_what_it_opens():
 def test_text_is_aligned():
     lines = str(TABLE).splitlines()
     edge = lines[2].index("R@1") + 3
-    assert all(line[edge - 3 : edge] == "1.0" for line in lines[4 : 4 + len(NAMES)])
+    assert all(line[edge - 3 : edge] == "1.0" for line in lines[4 : 4 + len(ESCAPED)])
 
 
 @pytest.mark.parametrize("render", [str, Table.as_markdown, Table.as_latex])
