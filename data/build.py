@@ -107,7 +107,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
             "name": cfg.name,
             "suite": suite_name(cfg),
             "seed": cfg.seed,
-            **component_versions(cfg.simulator, cfg.renderer, cfg.standin),
+            **component_versions(asdict(cfg)),
             "config": asdict(cfg),
             "counts": count_records(scene_ids, items, queries, databases)
             | unread

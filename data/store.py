@@ -20,6 +20,7 @@ import hashlib
 import io
 import json
 import os
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -54,13 +55,12 @@ DATABASES = ("test", "future", "counterfactual")
 counterfactual queries. The first is a part of the second."""
 
 
-def component_versions(simulator: str, renderer: str, standin: str | None) -> dict[str, str]:
+def component_versions(config: Mapping[str, Any]) -> dict[str, str]:
     """Versions of the code that determines a benchmark's scenes, pixels, items and queries."""
-    is_rendered = simulator == "bullet"
-    frames = RENDERERS[renderer].version if is_rendered else f"{simulator}'s own frames"
+    is_rendered, renderer = config["simulator"] == "bullet", RENDERERS[config["renderer"]]
     return {
-        "generator": generator_version(standin),
-        "renderer": frames,
+        "generator": generator_version(config["standin"]),
+        "renderer": renderer.version if is_rendered else f"{config['simulator']}'s own frames",
         "builders": BUILDERS_VERSION,
     }
 
@@ -231,7 +231,7 @@ def open_store(folder: Path) -> Store:
     try:
         manifest = json.loads(path.read_text())
         config = manifest["config"]
-        current = component_versions(config["simulator"], config["renderer"], config["standin"])
+        current = component_versions(config)
         built = {key: manifest[key] for key in current}
     except (ValueError, TypeError, KeyError) as error:
         raise refusal(f"{path} cannot be parsed", "damaged-file") from error

@@ -173,9 +173,7 @@ def render_card(store: Store, shards: Sequence[Shard], images: bool) -> str:
         rows=rows,
         columns=list_columns(images),
         descriptions=DESCRIPTIONS,
-        versions=component_versions(
-            settings["simulator"], settings["renderer"], settings.get("standin")
-        ),
+        versions=component_versions(settings),
         settings=OmegaConf.to_yaml(OmegaConf.create(settings)),
     )
 

@@ -28,13 +28,7 @@ if TYPE_CHECKING:
 GENERATOR_VERSION = "2"
 """Changes whenever the same seed and index give a different scene."""
 
-SUBSTEPS = 7
-"""Physics steps per frame: 175 Hz, as in CLEVRER's raw records."""
 SOLVER_ITERATIONS = 20
-GRAVITY = 9.81
-GROUND_FRICTION, OBJECT_FRICTION = 0.1, 0.3
-FRICTION_DECELERATION = GROUND_FRICTION * OBJECT_FRICTION * GRAVITY
-
 CONTACT_FREE_FRAMES = 5
 """A pair's contact is a new event only after more contact-free frames than this."""
 
@@ -44,14 +38,20 @@ class Physics:
     """Constants of a simulation, and its frame rate."""
 
     fps: int = FPS
-    substeps: int = SUBSTEPS
-    gravity: float = GRAVITY
-    ground_friction: float = GROUND_FRICTION
-    object_friction: float = OBJECT_FRICTION
+    substeps: int = 7
+    """Steps per frame: 175 Hz, as in CLEVRER's raw records."""
+    gravity: float = 9.81
+    ground_friction: float = 0.1
+    object_friction: float = 0.3
     ground_restitution: float = 0.0
     """Bullet multiplies it by the object's: with 0 nothing bounces on the ground."""
     rubber_restitution: float = 0.5
     metal_restitution: float = 0.7
+
+    @property
+    def friction_deceleration(self) -> float:
+        """Deceleration of a sliding object; Bullet multiplies the two coefficients."""
+        return self.ground_friction * self.object_friction * self.gravity
 
 
 STANDARD_PHYSICS = Physics()

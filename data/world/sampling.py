@@ -15,7 +15,6 @@ from conf.schema import BenchmarkConfig
 from data.records import COLORS, FPS, MATERIALS, SHAPES, Scene, SceneObject
 from data.world.camera import STANDARD_CAMERA, Camera
 from data.world.physics import (
-    FRICTION_DECELERATION,
     STANDARD_PHYSICS,
     Body,
     Motion,
@@ -136,11 +135,11 @@ def _colliding(added: SceneObject, motion: Motion, rng: np.random.Generator) -> 
         if np.linalg.norm(motion.velocities[frame, other]) < 0.3:
             return None
         return Body(added, place, rng.uniform(0, 2 * np.pi))
-    seconds = frame / FPS
+    seconds, deceleration = frame / FPS, STANDARD_PHYSICS.friction_deceleration
     speed = rng.uniform(*SPEED)
-    if speed - FRICTION_DECELERATION * seconds < 0.3:
+    if speed - deceleration * seconds < 0.3:
         return None
-    travel = speed * seconds - FRICTION_DECELERATION * seconds**2 / 2
+    travel = speed * seconds - deceleration * seconds**2 / 2
     direction = unit_vector(rng.uniform(0, 2 * np.pi))
     start = place - travel * direction
     return Body(added, start, rng.uniform(0, 2 * np.pi), speed * direction)

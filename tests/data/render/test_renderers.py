@@ -75,22 +75,8 @@ def test_blender_without_its_module_is_an_error(monkeypatch: pytest.MonkeyPatch)
         get_renderer("blender", 48, 32)
 
 
-@pytest.fixture
-def stub_bpy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Path of a file that the worker imports as bpy."""
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(blender, "version", lambda package: blender.BPY)
-    return tmp_path / "bpy.py"
-
-
-def test_import_error_of_blender_is_reported(stub_bpy: Path) -> None:
-    stub_bpy.write_text("print('ignored')\nraise ImportError('libSM.so.6 is not there')")
-    with raises_user_error("renderer-failed", contains=("libSM", "renderer=bullet")):
-        blender.BlenderRenderer(48, 32)
-
-
 def test_crash_of_blender_names_the_frame(
-    scene: Scene, stub_bpy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A fake worker that renders one frame, by the protocol, and exits."""
     dying = tmp_path / "dying.py"
@@ -106,6 +92,7 @@ def test_crash_of_blender_names_the_frame(
         "sys.exit('out of memory')\n"
     )
     monkeypatch.setattr(blender, "WORKER", dying)
+    monkeypatch.setattr(blender, "version", lambda package: blender.BPY)
     renderer = blender.BlenderRenderer(48, 32)
     assert renderer.render(scene, 4).getpixel((0, 0)) == (255, 0, 0)
     with raises_user_error("renderer-failed", contains=(f"frame 5 of {scene.scene_id}", "memory")):

@@ -11,7 +11,7 @@ import pytest
 
 from conf.schema import BenchmarkConfig
 from data.records import FPS, Scene, SceneObject
-from data.world.physics import FRICTION_DECELERATION, Body, _has_repeated, shared_simulator
+from data.world.physics import STANDARD_PHYSICS, Body, _has_repeated, shared_simulator
 from data.world.sampling import record_scene, sample_bodies, simulate_scene, simulate_without
 
 LIMITS = BenchmarkConfig(name="laws")
@@ -37,11 +37,11 @@ def test_scenes_are_bit_identical_in_another_process_and_order() -> None:
 
 def test_friction_decelerates_a_sliding_cube() -> None:
     motion = shared_simulator().simulate([Body(CUBE, (0.0, 0.0), 0.0, (-2.0, 0.0))], frames=26)
-    seconds = 25 / FPS
+    seconds, deceleration = 25 / FPS, STANDARD_PHYSICS.friction_deceleration
     lost = 2.0 - np.linalg.norm(motion.velocities[25, 0])
     travelled = np.linalg.norm(motion.positions[25, 0] - motion.positions[0, 0])
-    assert lost == pytest.approx(FRICTION_DECELERATION * seconds, rel=0.05)
-    assert travelled == pytest.approx(2 * seconds - FRICTION_DECELERATION / 2, rel=0.02)
+    assert lost == pytest.approx(deceleration * seconds, rel=0.05)
+    assert travelled == pytest.approx(2 * seconds - deceleration / 2, rel=0.02)
 
 
 def test_collision_of_two_spheres_conserves_momentum() -> None:
