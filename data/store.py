@@ -207,10 +207,8 @@ class Store:
         return [FrameRef(r["scene_id"], r["frame"]) for r in rows if r["database"] == name]
 
 
-@lru_cache(maxsize=512)
-def cached_scene(path: Path) -> Scene:
-    """Read a scene's oracle and keep the most recent ones in memory."""
-    return load_scene(path)
+cached_scene = lru_cache(maxsize=512)(load_scene)
+"""Reads a scene's oracle and keeps the most recent ones in memory."""
 
 
 def open_store(folder: Path) -> Store:
