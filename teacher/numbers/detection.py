@@ -15,35 +15,37 @@ from collections.abc import Callable
 from functools import lru_cache
 from itertools import accumulate
 
-from teacher.numbers import lexicon
+from teacher.numbers.lexicon import LEXICON
 from teacher.numbers.normalization import FOLDS, Spans, normalize, normalize_word
 
 Rule = Callable[["Prose", int], "tuple[int, int] | None"]
 
 _any = "|".join
 ENGLISH = {
-    *("one", "first", *lexicon.CARDINALS, *lexicon.ORDINALS, *lexicon.QUANTITIES, *lexicon.TIMES)
+    *("one", "first", *LEXICON.cardinals, *LEXICON.ordinals, *LEXICON.quantities, *LEXICON.times)
 }
-WORDS = {normalize_word(w) for w in (*ENGLISH, *lexicon.MISSPELT, *lexicon.FOREIGN)} - {
+WORDS = {normalize_word(w) for w in (*ENGLISH, *LEXICON.misspelt, *LEXICON.foreign)} - {
     "one",
     "first",
 }
 PIECED = {w for w in ENGLISH if len(w) > 2}
 """Words that are also detected when spaced, split or stretched."""
 PREFIXES = {word[:k] for word in PIECED for k in range(1, len(word) + 1)}
-_scene = _any(sorted(lexicon.SCENE, key=len, reverse=True))
-_count = _any(sorted((*lexicon.CARDINALS, *lexicon.ORDINALS), key=len, reverse=True))
+_scene = _any(sorted(LEXICON.scene, key=len, reverse=True))
+_count = _any(sorted((*LEXICON.cardinals, *LEXICON.ordinals), key=len, reverse=True))
 GLUED = re.compile(
     rf"(?:{_scene})*(?:one)?(?:{_count})(?:and|one|{_count})*"
-    rf"(?:{_any(lexicon.SUFFIXES)}|(?:{_scene})+)?"
+    rf"(?:{_any(LEXICON.suffixes)}|(?:{_scene})+)?"
     rf"|(?:one|first|twice|half|double|single|triple)(?:{_scene})+"
     r"|(?:twent|thirt|fort|fift|sixt|sevent|eight|ninet)ies|one(?:fold|time|x)"
-    rf"|(?:{_any(lexicon.SCALES)})s?fold|half(?:ed|th|s)"
+    rf"|(?:{_any(LEXICON.scales)})s?fold|half(?:ed|th|s)"
 )
+ARABIC_PREFIXES = "(?:[وفبلك]|ال|لل)+"
+"""Articles and prepositions that Arabic joins to the next word."""
 ARABIC = re.compile(
-    normalize_word(lexicon.ARABIC_PREFIXES) + rf"(?:{_any(w for w in WORDS if '؀' <= w[0] <= 'ۿ')})"
+    normalize_word(ARABIC_PREFIXES) + rf"(?:{_any(w for w in WORDS if '؀' <= w[0] <= 'ۿ')})"
 )
-UNSPACED = re.compile(_any(map(normalize_word, lexicon.UNSPACED)))
+UNSPACED = re.compile(_any(map(normalize_word, LEXICON.unspaced)))
 MAX_LETTERS = 60
 """Letters of a word that are examined."""
 ASCII_WORD = re.compile(r"([A-Za-z]+)")
@@ -55,7 +57,7 @@ STRETCH = re.compile(r"(.)\1+")
 UPPER_ROMAN = re.compile(r"M{0,3}(?:CM|CD|D?C{0,3})(?:XC|XL|L?X{0,3})(?:IX|IV|V?I{0,3})")
 CLAUSE = re.compile(r"[.!?:;\n•–—*#>(\"“]|\s-\s")
 """Marks between two words that end a clause."""
-COUNTABLE = lexicon.NOUNS | lexicon.EVENTS | lexicon.UNITS
+COUNTABLE = LEXICON.nouns | LEXICON.events | LEXICON.units
 """Nouns that "one" counts even after "the" or an adjective."""
 ADJECTIVAL = ("er", "est", "ing", "ed", "most")
 JOINS = frozenset(" -")
@@ -157,7 +159,7 @@ def rule_of(token: str) -> Rule | None:
     word = token.casefold()
     if word in RULES:
         return RULES[word]
-    if token.istitle() and word in lexicon.NAMES:
+    if token.istitle() and word in LEXICON.names:
         return None
     if _is_number(word) or _is_roman(token, word) or _is_camel(token):
         return _always
@@ -176,14 +178,14 @@ STRETCHED = {STRETCH.sub(r"\1", word): word for word in PIECED}
 
 
 def _is_roman(token: str, word: str) -> bool:
-    if word in lexicon.ROMAN:
+    if word in LEXICON.roman:
         return True
     return (
         len(token) > 1
         and token.isupper()
         and bool(set(token) & set("IVX"))
         and set(token) <= set("IVXLCDM")
-        and word not in lexicon.NOT_ROMAN
+        and word not in LEXICON.not_roman
         and bool(UPPER_ROMAN.fullmatch(token))
     )
 
@@ -223,7 +225,7 @@ def _is_split(prose: Prose, first: int, last: int) -> bool:
         return False
     # The letters after an apostrophe are the ending of a word.
     possessive = prose.gaps[first][-1:] in ("'", "’")
-    return not possessive and not all(piece in lexicon.PIECES for piece in pieces)
+    return not possessive and not all(piece in LEXICON.pieces for piece in pieces)
 
 
 def _one(prose: Prose, index: int) -> tuple[int, int] | None:
@@ -247,17 +249,17 @@ def _is_pronoun_between(previous: str, following: str) -> bool | None:
         return True
     if following in COUNTABLE or rule_of(previous[:MAX_LETTERS]) is _always:
         return False
-    if following in lexicon.MODALS or _describes(previous):
+    if following in LEXICON.modals or _describes(previous):
         return True
-    if not previous or previous in lexicon.NOT_ADJECTIVES or previous in COUNTABLE:
+    if not previous or previous in LEXICON.not_adjectives or previous in COUNTABLE:
         return False
     return None
 
 
 def _describes(word: str) -> bool:
-    if word in lexicon.ADJECTIVES:
+    if word in LEXICON.adjectives:
         return True
-    return len(word) > 4 and word.endswith(ADJECTIVAL) and word not in lexicon.NOT_ADJECTIVES
+    return len(word) > 4 and word.endswith(ADJECTIVAL) and word not in LEXICON.not_adjectives
 
 
 def _first(prose: Prose, index: int) -> tuple[int, int] | None:
@@ -275,12 +277,12 @@ def _once(prose: Prose, index: int) -> tuple[int, int] | None:
     previous, following = prose.before(index), prose.after(index)
     if previous == "at" or following in ("more", "again"):
         return None
-    if previous in lexicon.EXACTLY or following in ("or", "per", "every", "each"):
+    if previous in LEXICON.exactly or following in ("or", "per", "every", "each"):
         return index, index
     if not previous or prose.opens_clause(index):
         counts = prose.ends_clause(index)
     elif following:
-        opens = following in lexicon.CLAUSE_OPENERS or following.endswith(("ed", "ing"))
+        opens = following in LEXICON.clause_openers or following.endswith(("ed", "ing"))
         counts = not opens and not _starts_number(prose, index + 1)
     else:
         counts = not FIGURES.search(prose.gaps[index + 1])
@@ -295,14 +297,14 @@ def _starts_number(prose: Prose, index: int) -> bool:
 def _unit(prose: Prose, index: int) -> tuple[int, int] | None:
     """ "A few frames", "a frame later", "within a frame", "a pixel"."""
     back = 1
-    while back <= 3 and prose.before(index, back) in lexicon.FILLERS:
+    while back <= 3 and prose.before(index, back) in LEXICON.fillers:
         back += 1
-    plural = prose.word(index) in lexicon.PLURAL_UNITS or prose.gaps[index] == "-"
-    if plural and prose.before(index, back) in lexicon.VAGUE:
+    plural = prose.word(index) in LEXICON.plural_units or prose.gaps[index] == "-"
+    if plural and prose.before(index, back) in LEXICON.vague:
         return index - back, index
-    if prose.word(index) not in lexicon.UNITS or prose.before(index) not in ("a", "an"):
+    if prose.word(index) not in LEXICON.units or prose.before(index) not in ("a", "an"):
         return None
-    if prose.word(index) in lexicon.LENGTHS:
+    if prose.word(index) in LEXICON.lengths:
         return index - 1, index
     if prose.word(index) in ("moment", "instant"):
         return None
@@ -315,13 +317,13 @@ def _unit(prose: Prose, index: int) -> tuple[int, int] | None:
 def _minute(prose: Prose, index: int) -> tuple[int, int] | None:
     """A number if it measures time, but not in the sense of "tiny"."""
     previous, following = prose.before(index), prose.after(index)
-    if previous in lexicon.BEFORE_MINUTE:
+    if previous in LEXICON.before_minute:
         return index - 1, index
     if previous not in ("a", "the", "this"):
         return None
-    if following in lexicon.AFTER_MINUTE:
+    if following in LEXICON.after_minute:
         return index - 1, index + 1
-    timed = not following and prose.before(index, 2) in lexicon.TIME_PREPOSITIONS
+    timed = not following and prose.before(index, 2) in LEXICON.time_prepositions
     return (index - 1, index) if timed or prose.ends_sentence(index) else None
 
 
@@ -332,7 +334,7 @@ def _score(prose: Prose, index: int) -> tuple[int, int] | None:
 
 def _secondary(prose: Prose, index: int) -> tuple[int, int] | None:
     """A number before an event, whose place in a series it gives."""
-    return (index, index + 1) if prose.after(index) in lexicon.EVENTS else None
+    return (index, index + 1) if prose.after(index) in LEXICON.events else None
 
 
 def _letter(prose: Prose, index: int) -> tuple[int, int] | None:
@@ -345,15 +347,15 @@ def _letter(prose: Prose, index: int) -> tuple[int, int] | None:
         return index, index
     if prose.words[index] == "i" and not prose.ends_clause(index):
         return None
-    enumerated = before.strip(" .-\n") == "" and prose.word(index - 1) in lexicon.ENUMERATED
+    enumerated = before.strip(" .-\n") == "" and prose.word(index - 1) in LEXICON.enumerated
     return (index - 1, index) if enumerated else None
 
 
 def _italian(prose: Prose, index: int) -> tuple[int, int] | None:
     """ "Due" and "metà" are Italian beside Italian words."""
-    if prose.after(index) in lexicon.ITALIAN:
+    if prose.after(index) in LEXICON.italian:
         return index, index + 1
-    return (index - 1, index) if prose.before(index) in lexicon.ITALIAN else None
+    return (index - 1, index) if prose.before(index) in LEXICON.italian else None
 
 
 def _secondo(prose: Prose, index: int) -> tuple[int, int] | None:
@@ -367,14 +369,14 @@ def _ek(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 RULES: dict[str, Rule] = {
-    **dict.fromkeys((*lexicon.UNITS, *lexicon.PLURAL_UNITS), _unit),
+    **dict.fromkeys((*LEXICON.units, *LEXICON.plural_units), _unit),
     "one": _one,
     "first": _first,
     "once": _once,
     "minute": _minute,
     "score": _score,
     "secondary": _secondary,
-    **dict.fromkeys(map(normalize_word, lexicon.FOREIGN_FIRSTS), _first),
+    **dict.fromkeys(map(normalize_word, LEXICON.foreign_firsts), _first),
     **dict.fromkeys(("due", "meta"), _italian),
     "secondo": _secondo,
     normalize_word("एक"): _ek,

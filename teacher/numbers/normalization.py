@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain, compress, repeat
 
-from teacher.numbers.lexicon import IDEOGRAPHS, IDIOMS, PICTOGRAPHS
+from teacher.numbers.lexicon import LEXICON
 
 Spans = list[tuple[int, int]]
 
@@ -32,12 +32,18 @@ LOOKALIKES = {
         for i in range(26)
     },
 }
+PICTOGRAPHS = {
+    *(chr(c) for c in range(0x1F550, 0x1F568)),  # clock faces
+    *(chr(c) for c in range(0x2680, 0x2686)),  # dice
+    *(chr(c) for c in range(0x1F030, 0x1F0F6)),  # dominoes and playing cards
+    *"🔟💯🔢🥇🥈🥉\u283c",
+}
 MAX_FOLD = 6
 """Characters that expand to more letters than this, such as the phrase U+FDFA, stay as they are."""
 ENTITY = re.compile(r"&(?:#\d{1,7}|#[xX][0-9a-fA-F]{1,6}|[A-Za-z]\w{1,31});?")
 DISGUISE = re.compile(r"[&*`~_<$|@]|[A-Za-z]![A-Za-z]")
 TAG = r"</?[A-Za-z][^<>]{0,60}>"
-IDIOM = re.compile("|".join(IDIOMS))
+IDIOM = re.compile("|".join(LEXICON.idioms))
 SEAM = re.compile(rf"[*`~\u200b]+|{TAG}")
 """Invisible parts of a word: markup and zero-width characters (all normalized to U+200B)."""
 SEAMS_TO_SPACES = str.maketrans("*`~\u200b_", "     ")
@@ -70,7 +76,7 @@ class _Folds(dict[str, str]):
 
 def _fold_character(c: str) -> str:
     plain = unicodedata.normalize("NFKC", c)
-    if c in IDEOGRAPHS or c in PICTOGRAPHS or any(map(_is_numeral, (c, *plain))):
+    if c in LEXICON.ideographs or c in PICTOGRAPHS or any(map(_is_numeral, (c, *plain))):
         digits = "".join(p for p in plain if p in "0123456789")
         return digits[:MAX_FOLD] or "1"
     letters = []
