@@ -55,11 +55,11 @@ def write_rationale(
     The same arguments give the same text; another `attempt` gives another choice of phrasings.
     """
     keys = (seed, item.item_id, attempt)
-    text = _Writer(SPARSE, *keys).rationale(predicates)
+    text = _Writer(SPARSE, *keys).text(predicates)
     if len(text.split()) > MOST_WORDS:
-        text = _Writer(BRIEF, *keys).rationale(predicates)
+        text = _Writer(BRIEF, *keys).text(predicates)
     if len(text.split()) < FEW_WORDS:
-        text = _Writer(FULL, *keys, padded=True).rationale(predicates)
+        text = _Writer(FULL, *keys, padded=True).text(predicates)
     return text
 
 
@@ -71,7 +71,7 @@ def write_description(scene: Scene, start: int, stop: int, target: int, seed: in
     facts = extract_facts(scene, start, stop, target)
     if facts is None:
         return None
-    return _Writer(FULL, seed, scene.scene_id, start, stop, target).description(facts)
+    return _Writer(FULL, seed, scene.scene_id, start, stop, target).text(facts)
 
 
 def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:
@@ -111,6 +111,14 @@ def _pair(objects: tuple[str, str]) -> str:
     return f"the {objects[0]} and the {objects[1]}"
 
 
+def _unseen(name: str, verb: str, sight: str, region: str) -> str:
+    return f"the {name} {verb} {sight}" + (f" {region}" if sight != OUT_OF_VIEW else "")
+
+
+def _toward(heading: str | None) -> str:
+    return f" toward the {heading}" if heading else ""
+
+
 def _rank_objects(facts: Facts) -> list[ObjectFacts]:
     """Return the objects in order of relevance: first those of a `Meeting`, then moving ones."""
     met = {name for m in (*facts.courses, *facts.contacts) for name in m.objects}
@@ -138,31 +146,26 @@ class _Writer:
     def pick(self, *options: str) -> str:
         return options[self.rng.integers(len(options))]
 
-    def rationale(self, predicates: Predicates) -> str:
-        key = most_discriminative_object(predicates)
-        return "\n".join(
-            [
-                *self.opening(predicates, key),
-                f"Candidate analysis: {_sentences(self.candidates(predicates, key))}",
-                f"Outcome: {_sentences(self.outcome(predicates, predicates.answer))}",
-                f"Answer: {predicates.answer}",
-            ]
-        )
-
-    def description(self, facts: Facts) -> str:
-        return "\n".join(
-            [*self.opening(facts), f"Outcome: {_sentences(self.outcome(facts, None))}"]
-        )
-
-    def opening(self, facts: Facts, key: ObjectFacts | None = None) -> list[str]:
-        """Return the sections before the candidate analysis. The prediction begins with `key`."""
-        ranked = _rank_objects(facts)
-        predicted = sorted(ranked, key=lambda o: o is not key) if key else ranked
-        return [
-            f"Scene parse: {_sentences(self.parse(facts, ranked))}",
-            f"Motion analysis: {_sentences(self.motion(facts, ranked))}",
-            f"Prediction: {_sentences(self.prediction(facts, predicted))}",
-        ]
+    def text(self, facts: Facts) -> str:
+        """Return a rationale of predicates, or a description of facts without candidates."""
+        ranked = predicted = _rank_objects(facts)
+        if isinstance(facts, Predicates):
+            key = most_discriminative_object(facts)
+            predicted = sorted(ranked, key=lambda o: o is not key)
+        sections = {
+            "Scene parse": self.parse(facts, ranked),
+            "Motion analysis": self.motion(facts, ranked),
+            "Prediction": self.prediction(facts, predicted),
+        }
+        answer = None
+        if isinstance(facts, Predicates):
+            answer = facts.answer
+            expected = {o.object: o.target_region for o in facts.objects}
+            analysis = [self.candidate(c, key, expected) for c in facts.candidates]
+            sections["Candidate analysis"] = analysis
+        sections["Outcome"] = self.outcome(facts, ranked, answer)
+        lines = [f"{name}: {_sentences(parts)}" for name, parts in sections.items()]
+        return "\n".join([*lines, f"Answer: {answer}"] if answer else lines)
 
     def parse(self, facts: Facts, ranked: list[ObjectFacts]) -> list[str]:
         parts = [self.observed(o) for o in ranked[: self.detail.parsed]]
@@ -175,21 +178,19 @@ class _Writer:
         return parts
 
     def observed(self, o: ObjectFacts) -> str:
-        if o.sight == OUT_OF_VIEW:
-            return f"the {o.object} is out of view"
-        if o.sight == "hidden":
-            return f"the {o.object} is hidden {o.region}"
+        if o.sight != "shown":
+            return _unseen(o.object, "is", o.sight, o.region)
         if o.speed == "stationary":
             return self.pick(
                 f"the {o.object} is stationary {o.region}",
                 f"the {o.object} rests {o.region}",
                 f"the {o.object} is {o.region} and does not move",
             )
-        toward = f" toward the {o.heading}" if o.heading else ""
+        motion = f"{o.speed}{_toward(o.heading)}"
         return self.pick(
-            f"the {o.object} is {o.region}, moving {o.speed}{toward}",
-            f"the {o.object} is {o.region} and moves {o.speed}{toward}",
-            f"the {o.object} {o.region} is moving {o.speed}{toward}",
+            f"the {o.object} is {o.region}, moving {motion}",
+            f"the {o.object} is {o.region} and moves {motion}",
+            f"the {o.object} {o.region} is moving {motion}",
         )
 
     def motion(self, facts: Facts, ranked: list[ObjectFacts]) -> list[str]:
@@ -233,12 +234,11 @@ class _Writer:
             return self.pick(f"the {o.object} leaves the view", f"the {o.object} moves out of view")
         if o.enters:
             return f"the {o.object} enters the view {o.target_region}"
-        toward = f" toward the {o.travel}" if o.travel else ""
         if o.speed in (None, "stationary"):
             cause = "once struck, " if struck and o.speed else ""
         else:
             cause = self.pick("", f"moving {o.speed}, ", "given its speed, ")
-        return f"{cause}the {o.object} {o.extent}{toward}"
+        return f"{cause}the {o.object} {o.extent}{_toward(o.travel)}"
 
     def prediction(self, facts: Facts, ranked: list[ObjectFacts]) -> list[str]:
         parts = [
@@ -252,10 +252,8 @@ class _Writer:
         return parts
 
     def expected(self, o: ObjectFacts) -> str:
-        if o.target_sight == OUT_OF_VIEW:
-            return f"the {o.object} will be out of view"
-        if o.target_sight == "hidden":
-            return f"the {o.object} will be hidden {o.target_region}"
+        if o.target_sight != "shown":
+            return _unseen(o.object, "will be", o.target_sight, o.target_region)
         if o.extent == "stays" and o.region == o.target_region:
             return self.pick(
                 f"the {o.object} remains {o.target_region}",
@@ -265,10 +263,6 @@ class _Writer:
             f"the {o.object} will be {o.target_region}",
             f"the {o.object} should be {o.target_region}",
         )
-
-    def candidates(self, predicates: Predicates, key: ObjectFacts) -> list[str]:
-        expected = {o.object: o.target_region for o in predicates.objects}
-        return [self.candidate(c, key, expected) for c in predicates.candidates]
 
     def candidate(
         self, candidate: CandidateFacts, key: ObjectFacts, expected: dict[str, str]
@@ -284,8 +278,8 @@ class _Writer:
             why = self.difference(candidate.differences[0], expected)
             return f"{name} {shows} {key.target_region} but {why}{others}"
         if difference.kind == "displaced":
-            toward = f" toward the {difference.heading}" if difference.heading else ""
-            return f"{name} {shows} {key.target_region} but {difference.extent} off{toward}{others}"
+            off = f"{difference.extent} off{_toward(difference.heading)}"
+            return f"{name} {shows} {key.target_region} but {off}{others}"
         if difference.kind == "missing":
             return f"{name} lacks the {key.object}{others}"
         return f"{name} {shows} {difference.region}, not {key.target_region}{others}"
@@ -312,7 +306,7 @@ class _Writer:
                 f"shows the {d.object} {d.region}, not {expected[d.object]}",
                 f"has the {d.object} {d.region} and not {expected[d.object]}",
             )
-        toward = f" toward the {d.heading}" if d.heading else ""
+        toward = _toward(d.heading)
         return self.pick(
             f"has the {d.object} {d.extent} off{toward}",
             f"shows the {d.object} {d.extent} too far{toward}"
@@ -320,17 +314,16 @@ class _Writer:
             else f"has the {d.object} off",
         )
 
-    def outcome(self, facts: Facts, letter: str | None) -> list[str]:
+    def outcome(self, facts: Facts, ranked: list[ObjectFacts], answer: str | None) -> list[str]:
         parts = [f"{_pair(c.objects)} are very close {c.region}" for c in facts.close[:1]]
-        ranked = _rank_objects(facts)
         visible = [o for o in ranked if o.target_sight == "shown"]
         parts += [f"the {o.object} is {o.target_region}" for o in visible[: 2 - len(parts)]]
-        if letter is not None:
+        if answer is not None:
             parts.append(
                 self.pick(
-                    f"candidate {letter} shows this layout",
-                    f"this layout is that of candidate {letter}",
-                    f"only candidate {letter} agrees",
+                    f"candidate {answer} shows this layout",
+                    f"this layout is that of candidate {answer}",
+                    f"only candidate {answer} agrees",
                 )
             )
         return parts or ["no object is in view"]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from data.records import LETTERS, Candidate, Collision, Scene, SelectionItem
+from data.records import LETTERS, Candidate, Scene, SelectionItem
 
 CUT_MARGIN = 12
 """Frames between the cut and the first collision (paper, Rationale construction)."""
@@ -47,16 +47,7 @@ BORDER = 6.0
 DISPLACED, CLEARLY = 12.0, 40.0
 """Lower bounds (px at 336) of a displacement, and of a clear one."""
 
-COMPASS = (
-    "east",
-    "southeast",
-    "south",
-    "southwest",
-    "west",
-    "northwest",
-    "north",
-    "northeast",
-)
+COMPASS = ("east", "southeast", "south", "southwest", "west", "northwest", "north", "northeast")
 """Directions in the image plane, clockwise from the x axis; south is down."""
 REGIONS = (
     ("near the top-left", "near the top", "near the top-right"),
@@ -200,23 +191,16 @@ def extract_facts(
     cut = find_cut(scene, start, stop)
     if cut is None:
         return None
-    names = [o.phrase for o in scene.objects]
-    objects = tuple(_object_facts(scene, i, cut, target) for i in range(len(names)))
-    contacts = [c for c in scene.collisions if cut < c.frame <= target]
+    objects = tuple(_object_facts(scene, i, cut, target) for i in range(len(scene.objects)))
+    contacts = [c.objects for c in scene.collisions if cut < c.frame <= target]
     return Facts(
         instant="at the end of the observation" if cut == stop else "just before the contact",
         moment=moment,
         objects=objects,
         entering=tuple(o.object for o in objects if o.enters),
         leaving=tuple(o.object for o in objects if o.leaves),
-        courses=tuple(
-            Meeting((names[i], names[j]), _course_outcome(scene, i, j, cut))
-            for i, j in find_collision_courses(scene, cut)
-        ),
-        contacts=tuple(
-            Meeting((names[i], names[j]), _when(contacts, i, j, cut))
-            for i, j in dict.fromkeys(c.objects for c in contacts)
-        ),
+        courses=tuple(_meeting(scene, p, cut) for p in find_collision_courses(scene, cut)),
+        contacts=tuple(_meeting(scene, pair, cut) for pair in dict.fromkeys(contacts)),
         close=_close_pairs(scene, target),
     )
 
@@ -275,15 +259,19 @@ def motion_start(scene: Scene, index: int, cut: int) -> int:
     return max([cut - COURSE_FRAMES + 1, *hits])
 
 
-def _course_outcome(scene: Scene, i: int, j: int, cut: int) -> str | None:
-    when = _when(scene.collisions, i, j, cut)
-    return "unseen" if when is None and _closing_at_end(scene, i, j) else when
-
-
-def _closing_at_end(scene: Scene, i: int, j: int) -> bool:
-    gap = scene.positions[-1, j, :2] - scene.positions[-1, i, :2]
-    closing = scene.velocities[-1, j, :2] - scene.velocities[-1, i, :2]
-    return bool(np.dot(gap, closing) < -STATIONARY * np.linalg.norm(gap))
+def _meeting(scene: Scene, pair: tuple[int, int], cut: int) -> Meeting:
+    """When a pair collides after the cut, if it does."""
+    i, j = pair
+    collisions = [c.frame for c in scene.collisions if set(c.objects) == {i, j}]
+    frames = next((frame - cut for frame in collisions if frame > cut), None)
+    if frames is not None:
+        when = "imminent" if frames <= IMMINENT else "soon" if frames <= SOON else "later"
+    else:
+        gap = scene.positions[-1, j, :2] - scene.positions[-1, i, :2]
+        closing = scene.velocities[-1, j, :2] - scene.velocities[-1, i, :2]
+        approaches = np.dot(gap, closing) < -STATIONARY * np.linalg.norm(gap)
+        when = "unseen" if approaches else None
+    return Meeting((scene.objects[i].phrase, scene.objects[j].phrase), when)
 
 
 def compass_direction(delta: np.ndarray) -> str | None:
@@ -321,22 +309,29 @@ def _sight(scene: Scene, frame: int, index: int) -> str:
 
 def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFacts:
     sight, target_sight = _sight(scene, cut, index), _sight(scene, target, index)
-    speed = _speed(scene, index, cut) if sight != OUT_OF_VIEW else None
-    moving = speed not in (None, "stationary")
-    travelled = _position(scene, target, index) - _position(scene, cut, index)
-    extent = _extent(travelled) if {sight, target_sight} != {OUT_OF_VIEW} else "unseen"
+    speed = heading = travel = None
+    if sight != OUT_OF_VIEW:
+        speed = _speed(scene, index, cut)
+        heading = object_heading(scene, index, motion_start(scene, index, cut), cut)
+    shift = _position(scene, target, index) - _position(scene, cut, index)
+    distance = float(np.hypot(*shift))
+    if sight == OUT_OF_VIEW == target_sight:
+        extent = "unseen"
+    elif distance < STAYS:
+        extent = "stays"
+    else:
+        extent = "shifts slightly" if distance < SHIFTS else "moves across"
+        travel = compass_direction(shift)
     return ObjectFacts(
         object=scene.objects[index].phrase,
         region=object_region(scene, cut, index),
         sight=sight,
         speed=speed,
-        heading=object_heading(scene, index, motion_start(scene, index, cut), cut)
-        if moving
-        else None,
+        heading=heading,
         target_region=object_region(scene, target, index),
         target_sight=target_sight,
         extent=extent,
-        travel=None if extent in ("stays", "unseen") else compass_direction(travelled),
+        travel=travel,
     )
 
 
@@ -353,22 +348,6 @@ def _speed(scene: Scene, index: int, frame: int) -> str:
     if speed < STATIONARY:
         return "stationary"
     return next((word for bound, word in SPEEDS if speed < bound), VERY_FAST)
-
-
-def _extent(travelled: np.ndarray) -> str:
-    distance = float(np.hypot(*travelled))
-    return (
-        "stays" if distance < STAYS else "shifts slightly" if distance < SHIFTS else "moves across"
-    )
-
-
-def _when(
-    collisions: tuple[Collision, ...] | list[Collision], i: int, j: int, cut: int
-) -> str | None:
-    ahead = [c.frame - cut for c in collisions if set(c.objects) == {i, j} and c.frame > cut]
-    if not ahead:
-        return None
-    return "imminent" if ahead[0] <= IMMINENT else "soon" if ahead[0] <= SOON else "later"
 
 
 def _close_pairs(scene: Scene, target: int) -> tuple[Closeness, ...]:
