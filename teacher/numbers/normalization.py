@@ -9,10 +9,9 @@ from __future__ import annotations
 import html
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import chain, compress, repeat
 
 from teacher.numbers.lexicon import LEXICON
 
@@ -41,6 +40,7 @@ PICTOGRAPHS = {
 MAX_FOLD = 6
 """Characters that expand to more letters than this, such as the phrase U+FDFA, stay as they are."""
 ENTITY = re.compile(r"&(?:#\d{1,7}|#[xX][0-9a-fA-F]{1,6}|[A-Za-z]\w{1,31});?")
+NOT_ASCII = re.compile(r"[^\x00-\x7f]")
 DISGUISE = re.compile(r"[&*`~_<$|@]|[A-Za-z]![A-Za-z]")
 TAG = r"</?[A-Za-z][^<>]{0,60}>"
 IDIOM = re.compile("|".join(LEXICON.idioms))
@@ -107,68 +107,42 @@ def normalize(text: str) -> list[Reading]:
     reading = Reading(text, range(len(text)), range(1, len(text) + 1))
     if text.isascii() and not DISGUISE.search(text):
         return [reading]
-    reading = _folded(
-        _unescaped(_unescaped(reading))
-    )  # Twice, since an entity may itself be escaped.
-    joined = _without_seams(reading)
-    parted = Reading(reading.text.translate(SEAMS_TO_SPACES), reading.starts, reading.stops)
+    # Twice, since an entity may itself be escaped.
+    for _ in range(2):
+        reading = _substitute(reading, ENTITY, _meaning)
+    folded = IDIOM.sub(lambda m: "人" * len(m[0]), reading.text)
+    reading = Reading(folded, reading.starts, reading.stops)
+    reading = _substitute(reading, NOT_ASCII, FOLDS.__getitem__)
+    readings = [Reading(reading.text.translate(SEAMS_TO_SPACES), reading.starts, reading.stops)]
+    if SEAM.search(reading.text):
+        joined = _substitute(reading, SEAM, lambda _: "")
+        readings.append(Reading(joined.text.replace("_", " "), joined.starts, joined.stops))
     return [
-        Reading(LEET.sub(lambda m: LEET_LETTERS[m[0]], r.text), r.starts, r.stops)
-        for r in ([parted, joined] if joined else [parted])
+        Reading(LEET.sub(lambda m: LEET_LETTERS[m[0]], r.text), r.starts, r.stops) for r in readings
     ]
 
 
-def _unescaped(reading: Reading) -> Reading:
-    text, starts, stops = reading.text, reading.starts, reading.stops
-    entities = [m for m in ENTITY.finditer(text) if _meaning(m[0]) != m[0]]
-    if not entities:
-        return reading
+def _substitute(reading: Reading, pattern: re.Pattern[str], new: Callable[[str], str]) -> Reading:
+    """Replace the matches of a pattern; a new character comes from the whole span of its match."""
     pieces: list[str] = []
-    new_starts: list[int] = []
-    new_stops: list[int] = []
-    at = 0
-    for match in entities:
+    starts: list[int] = []
+    stops: list[int] = []
+    end = 0
+    for match in pattern.finditer(reading.text):
         first, last = match.span()
-        meant = _meaning(match[0])
-        pieces += (text[at:first], meant)
-        new_starts += starts[at:first]
-        new_starts += [starts[first]] * len(meant)
-        new_stops += stops[at:first]
-        new_stops += [stops[last - 1]] * len(meant)
-        at = last
-    pieces.append(text[at:])
-    return Reading("".join(pieces), [*new_starts, *starts[at:]], [*new_stops, *stops[at:]])
+        if (text := new(match[0])) == match[0]:
+            continue
+        pieces += (reading.text[end:first], text)
+        starts += [*reading.starts[end:first], *[reading.starts[first]] * len(text)]
+        stops += [*reading.stops[end:first], *[reading.stops[last - 1]] * len(text)]
+        end = last
+    pieces.append(reading.text[end:])
+    return Reading(
+        "".join(pieces), [*starts, *reading.starts[end:]], [*stops, *reading.stops[end:]]
+    )
 
 
 @lru_cache(maxsize=4096)
 def _meaning(entity: str) -> str:
     # An entity of no character stays as it is.
     return html.unescape(entity) or entity
-
-
-def _folded(reading: Reading) -> Reading:
-    if reading.text.isascii():
-        return reading
-    text = IDIOM.sub(lambda m: "人" * len(m[0]), reading.text)
-    folded = list(map(FOLDS.__getitem__, text))
-    lengths = list(map(len, folded))
-    if lengths.count(1) == len(lengths):
-        return Reading("".join(folded), reading.starts, reading.stops)
-    return Reading(
-        "".join(folded),
-        list(chain.from_iterable(map(repeat, reading.starts, lengths))),
-        list(chain.from_iterable(map(repeat, reading.stops, lengths))),
-    )
-
-
-def _without_seams(reading: Reading) -> Reading | None:
-    """The reading without seams; None if it has none."""
-    keeps = bytearray(b"\1") * len(reading.text)
-    for match in SEAM.finditer(reading.text):
-        keeps[match.start() : match.end()] = bytes(match.end() - match.start())
-    if all(keeps):
-        return None
-    text = "".join(compress(reading.text, keeps)).replace("_", " ")
-    return Reading(
-        text, list(compress(reading.starts, keeps)), list(compress(reading.stops, keeps))
-    )
