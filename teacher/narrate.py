@@ -8,74 +8,56 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from tqdm import tqdm
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import write_json, write_text
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
 from teacher.narrator import write_rationale
 from teacher.predicates import extract_predicates
-from teacher.progress import Progress, rejection_kinds
 from teacher.rationale_log import Journal, save_accepted
-from teacher.report.summary import Summary, select_accepted, summarize
+from teacher.report import Figures, rejection_kinds, select_accepted, summarize, write_report
 from teacher.servers.responses import Response
 from teacher.validation.grader import RationaleGrader
 
 if TYPE_CHECKING:
     from data.store import Store
-    from teacher.server_narrator import Job, SaveResponses
 
 log = logging.getLogger(__name__)
 
 JOURNAL_FILE = "rationales.jsonl"
-BATCH_SIZE = 200
-"""Responses of the built-in narrator per write to the disk."""
+LISTED_REASONS = 3
+"""Most frequent reasons for rejections that the bar lists."""
 
 
 @dataclass(frozen=True)
 class Narration:
-    """A teacher's responses to the training items of a store.
+    """The result of a narration.
 
     Attributes:
-        rationales: The accepted rationale of each item that has one, in item order.
-        items: The training items.
-        responses: All responses by item.
-        attempts: The most attempts that an item has.
-        seed: The teacher's seed.
-        too_short: Number of items whose prefix is too short.
+        rationales: The accepted rationale of each training item that has one, in item order.
+        figures: Figures of all responses; see `teacher.report.summarize`.
     """
 
     rationales: list[Rationale]
-    items: list[SelectionItem]
-    responses: dict[str, list[Rationale]]
-    attempts: int
-    seed: int
-    too_short: int
-
-    @cached_property
-    def summary(self) -> Summary:
-        """The figures of a report; lazy, because they count every word."""
-        return summarize(self.items, self.responses, self.attempts, self.too_short)
+    figures: Figures
 
     def __str__(self) -> str:
-        every = [r for responses in self.responses.values() for r in responses]
-        rejected = Counter(kind for r in every for kind in rejection_kinds(r)).most_common()
-        fallback = sum(r.fallback for r in self.rationales)
-        set_aside = len(self.items) - self.too_short - len(self.rationales)
+        f = self.figures
+        fallback = f" ({f['fallback']} by the built-in narrator)" if f["fallback"] else ""
+        rejections = ", ".join(f"{n} {kind}" for kind, n in f["rejected"].items())
         return (
-            f"rationales: {len(self.rationales)} accepted"
-            f"{f' ({fallback} by the built-in narrator)' if fallback else ''}, "
-            f"{set_aside} items set aside, {self.too_short} items with too short a prefix; "
-            f"rejections: {', '.join(f'{n} {kind}' for kind, n in rejected) or 'none'}"
+            f"rationales: {f['accepted']} accepted{fallback}, "
+            f"{f['set_aside']} items set aside, {f['too_short']} items with too short a prefix; "
+            f"rejections: {rejections or 'none'}"
         )
 
 
@@ -86,26 +68,17 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     narration = narrate_store(store, cfg.teacher)
     log.info(narration)
-    write_report(store, narration, cfg.examples, run.folder)
-    summary = narration.summary
-    return {
-        "accepted": float(summary.accepted),
-        "answers": float(sum(summary.responses)),
-        "set_aside": float(summary.set_aside),
-        "too_short": float(summary.too_short),
-        "mean_words": float(np.mean(summary.lengths or [0])),
-    }
-
-
-def write_report(store: Store, narration: Narration, examples: int, folder: Path) -> None:
-    """Write report.json, report.txt and report.html, the last with some rationales."""
-    from teacher.report.page import write_page
-
-    figures = narration.summary.text()
-    write_json(folder / "report.json", narration.summary.to_dict())
-    write_text(folder / "report.txt", figures + "\n")
-    page = write_page(store, narration.rationales, figures, examples, narration.seed, folder)
+    figures = narration.figures
+    seed = cfg.teacher.seed
+    page = write_report(store, narration.rationales, figures, cfg.examples, seed, run.folder)
     log.info("report: %s", page)
+    return {
+        "accepted": float(figures["accepted"]),
+        "answers": float(sum(figures["responses"])),
+        "set_aside": float(figures["set_aside"]),
+        "too_short": float(figures["too_short"]),
+        "mean_words": float(np.mean(figures["lengths"] or [0])),
+    }
 
 
 def ensure_rationales(store: Store, cfg: TeacherConfig) -> list[Rationale]:
@@ -138,34 +111,66 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
         def is_settled(item: SelectionItem) -> bool:
             return any(r.accepted for r in responses[item.item_id])
 
-        def save(new: list[Rationale]) -> None:
-            journal.append(new)
-            for rationale in new:
-                responses[rationale.item_id].append(rationale)
-
         # Finished items are left out, so that none occupies a slot of the requests in flight.
         jobs = [
             (item, attempts)
             for item in items
             if (attempts := len(responses[item.item_id])) < cfg.attempts and not is_settled(item)
         ]
-        progress, too_short = Progress(len(items), len(items) - len(jobs)), 0
+        progress = Progress(len(items), len(items) - len(jobs))
+
+        def record(new: list[Rationale]) -> None:
+            journal.append(new)
+            for rationale in new:
+                responses[rationale.item_id].append(rationale)
+            progress.add_responses(new)
+
         with progress.bar:
             if cfg.url is None:
-                too_short = _narrate_by_template(jobs, store, grader, save, progress)
+                for item, attempt in jobs:
+                    record(_write_rationales(item, store, grader, attempt))
+                    progress.finish_item()
             elif jobs:
-                from teacher.server_narrator import ServerNarrator
+                from teacher.server_narrator import request_rationales
 
-                narrator = ServerNarrator(store, cfg, grader, save, progress)
-                too_short = asyncio.run(narrator.run(jobs))
+                asyncio.run(request_rationales(jobs, store, grader, record, progress.finish_item))
         if cfg.fallback:
-            set_aside = (
-                i for i in items if not is_settled(i) and len(responses[i.item_id]) >= cfg.attempts
-            )
-            save([r for item in set_aside for r in _write_fallback(item, store, grader)])
+            for item in items:
+                if not is_settled(item) and len(responses[item.item_id]) >= cfg.attempts:
+                    fallbacks = _write_rationales(item, store, grader)
+                    record(
+                        [
+                            replace(r, fallback=True, attempt=cfg.attempts + r.attempt)
+                            for r in fallbacks
+                            if r.accepted
+                        ]
+                    )
         rationales = select_accepted(items, responses)
         save_accepted(rationales, store.folder / "rationales.parquet")
-    return Narration(rationales, items, dict(responses), cfg.attempts, cfg.seed, too_short)
+    return Narration(rationales, summarize(items, responses))
+
+
+class Progress:
+    """A bar with accepted and rejected responses, tokens per second and the remaining time."""
+
+    def __init__(self, total: int, done: int) -> None:
+        self.bar = tqdm(total=total, initial=done, desc="narrating", unit="item", mininterval=1.0)
+        self.accepted = self.tokens = 0
+        self.rejected: Counter[str] = Counter()
+        self.started = time.monotonic()
+
+    def add_responses(self, responses: list[Rationale]) -> None:
+        self.accepted += sum(r.accepted for r in responses)
+        self.tokens += sum(r.completion_tokens or 0 for r in responses)
+        self.rejected.update(kind for r in responses for kind in rejection_kinds(r))
+        words = [f"{self.accepted} accepted"]
+        words += [f"{n} {kind}" for kind, n in self.rejected.most_common(LISTED_REASONS)]
+        if self.tokens:
+            words.append(f"{self.tokens / (time.monotonic() - self.started):,.0f} tokens/s")
+        self.bar.set_postfix_str(", ".join(words), refresh=False)
+
+    def finish_item(self) -> None:
+        self.bar.update()
 
 
 def check_items(journal: Journal, items: list[SelectionItem]) -> None:
@@ -180,52 +185,19 @@ def check_items(journal: Journal, items: list[SelectionItem]) -> None:
         )
 
 
-def _narrate_by_template(
-    jobs: list[Job],
-    store: Store,
-    grader: RationaleGrader,
-    save: SaveResponses,
-    progress: Progress,
-) -> int:
-    """Narrate in item order without a server; returns the number of too short prefixes."""
-    too_short = 0
-    batch: list[Rationale] = []
-    for item, first in jobs:
-        responses = []
-        for rationale in _write_rationales(item, store, grader, first):
-            responses.append(rationale)
-            if rationale.accepted:
-                break
-        too_short += not responses
-        batch += responses
-        if len(batch) >= BATCH_SIZE:
-            save(batch)
-            batch = []
-        progress.add_responses(responses)
-        progress.finish_item()
-    save(batch)
-    return too_short
-
-
-def _write_fallback(item: SelectionItem, store: Store, grader: RationaleGrader) -> list[Rationale]:
-    """The built-in narrator's first accepted rationale for an item that was set aside, if any."""
-    attempts = _write_rationales(item, store, grader)
-    return [
-        replace(r, fallback=True, attempt=grader.cfg.attempts + r.attempt)
-        for r in attempts
-        if r.accepted
-    ][:1]
-
-
 def _write_rationales(
     item: SelectionItem, store: Store, grader: RationaleGrader, first: int = 0
-) -> Iterator[Rationale]:
-    """The built-in narrator's rationales from attempt `first` on; none for a too short prefix."""
+) -> list[Rationale]:
+    """The built-in narrator's rationales from attempt `first` up to the first accepted one; none
+    for a too short prefix."""
     predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
-    if predicates is not None:
-        for attempt in range(first, grader.cfg.attempts):
-            text = write_rationale(predicates, item, grader.cfg.seed, attempt)
-            yield grader.grade(Response(text), predicates, item, attempt)
+    rationales: list[Rationale] = []
+    for attempt in range(first, grader.cfg.attempts if predicates else 0):
+        text = write_rationale(predicates, item, grader.cfg.seed, attempt)
+        rationales.append(grader.grade(Response(text), predicates, item, attempt))
+        if rationales[-1].accepted:
+            break
+    return rationales
 
 
 if __name__ == "__main__":

@@ -372,6 +372,7 @@ def _candidate_facts(
     scene_of: Callable[[str], Scene],
 ) -> CandidateFacts:
     other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
+    frame = candidate.frame
     in_target = {o.phrase: i for i, o in enumerate(scene.objects)}
     in_candidate = {o.phrase: i for i, o in enumerate(other.objects)}
     large: list[tuple[float, Difference]] = []
@@ -379,12 +380,21 @@ def _candidate_facts(
     for name in {**in_target, **in_candidate}:
         i, j = in_target.get(name), in_candidate.get(name)
         expected = i is not None and _sight(scene, target, i) == "shown"
-        visible = j is not None and _sight(other, candidate.frame, j) == "shown"
+        visible = j is not None and _sight(other, frame, j) == "shown"
         if expected != visible:
             large.append((float(IMAGE_SIZE), Difference(name, "missing" if expected else "extra")))
         elif i is not None and j is not None:
-            difference, distance = _displacement(scene, target, i, other, candidate.frame, j)
-            if visible and distance >= (BORDER if difference.kind == "region" else DISPLACED):
+            shift = _position(other, frame, j) - _position(scene, target, i)
+            distance = float(np.hypot(*shift))
+            region = object_region(other, frame, j)
+            if region != object_region(scene, target, i):
+                bound, difference = BORDER, Difference(name, "region", region=region)
+            else:
+                extent = "clearly" if distance >= CLEARLY else "slightly"
+                heading = compass_direction(shift)
+                difference = Difference(name, "displaced", heading=heading, extent=extent)
+                bound = DISPLACED
+            if visible and distance >= bound:
                 large.append((distance, difference))
             else:
                 small.append((visible, distance, difference))
@@ -395,16 +405,3 @@ def _candidate_facts(
     return CandidateFacts(
         letter, False, set(in_target) != set(in_candidate), tuple(d for _, d in large)
     )
-
-
-def _displacement(
-    scene: Scene, target: int, i: int, other: Scene, frame: int, j: int
-) -> tuple[Difference, float]:
-    name = scene.objects[i].phrase
-    shift = _position(other, frame, j) - _position(scene, target, i)
-    distance = float(np.hypot(*shift))
-    region = object_region(other, frame, j)
-    if region != object_region(scene, target, i):
-        return Difference(name, "region", region=region), distance
-    extent = "clearly" if distance >= CLEARLY else "slightly"
-    return Difference(name, "displaced", heading=compass_direction(shift), extent=extent), distance

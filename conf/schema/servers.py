@@ -28,8 +28,8 @@ class ServersConfig(Settings):
     """Concurrent requests over all servers; 128 requests saturate one vLLM server."""
     timeout: float = setting(120.0, least=1)
     """Timeout of a request (s)."""
-    patience: float = setting(600.0, least=0)
-    """Time (s) without any reachable server after which the command gives up."""
+    unreachable_timeout: float = setting(600.0, least=0)
+    """Time (s) without a response of any server after which the command gives up."""
 
     @property
     def urls(self) -> list[str]:

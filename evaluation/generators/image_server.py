@@ -22,8 +22,7 @@ from conf.errors import UserError
 from conf.runs import write_json
 from conf.schema import ImageServerConfig
 from data.store import Store, write_atomically
-from teacher.servers.concurrency import run_limited
-from teacher.servers.pool import NoResponseError, ServerPool
+from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from teacher.servers.responses import Response
 from teacher.servers.server import Messages, RequestFields, Server
 

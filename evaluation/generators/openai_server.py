@@ -24,8 +24,7 @@ from models.fingerprints import processor_digest, weights_digest
 from models.student.generation import THOUGHT, GeneratedText, response_token_limit
 from models.student.prompts import Clip, Sample
 from models.trained_runs import product_folder, run_title
-from teacher.servers.concurrency import run_limited
-from teacher.servers.pool import NoResponseError, ServerPool
+from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from teacher.servers.responses import TRUNCATED, Response
 from teacher.servers.server import (
     MALFORMED_RESPONSE_ERRORS,

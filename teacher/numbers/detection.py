@@ -11,12 +11,12 @@ each other word, a rule looks at its neighbors and returns the span of words tha
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import lru_cache
 from itertools import accumulate
 
 from teacher.numbers.lexicon import LEXICON
-from teacher.numbers.normalization import FOLDS, Spans, normalize, normalize_word
+from teacher.numbers.normalization import Spans, fold_character, normalize, normalize_word
 
 Rule = Callable[["Prose", int], "tuple[int, int] | None"]
 
@@ -60,8 +60,7 @@ CLAUSE = re.compile(r"[.!?:;\n•–—*#>(\"“]|\s-\s")
 COUNTABLE = LEXICON.nouns | LEXICON.events | LEXICON.units
 """Nouns that "one" counts even after "the" or an adjective."""
 ADJECTIVAL = ("er", "est", "ing", "ed", "most")
-JOINS = frozenset(" -")
-CLOSERS = frozenset(".,;:!?)…—–")
+CLAUSE_ENDS, SENTENCE_ENDS = frozenset(".,;:!?)…—–"), frozenset(".;!?)")
 
 
 class Prose:
@@ -88,7 +87,9 @@ class Prose:
     def _neighbor(self, index: int, step: int, by: int) -> str:
         for _ in range(by):
             gap = max(index, index + step)
-            if not 0 < gap < len(self.words) or not _joins(self.gaps[gap]):
+            if not 0 < gap < len(self.words):
+                return ""
+            if self.gaps[gap] != "-" and not self.gaps[gap].isspace():
                 return ""
             index += step
         return self.lower[index]
@@ -96,21 +97,13 @@ class Prose:
     def opens_clause(self, index: int) -> bool:
         return index == 0 or bool(CLAUSE.search(self.gaps[index][-8:]))
 
-    def ends_clause(self, index: int) -> bool:
+    def ends(self, index: int, marks: Collection[str]) -> bool:
+        """Whether a word is the last of the text, or one of some marks follows it."""
         gap = self.gaps[index + 1].lstrip()
-        return gap[:1] in CLOSERS if gap else index + 1 == len(self.words)
-
-    def ends_sentence(self, index: int) -> bool:
-        gap = self.gaps[index + 1].lstrip()
-        return gap[:1] in (".", ";", "!", "?", ")") if gap else index + 1 == len(self.words)
+        return gap[:1] in marks if gap else index + 1 == len(self.words)
 
     def span(self, first: int, last: int) -> tuple[int, int]:
         return self.bounds[2 * first + 1], self.bounds[2 * last + 2]
-
-
-def _joins(gap: str) -> bool:
-    # The most frequent gaps first, because this runs for most words with a rule.
-    return gap in JOINS or gap.isspace()
 
 
 def find_numbers(text: str) -> list[tuple[int, int]]:
@@ -127,7 +120,7 @@ def _merged(spans: Spans, text: str) -> Spans:
     first, last = spans[0]
     for start, stop in spans:
         # Combining marks normalize to nothing and belong to the character before them.
-        while stop < len(text) and text[stop] > "\x7f" and not FOLDS[text[stop]]:
+        while stop < len(text) and text[stop] > "\x7f" and not fold_character(text[stop]):
             stop += 1
         if start <= last or (start == last + 1 and text[last] in "- "):
             last = stop if stop > last else last
@@ -236,15 +229,7 @@ def _is_pronoun(prose: Prose, index: int) -> bool:
     """Whether "one" is a pronoun and counts nothing."""
     if prose.gaps[index + 1] in ("'", "’") and prose.word(index + 1) == "s":
         return True
-    pronoun = _is_pronoun_between(prose.before(index), prose.after(index))
-    if pronoun is None:
-        return prose.before(index, 2) in ("the", "a", "an", "each", "every", "its", "their")
-    return pronoun
-
-
-@lru_cache(maxsize=1 << 12)
-def _is_pronoun_between(previous: str, following: str) -> bool | None:
-    """None if it depends on an article before the previous word, as in "the opaque one"."""
+    previous, following = prose.before(index), prose.after(index)
     if following in ("another", "side", "sided") or previous == "no":
         return True
     if following in COUNTABLE or rule_of(previous[:MAX_LETTERS]) is _always:
@@ -253,7 +238,8 @@ def _is_pronoun_between(previous: str, following: str) -> bool | None:
         return True
     if not previous or previous in LEXICON.not_adjectives or previous in COUNTABLE:
         return False
-    return None
+    # An article before the previous word, as in "the opaque one".
+    return prose.before(index, 2) in ("the", "a", "an", "each", "every", "its", "their")
 
 
 def _describes(word: str) -> bool:
@@ -280,7 +266,7 @@ def _once(prose: Prose, index: int) -> tuple[int, int] | None:
     if previous in LEXICON.exactly or following in ("or", "per", "every", "each"):
         return index, index
     if not previous or prose.opens_clause(index):
-        counts = prose.ends_clause(index)
+        counts = prose.ends(index, CLAUSE_ENDS)
     elif following:
         opens = following in LEXICON.clause_openers or following.endswith(("ed", "ing"))
         counts = not opens and not _starts_number(prose, index + 1)
@@ -324,7 +310,7 @@ def _minute(prose: Prose, index: int) -> tuple[int, int] | None:
     if following in LEXICON.after_minute:
         return index - 1, index + 1
     timed = not following and prose.before(index, 2) in LEXICON.time_prepositions
-    return (index - 1, index) if timed or prose.ends_sentence(index) else None
+    return (index - 1, index) if timed or prose.ends(index, SENTENCE_ENDS) else None
 
 
 def _score(prose: Prose, index: int) -> tuple[int, int] | None:
@@ -345,7 +331,7 @@ def _letter(prose: Prose, index: int) -> tuple[int, int] | None:
     entry = after == ". " and (before[-1:] == "\n" or index == 0)
     if entry or after[:1] == ")" or len(prose.words) == 1:
         return index, index
-    if prose.words[index] == "i" and not prose.ends_clause(index):
+    if prose.words[index] == "i" and not prose.ends(index, CLAUSE_ENDS):
         return None
     enumerated = before.strip(" .-\n") == "" and prose.word(index - 1) in LEXICON.enumerated
     return (index - 1, index) if enumerated else None
@@ -358,14 +344,9 @@ def _italian(prose: Prose, index: int) -> tuple[int, int] | None:
     return (index - 1, index) if prose.before(index) in LEXICON.italian else None
 
 
-def _secondo(prose: Prose, index: int) -> tuple[int, int] | None:
-    """The Italian "second", or "according to" before an article."""
-    return None if prose.after(index) in ("la", "il", "le", "i", "lo", "gli") else (index, index)
-
-
-def _ek(prose: Prose, index: int) -> tuple[int, int] | None:
-    """The Hindi "one", or half of "each other"."""
-    return None if prose.after(index) == normalize_word("दूसरे") else (index, index)
+def _except_before(*words: str) -> Rule:
+    """A rule for a word that states a number unless one of some words follows."""
+    return lambda prose, index: None if prose.after(index) in words else (index, index)
 
 
 RULES: dict[str, Rule] = {
@@ -378,7 +359,9 @@ RULES: dict[str, Rule] = {
     "secondary": _secondary,
     **dict.fromkeys(map(normalize_word, LEXICON.foreign_firsts), _first),
     **dict.fromkeys(("due", "meta"), _italian),
-    "secondo": _secondo,
-    normalize_word("एक"): _ek,
+    # The Italian "second", or "according to" before an article.
+    "secondo": _except_before("la", "il", "le", "i", "lo", "gli"),
+    # The Hindi "one", or half of "each other".
+    normalize_word("एक"): _except_before(normalize_word("दूसरे")),
     **dict.fromkeys("ivx", _letter),
 }

@@ -64,17 +64,9 @@ class Reading:
         return [(self.starts[start], self.stops[stop - 1]) for start, stop in spans]
 
 
-class _Folds(dict[str, str]):
-    """A bounded cache of the normalized form of each character."""
-
-    def __missing__(self, c: str) -> str:
-        if len(self) >= 1 << 16:
-            self.clear()
-        self[c] = folded = _fold_character(c)
-        return folded
-
-
-def _fold_character(c: str) -> str:
+@lru_cache(maxsize=1 << 16)
+def fold_character(c: str) -> str:
+    """The normalized form of a character."""
     plain = unicodedata.normalize("NFKC", c)
     if c in LEXICON.ideographs or c in PICTOGRAPHS or any(map(_is_numeral, (c, *plain))):
         digits = "".join(p for p in plain if p in "0123456789")
@@ -93,12 +85,9 @@ def _is_numeral(c: str) -> bool:
     return unicodedata.category(c)[0] == "N" or unicodedata.numeric(c, None) is not None
 
 
-FOLDS = _Folds()
-
-
 def normalize_word(word: str) -> str:
     """A lexicon entry in its normalized form."""
-    return "".join(map(FOLDS.__getitem__, word)).casefold()
+    return "".join(map(fold_character, word)).casefold()
 
 
 def normalize(text: str) -> list[Reading]:
@@ -112,7 +101,7 @@ def normalize(text: str) -> list[Reading]:
         reading = _substitute(reading, ENTITY, _meaning)
     folded = IDIOM.sub(lambda m: "人" * len(m[0]), reading.text)
     reading = Reading(folded, reading.starts, reading.stops)
-    reading = _substitute(reading, NOT_ASCII, FOLDS.__getitem__)
+    reading = _substitute(reading, NOT_ASCII, fold_character)
     readings = [Reading(reading.text.translate(SEAMS_TO_SPACES), reading.starts, reading.stops)]
     if SEAM.search(reading.text):
         joined = _substitute(reading, SEAM, lambda _: "")

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import email.utils
+import math
 import os
-import time
 from typing import Any
 
 import openai
 
 from conf.errors import UserError
 from conf.schema import ServersConfig
-from teacher.servers.health import check_health
 from teacher.servers.responses import Response, parse_completion
 
 Messages = list[dict[str, Any]]
@@ -63,7 +61,16 @@ class RateLimitedError(RequestError):
 
 
 class Server:
-    """Sends requests to `cfg.model` at `url`. Use it inside one event loop."""
+    """Sends requests to `cfg.model` at `url`. Use it inside one event loop.
+
+    Attributes:
+        in_flight: Number of requests without a response yet.
+        problem: Why the last request failed; None if it did not.
+        pauses: Number of pauses in a row.
+        available_at: Earliest time of the next request, on the clock of time.monotonic().
+        checked_at: Time of the last canary.
+        lock: Held while a canary is in flight.
+    """
 
     def __init__(self, url: str, cfg: ServersConfig) -> None:
         self.url = url
@@ -71,6 +78,10 @@ class Server:
         self.client = openai.AsyncOpenAI(
             base_url=url, api_key=get_api_key(), max_retries=0, timeout=cfg.timeout
         )
+        self.in_flight = self.pauses = 0
+        self.problem: str | None = None
+        self.available_at = self.checked_at = -math.inf
+        self.lock = asyncio.Lock()
 
     async def complete(self, messages: Messages, n: int, fields: RequestFields) -> list[Response]:
         """Up to `n` responses to a prompt.
@@ -89,7 +100,7 @@ class Server:
         except openai.AuthenticationError as error:
             raise authentication_error(self.url, error) from error
         except openai.RateLimitError as error:
-            raise RateLimitedError("HTTP 429", _retry_after(error)) from error
+            raise RateLimitedError("rate-limited (HTTP 429)", _retry_after(error)) from error
         except openai.APIStatusError as error:
             if error.status_code >= 500 or error.status_code in RETRYABLE_STATUSES:
                 raise RequestError(f"HTTP {error.status_code}") from error
@@ -110,10 +121,6 @@ class Server:
         )
         return parse_completion(completion, n)
 
-    async def check_health(self) -> str | None:
-        """Why the server is down, or None if it is up."""
-        return await asyncio.to_thread(check_health, self.url)
-
     async def close(self) -> None:
         await self.client.close()
 
@@ -130,13 +137,8 @@ class Server:
 
 
 def _retry_after(error: openai.APIStatusError) -> float | None:
-    """Seconds to wait by the Retry-After header, which holds a number or a date."""
-    header = error.response.headers.get("retry-after", "")
+    """Seconds to wait by the Retry-After header; None without one, or if it is a date."""
     try:
-        return max(0.0, float(header))
-    except ValueError:
-        pass
-    try:
-        return max(0.0, email.utils.parsedate_to_datetime(header).timestamp() - time.time())
+        return max(0.0, float(error.response.headers.get("retry-after", "")))
     except ValueError:
         return None

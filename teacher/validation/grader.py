@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections import Counter
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
-from teacher.grammar import GRAMMAR_VERSION
 from teacher.narrator import NARRATOR_VERSION
 from teacher.predicates import Predicates
 from teacher.prompts import PROMPT_VERSION
-from teacher.reading.grounding import VERDICTS, Claim
+from teacher.reading.grounding import VERDICTS
+from teacher.sections import GRAMMAR_VERSION
 from teacher.servers.responses import Response
 from teacher.validation.validator import VALIDATOR_VERSION, Verdict, validate_rationale
 
@@ -26,8 +26,14 @@ class RationaleGrader:
     def __init__(self, cfg: TeacherConfig) -> None:
         self.cfg = cfg
         self.grammar_version = GRAMMAR_VERSION if cfg.grammar else None
-        self.prompt_version = NARRATOR_VERSION if cfg.url is None else PROMPT_VERSION
-        self.settings = self._hash_settings()
+        self.origin = {
+            "teacher": cfg.name,
+            "prompt_version": NARRATOR_VERSION if cfg.url is None else PROMPT_VERSION,
+            "validator_version": VALIDATOR_VERSION,
+            "settings": self._hash_settings(),
+            "seed": cfg.seed,
+        }
+        """Fields of a record on which it depends whether a response is requested again."""
 
     def grade(
         self, response: Response, predicates: Predicates, item: SelectionItem, attempt: int
@@ -39,31 +45,29 @@ class RationaleGrader:
             verdict = Verdict((response.flaw,))
         else:
             verdict = validate_rationale(response.text, predicates, item, self.cfg)
+        counts = Counter((claim.kind, claim.verdict) for claim in verdict.claims)
         return Rationale(
             item_id=item.item_id,
             attempt=attempt,
             accepted=verdict.accepted,
             text=response.text[:MAX_CHARACTERS],
             answer=verdict.answer,
-            teacher=self.cfg.name,
-            prompt_version=self.prompt_version,
-            validator_version=VALIDATOR_VERSION,
-            settings=self.settings,
-            seed=self.cfg.seed,
             reasons=verdict.reasons,
             sections=verdict.sections,
             prompt_tokens=response.prompt_tokens,
             completion_tokens=response.completion_tokens,
             grammar=self.grammar_version,
             finished=response.finished,
-            claims=count_verdicts(verdict.claims),
+            claims={
+                kind: [counts[kind, name] for name in VERDICTS]
+                for kind in sorted({kind for kind, _ in counts})
+            },
+            **self.origin,
         )
 
-    def is_current(self, r: Rationale) -> bool:
+    def is_current(self, rationale: Rationale) -> bool:
         """Whether a rationale was recorded with the current teacher, versions and settings."""
-        recorded = (r.teacher, r.prompt_version, r.validator_version, r.settings, r.seed)
-        versions = (self.prompt_version, VALIDATOR_VERSION, self.settings)
-        return recorded == (self.cfg.name, *versions, self.cfg.seed)
+        return all(getattr(rationale, name) == value for name, value in self.origin.items())
 
     def _hash_settings(self) -> str:
         """A short hash of the settings that affect a response or its verdict."""
@@ -74,11 +78,3 @@ class RationaleGrader:
         if self.grammar_version is not None:
             settings.append(self.grammar_version)
         return hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:8]
-
-
-def count_verdicts(claims: Iterable[Claim]) -> dict[str, list[int]]:
-    """For each kind of claim, the numbers of claims by verdict, in the order of `VERDICTS`."""
-    counts: dict[str, list[int]] = {}
-    for claim in claims:
-        counts.setdefault(claim.kind, [0] * len(VERDICTS))[VERDICTS.index(claim.verdict)] += 1
-    return dict(sorted(counts.items()))

@@ -11,7 +11,7 @@ from teacher.candidate_letters import find_letters
 from teacher.numbers.detection import find_numbers
 from teacher.predicates import Predicates
 from teacher.reading.grounding import Claim
-from teacher.sections import SECTIONS, split_sections, text_before_sections
+from teacher.sections import HEADING, SECTIONS, split_sections
 from teacher.validation.claim_extraction import extract_claims
 
 VALIDATOR_VERSION = "4"
@@ -86,7 +86,7 @@ def _parse_sections(text: str) -> tuple[dict[str, str], str | None, list[str]]:
         problems.append("repeated section")
     if names != sorted(names, key=[*SECTIONS, "Answer"].index):
         problems.append("sections out of order")
-    if text_before_sections(text).strip():
+    if names and HEADING.split(text, maxsplit=1)[0].strip():
         problems.append("text before the sections")
     if not answers:
         return sections, None, [*problems, "no answer"]

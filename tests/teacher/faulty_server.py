@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from socket import SO_LINGER, SOL_SOCKET
 from typing import Any
 
+from teacher.servers.pool import CANARY
 from tests.local import JsonHandler, LocalServer
 from tests.teacher.memory_store import MemoryStore, prompts_and_rationales
 
@@ -30,11 +31,11 @@ def spoil_text(fault: str, text: str) -> tuple[str, str]:
 
 
 class FaultyServer(LocalServer):
-    """A server whose first responses have `faults`.
+    """A server whose first responses have `faults`, other than those to canaries.
 
     Attributes:
         always: Fault of every response to a prompt; "*" stands for every prompt.
-        requests: The requests so far.
+        requests: The requests so far, without canaries.
         times: When they came.
         delay: Seconds before a response.
         most: Most requests that were in flight at once.
@@ -64,13 +65,14 @@ class Handler(JsonHandler):
     def post(self, request: dict[str, Any]) -> None:
         server, prompt = self.server, request["messages"][-1]["content"]
         with server.lock:
-            server.requests.append(request)
-            server.times.append(time.monotonic())
+            fault = server.always.get(prompt) or server.always.get("*")
+            if request["messages"] != CANARY:
+                server.requests.append(request)
+                server.times.append(time.monotonic())
+                if fault is None and server.faults:
+                    fault = server.faults.pop(0)
             server.in_flight += 1
             server.most = max(server.most, server.in_flight)
-            fault = server.always.get(prompt) or server.always.get("*")
-            if fault is None and server.faults:
-                fault = server.faults.pop(0)
         time.sleep(server.delay)
         try:
             self.respond(request, server.texts.get(prompt, "Hello."), fault)

@@ -92,10 +92,6 @@ def test_no_negative_sentence_is_detected():
     assert [(text, detect(text)) for text in NEGATIVE if find_numbers(text)] == []
 
 
-def test_sentences_are_distinct():
-    assert len({*POSITIVE, *NEGATIVE}) == len(POSITIVE) + len(NEGATIVE)
-
-
 @pytest.mark.parametrize(
     ("text", "stated"),
     [
@@ -151,16 +147,6 @@ def test_spans_of_random_text_are_valid():
         ]
         assert_spans_are_valid("".join(pieces))
         assert_spans_are_valid(" ".join(rng.choices(words, k=20)))
-
-
-def test_mutated_sentences_do_not_raise():
-    rng = random.Random(1)
-    for text in (*POSITIVE, *NEGATIVE):
-        cut, other = rng.randrange(len(text) + 1), rng.choice(POSITIVE)
-        swapped = list(text)
-        swapped[rng.randrange(len(text))] = chr(rng.randrange(0x110000))
-        for mutant in (text[:cut], text[cut:] + other, text[::-1], "".join(swapped), text.upper()):
-            find_numbers(mutant)
 
 
 @pytest.mark.slow

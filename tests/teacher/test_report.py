@@ -7,9 +7,8 @@ import pytest
 
 from conf.schema import TeacherConfig
 from data.records import Rationale
-from teacher.narrate import narrate_store, write_report
-from teacher.report.page import write_page
-from teacher.report.summary import summarize
+from teacher.narrate import narrate_store
+from teacher.report import format_figures, summarize, write_report
 from tests.teacher import synthetic
 
 ITEMS = [synthetic.item((60, 80, 100, 120), item_id=f"item-{k}") for k in range(5)]
@@ -32,15 +31,15 @@ def response(k, attempt, text="A red cube rests.", reasons=(), **fields):
     )
 
 
-def summary_of(*responses):
+def figures_of(*responses):
     by_item = {}
     for r in responses:
         by_item.setdefault(r.item_id, []).append(r)
-    return summarize(ITEMS, by_item, attempts=2, too_short=1)
+    return summarize(ITEMS, by_item)
 
 
 def test_every_figure_is_counted():
-    summary = summary_of(
+    figures = figures_of(
         response(0, 0, "The red metal cube rests here. The red metal cube stays."),
         response(1, 0, reasons=["number: 'two'", "number: 'half'", "too short"]),
         response(1, 1, "The blue rubber cube rests here. The blue rubber cube stays."),
@@ -48,54 +47,58 @@ def test_every_figure_is_counted():
         response(2, 1, reasons=["wrong answer: B"]),
         response(3, 0, "The red metal cube rests here. The red metal cube stays."),
     )
-    assert (summary.items, summary.accepted, summary.set_aside, summary.too_short) == (5, 3, 1, 1)
-    assert (summary.responses, summary.accepted_responses) == ((4, 2), (2, 1))
-    assert summary.rejected == {"number": 2, "too short": 1, "wrong answer": 1}
-    assert summary.examples["number"] == [("item-1", "'two'"), ("item-2", "'six'")]
-    assert summary.lengths == (11, 11, 11)
-    assert summary.distinct_words == 9
-    assert list(summary.words.items())[:2] == [("the", 6), ("cube", 6)]
-    assert (summary.same_text, summary.same_but_names) == (1, 2)
-    assert summary.requests == 0
-    assert json.loads(json.dumps(summary.to_dict()))["accepted"] == 3
+    items = [figures[key] for key in ("items", "accepted", "set_aside", "too_short")]
+    assert items == [5, 3, 1, 1]
+    assert (figures["responses"], figures["accepted_responses"]) == ([4, 2], [2, 1])
+    assert figures["rejected"] == {"number": 2, "too short": 1, "wrong answer": 1}
+    assert figures["examples"]["number"] == [("item-1", "'two'"), ("item-2", "'six'")]
+    assert figures["lengths"] == [11, 11, 11]
+    assert figures["distinct_words"] == 9
+    assert list(figures["words"].items())[:2] == [("the", 6), ("cube", 6)]
+    assert (figures["same_text"], figures["same_but_names"]) == (1, 2)
+    assert figures["requests"] == 0
 
 
 def test_claims_are_summed_and_shown_as_shares():
-    summary = summary_of(
+    figures = figures_of(
         response(0, 0, claims={"direction": [3, 0, 1]}),
         response(1, 0, claims={"direction": [1, 1, 2], "speed": [2, 0, 0]}),
     )
-    assert summary.claims == {"direction": (4, 1, 3), "speed": (2, 0, 0)}
-    line = next(line for line in summary.text().splitlines() if line.startswith("direction"))
+    assert figures["claims"] == {"direction": [4, 1, 3], "speed": [2, 0, 0]}
+    lines = format_figures(figures).splitlines()
+    line = next(line for line in lines if line.startswith("direction"))
     assert line.split()[1:] == ["8", "50.0%", "12.5%", "37.5%"]
 
 
 def test_idle_time_of_servers_costs_nothing():
     times = [100.0, 101.0, 103.0, 5000.0, 5001.0]
-    summary = summary_of(
+    figures = figures_of(
         *(
             response(k, 0, finished=time, prompt_tokens=50, completion_tokens=20)
             for k, time in enumerate(times)
         )
     )
-    assert summary.hours * 3600 == pytest.approx(4)
-    assert (summary.requests, summary.prompt_tokens) == (5, 250)
-    assert summary.completion_tokens == 100
-    assert "25 tokens/s" in summary.text()
+    assert figures["hours"] * 3600 == pytest.approx(4)
+    assert (figures["requests"], figures["prompt_tokens"]) == (5, 250)
+    assert figures["completion_tokens"] == 100
+    assert "25 tokens/s" in format_figures(figures)
 
 
-def test_summary_without_responses():
-    summary = summary_of()
-    assert summary.accepted == 0
-    assert summary.text()
+def test_figures_without_responses():
+    figures = figures_of()
+    assert figures["accepted"] == 0
+    assert format_figures(figures)
 
 
 def test_page_shows_random_rationales_beside_their_frames(micro_store, tmp_path):
     narration = narrate_store(micro_store, TeacherConfig(name="template & co"))
-    write_report(micro_store, narration, 4, tmp_path)
-    page = (tmp_path / "report.html").read_text()
-    figures = narration.summary.text()
-    assert (tmp_path / "report.txt").read_text() == figures + "\n"
+    figures = narration.figures
+
+    def write(rationales, seed):
+        return write_report(micro_store, rationales, figures, 4, seed, tmp_path).read_text()
+
+    page = write(narration.rationales, 0)
+    assert (tmp_path / "report.txt").read_text() == format_figures(figures) + "\n"
     assert json.loads((tmp_path / "report.json").read_text())["accepted"] == len(
         narration.rationales
     )
@@ -103,10 +106,5 @@ def test_page_shows_random_rationales_beside_their_frames(micro_store, tmp_path)
     images = re.findall(r'src="(images/[^"]+\.png)"', page)
     assert len(set(images)) == 4
     assert all((tmp_path / image).read_bytes().startswith(b"\x89PNG") for image in images)
-
-    def write(rationales, seed):
-        return write_page(micro_store, rationales, figures, 4, seed, tmp_path).read_text()
-
-    assert write(narration.rationales, 0) == page
     assert write(narration.rationales, 1) != page
     assert "0 of" in write([], 0)

@@ -1,4 +1,4 @@
-"""A real vLLM server under a real `python -m teacher.serve`, to be started, killed and stopped."""
+"""A real vLLM server, started by `python -m teacher.serve`, to be killed and stopped."""
 
 from __future__ import annotations
 
@@ -8,11 +8,8 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from pathlib import Path
-
-import psutil
-
-from teacher.servers.health import check_health
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = ROOT / ".venv-vllm"
@@ -34,27 +31,32 @@ class VllmServer:
         self.arguments += [f"teacher.url={self.url}", "teacher.max_tokens=512", f"model={model}"]
         self.arguments += [f"environment={ENVIRONMENT}", f"checkpoints={folder}", "cache_gb=0.5"]
         self.arguments += settings
-        self.command: subprocess.Popen[bytes] | None = None
+        self.process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Start the command and wait until the server is up."""
+        """Start vLLM in a process group of its own, and wait until it is up."""
         with open(self.output, "ab") as output:
-            self.command = subprocess.Popen(self.arguments, stdout=output, stderr=output, cwd=ROOT)
-        while check_health(self.url) is not None:
-            assert self.command.poll() is None, self.output.read_text()
+            self.process = subprocess.Popen(
+                self.arguments, stdout=output, stderr=output, cwd=ROOT, start_new_session=True
+            )
+        while not self.is_up():
+            assert self.process.poll() is None, self.output.read_text()
             time.sleep(0.2)
 
-    def processes(self) -> list[psutil.Process]:
-        """vLLM's processes; the first is the parent of the others."""
-        return psutil.Process(self.command.pid).children(recursive=True)
+    def is_up(self) -> bool:
+        try:
+            urllib.request.urlopen(self.url.removesuffix("/v1") + "/health", timeout=10).close()
+        except OSError:
+            return False
+        return True
 
     def kill(self) -> None:
-        """Kill vLLM, as the system does when out of memory, and wait for the command to exit."""
-        os.killpg(self.processes()[0].pid, signal.SIGKILL)
-        self.command.wait()
+        """Kill vLLM with all its processes, as a restart of the machine does."""
+        os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
 
     def stop(self, number: int = signal.SIGTERM) -> int:
-        """Send a signal to the command; returns its exit status."""
-        if self.command.poll() is None:
-            self.command.send_signal(number)
-        return self.command.wait()
+        """Send a signal to vLLM; returns its exit status."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        return self.process.wait()

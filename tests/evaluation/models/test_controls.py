@@ -25,7 +25,9 @@ STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500,
 @pytest.fixture
 def command(micro, micro_store):
     def asked(server, **changes) -> SelectCommand:
-        served = ServerConfig(url=[server.url], model="served", patience=5.0, timeout=10.0)
+        served = ServerConfig(
+            url=[server.url], model="served", unreachable_timeout=5.0, timeout=10.0
+        )
         store = str(micro_store.folder.parent)
         settings = {"modes": ["answer"], **changes}
         return SelectCommand(

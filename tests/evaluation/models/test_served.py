@@ -45,7 +45,7 @@ def frames(micro_store):
 
 
 def at(*servers, **changes) -> ServerConfig:
-    settings = {"concurrency": 3, "patience": 5.0, "timeout": 10.0, **changes}
+    settings = {"concurrency": 3, "unreachable_timeout": 5.0, "timeout": 10.0, **changes}
     return ServerConfig(url=[s.url for s in servers], model="served", **settings)
 
 
@@ -169,7 +169,7 @@ def test_hostile_answers_are_kept_and_read(items, frames, talking, tmp_path) -> 
 def test_a_server_that_dies_costs_no_answer(items, frames, talking, tmp_path) -> None:
     first = talking(lambda _: FULL if len(first.asked) < 4 else 500)
     log = opened(tmp_path, items)
-    dying = asker(at(first, patience=0.2, concurrency=1), frames)
+    dying = asker(at(first, unreachable_timeout=0.2, concurrency=1), frames)
     with raises_user_error("no-server", contains="server.url"):
         collect_responses(items, "record", dying, log)
     kept = (tmp_path / "answers.jsonl").read_text()

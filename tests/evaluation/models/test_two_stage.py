@@ -209,7 +209,7 @@ def test_what_is_drawn_is_kept_when_the_server_fails(ranks, store, talking) -> N
     bad = sorted(said)[3]
 
     server = talking(lambda r: b"no image" if r["prompt"] == bad else image)
-    drawn = {"concurrency": 1, "patience": 0.2, "timeout": 10.0}
+    drawn = {"concurrency": 1, "unreachable_timeout": 0.2, "timeout": 10.0}
     with raises_user_error("no-response", contains=("painter", bad)):
         ranks("predict_generated_image", said, url=server.url, **drawn)
     assert len([*(store.folder / "generated_images").rglob("*.png")]) == 3
@@ -311,7 +311,7 @@ def test_texts_are_kept_when_the_server_dies(world, store, talking) -> None:
 
     def at(server) -> ServerConfig:
         return ServerConfig(
-            url=server.url, model="served", concurrency=1, patience=0.2, timeout=10.0
+            url=server.url, model="served", concurrency=1, unreachable_timeout=0.2, timeout=10.0
         )
 
     dying = talking(lambda r: say(r) if len(dying.asked) < 6 else 500)

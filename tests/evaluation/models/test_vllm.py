@@ -141,7 +141,7 @@ def test_answers_are_drawn_many_at_a_time_each_by_its_own_seed(
     drawn = replace(cfg, temperature=0.7, max_new_tokens=16)
     asked = SelectCommand(
         benchmark=micro, student=drawn, store=str(micro_store.folder.parent), modes=["answer"],
-        server=ServerConfig(url=server.url, model="tiny", patience=5),
+        server=ServerConfig(url=server.url, model="tiny", unreachable_timeout=5),
     )  # fmt: skip
 
     def answers(name: str, **settings: object) -> dict[str, str]:

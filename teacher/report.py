@@ -1,0 +1,223 @@
+"""Report of a narration: figures of all responses, and random rationales beside their frames."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from conf.runs import write_json, write_text
+from data.records import COLORS, MATERIALS, Rationale, SelectionItem
+from teacher.predicates import extract_predicates
+from teacher.validation.validator import WORD
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from data.store import Store
+
+Figures = dict[str, Any]
+
+EXAMPLES = 3
+"""Rejected responses that are quoted for each reason."""
+COMMON_WORDS = 20
+"""Most frequent words that are listed."""
+BIN_WIDTH = 10
+"""Words per bar of the histogram of lengths."""
+IDLE_SECONDS = 60.0
+"""Time without a response after which the servers count as idle."""
+OBJECT_NAME = re.compile(rf"\b(?:{'|'.join(COLORS)}) (?:{'|'.join(MATERIALS)}) \w+")
+
+
+def summarize(
+    items: Sequence[SelectionItem], responses: Mapping[str, Sequence[Rationale]]
+) -> Figures:
+    """Figures of the responses to each item, which are in the order of their attempts.
+
+    `accepted` counts items; `fallback`, those of them that the built-in narrator wrote in the
+    teacher's place; `set_aside`, items without an accepted response; `too_short`, items without a
+    response, since their prefix is too short. `responses` and `accepted_responses` are the
+    teacher's, by attempt. `rejected` counts responses by kind of reason, the most frequent first,
+    and `examples` has items and details of some. `lengths` are words of each accepted rationale,
+    `words` the most frequent ones. `same_text` counts accepted rationales that repeat another one's
+    text, `same_but_names` those that do so up to the objects' names. `claims` are the supported,
+    contradicted and unknown ones, by kind. `hours` is the time in which servers were in use; times
+    their GPUs, it gives GPU hours.
+    """
+    every = [r for item in items for r in responses.get(item.item_id, ())]
+    accepted = select_accepted(items, responses)
+    without_names = {OBJECT_NAME.sub("object", r.text) for r in accepted}
+    narrated = len({r.item_id for r in every})
+    by_attempt = Counter(r.attempt for r in every if not r.fallback)
+    accepted_by_attempt = Counter(r.attempt for r in every if r.accepted and not r.fallback)
+    rejections = _collect_rejections(every)
+    words = Counter(word for r in accepted for word in WORD.findall(r.text.lower()))
+    claims: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3, int))
+    for r in every:
+        for kind, counts in r.claims.items():
+            claims[kind] += counts
+    gaps = np.diff(np.sort([r.finished for r in every if r.finished is not None]))
+    return {
+        "items": len(items),
+        "accepted": len(accepted),
+        "fallback": sum(r.fallback for r in accepted),
+        "set_aside": narrated - len(accepted),
+        "too_short": len(items) - narrated,
+        "responses": [by_attempt[k] for k in sorted(by_attempt)],
+        "accepted_responses": [accepted_by_attempt[k] for k in sorted(by_attempt)],
+        "rejected": {kind: len(details) for kind, details in rejections.items()},
+        "examples": {kind: details[:EXAMPLES] for kind, details in rejections.items()},
+        "lengths": [len(WORD.findall(r.text)) for r in accepted],
+        "words": dict(words.most_common(COMMON_WORDS)),
+        "distinct_words": len(words),
+        "same_text": len(accepted) - len({r.text for r in accepted}),
+        "same_but_names": len(accepted) - len(without_names),
+        "claims": {kind: counts.tolist() for kind, counts in sorted(claims.items())},
+        "requests": sum(r.prompt_tokens is not None for r in every),
+        "prompt_tokens": sum(r.prompt_tokens or 0 for r in every),
+        "completion_tokens": sum(r.completion_tokens or 0 for r in every),
+        "hours": float(gaps[gaps < IDLE_SECONDS].sum()) / 3600,
+    }
+
+
+def select_accepted(
+    items: Sequence[SelectionItem], responses: Mapping[str, Sequence[Rationale]]
+) -> list[Rationale]:
+    """The first accepted rationale of each item that has one, in item order."""
+    firsts = (
+        next((r for r in responses.get(item.item_id, ()) if r.accepted), None) for item in items
+    )
+    return [r for r in firsts if r is not None]
+
+
+def rejection_kinds(rationale: Rationale) -> set[str]:
+    """The kinds of reasons for which a response was rejected, without their details."""
+    return {reason.partition(":")[0] for reason in rationale.reasons}
+
+
+def _collect_rejections(responses: Iterable[Rationale]) -> dict[str, list[tuple[str, str]]]:
+    """Item and detail of each rejection by kind of reason, the most frequent kind first."""
+    details: dict[str, list[tuple[str, str]]] = defaultdict(list)
+    for response in responses:
+        # A response with several numbers counts once under "number".
+        for kind in rejection_kinds(response):
+            detail = next(r for r in response.reasons if r.partition(":")[0] == kind)
+            details[kind].append((response.item_id, detail.removeprefix(f"{kind}:").strip()))
+    return dict(sorted(details.items(), key=lambda pair: (-len(pair[1]), pair[0])))
+
+
+def format_figures(figures: Figures) -> str:
+    """The figures as plain text."""
+    import pandas as pd
+
+    f = figures
+    counts = {
+        "training items": f["items"],
+        "accepted": f["accepted"],
+        "of them by the built-in narrator": f["fallback"],
+        "set aside": f["set_aside"],
+        "prefix too short": f["too_short"],
+    }
+    attempts = pd.DataFrame({"responses": f["responses"], "accepted": f["accepted_responses"]})
+    attempts.index = pd.RangeIndex(1, len(attempts) + 1, name="attempt")
+    attempts["share"] = attempts["accepted"] / attempts["responses"]
+    rejected = pd.DataFrame({"responses": f["rejected"]}).rename_axis("rejected for")
+    rejected["share"] = rejected["responses"] / sum(f["responses"])
+    verdicts = ["supported", "contradicted", "unknown"]
+    claims = pd.DataFrame.from_dict(f["claims"], orient="index", columns=verdicts)
+    totals = claims.sum(axis=1)
+    claims = claims.div(totals, axis=0)
+    claims.insert(0, "total", totals)
+    examples = [
+        f"    {kind}, {item}: {detail}"
+        for kind, details in f["examples"].items()
+        for item, detail in details
+        if detail
+    ]
+    parts = [
+        pd.Series(counts).to_string(),
+        *(_format_table(table) for table in (attempts, rejected)),
+        "\n".join(examples),
+        _format_words(f) if f["accepted"] else "",
+        _format_table(claims.rename_axis("claims")),
+        _format_cost(f) if f["requests"] else "",
+    ]
+    return "\n\n".join(filter(None, parts))
+
+
+def _format_table(table: pd.DataFrame) -> str:
+    return "" if table.empty else table.to_string(float_format="{:.1%}".format)
+
+
+def _format_words(figures: Figures) -> str:
+    lengths = figures["lengths"]
+    low, median, high = np.percentile(lengths, [5, 50, 95])
+    bins = Counter(length // BIN_WIDTH * BIN_WIDTH for length in lengths)
+    widest = max(bins.values())
+    lines = [
+        f"words per rationale: {min(lengths)} to {max(lengths)}, mean {np.mean(lengths):.0f}, "
+        f"median {median:.0f}, 5% to 95% {low:.0f} to {high:.0f}",
+        *(f"{k:>4} {'#' * round(50 * n / widest)} {n:,}" for k, n in sorted(bins.items())),
+        f"vocabulary: {figures['distinct_words']:,} distinct words; most frequent: "
+        + ", ".join(f"{word} {count:,}" for word, count in figures["words"].items()),
+        f"duplicates: {figures['same_text']:,} accepted rationales repeat another one's text, "
+        f"{figures['same_but_names']:,} do so up to the objects' names",
+    ]
+    return "\n".join(lines)
+
+
+def _format_cost(figures: Figures) -> str:
+    tokens, hours = figures["completion_tokens"], figures["hours"]
+    per_rationale = tokens / max(figures["accepted"] - figures["fallback"], 1)
+    rate = tokens / (3600 * hours) if hours else 0.0
+    return (
+        f"cost: {figures['requests']:,} requests, {figures['prompt_tokens']:,} prompt tokens, "
+        f"{tokens:,} completion tokens ({per_rationale:,.0f} per accepted rationale), {hours:.2f} "
+        f"hours of the servers, {rate:,.0f} tokens/s"
+    )
+
+
+def write_report(
+    store: Store,
+    accepted: Sequence[Rationale],
+    figures: Figures,
+    count: int,
+    seed: int,
+    folder: Path,
+) -> Path:
+    """Write report.json, report.txt, and report.html with `count` random accepted rationales."""
+    import jinja2
+
+    from data.publish.contact_sheets import ExampleRows, draw_sheet
+    from data.store import write_atomically
+
+    text = format_figures(figures)
+    write_json(folder / "report.json", figures)
+    write_text(folder / "report.txt", text + "\n")
+    items = {item.item_id: item for item in store.selection("train")}
+    rows, examples = ExampleRows(store), []
+    for k in sorted(np.random.default_rng(seed).permutation(len(accepted))[:count].tolist()):
+        item = items[accepted[k].item_id]
+        write_atomically(folder / "images" / f"{item.item_id}.png", draw_sheet([rows.item(item)]))
+        predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
+        examples.append((accepted[k], json.dumps(predicates and predicates.to_dict(), indent=1)))
+    template = (files("teacher") / "templates" / "report.html").read_text()
+    page = (
+        jinja2.Environment(autoescape=True)
+        .from_string(template)
+        .render(
+            teacher=accepted[0].teacher if accepted else "an unnamed teacher",
+            text=text,
+            accepted=len(accepted),
+            benchmark=store.name,
+            examples=examples,
+        )
+    )
+    write_text(folder / "report.html", page)
+    return folder / "report.html"
