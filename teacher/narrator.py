@@ -55,11 +55,11 @@ def write_rationale(
     The same arguments give the same text; another `attempt` gives another choice of phrasings.
     """
     keys = (seed, item.item_id, attempt)
-    text = _Writer(SPARSE, *keys).text(predicates)
+    text = _Writer(predicates, SPARSE, *keys).text()
     if len(text.split()) > MOST_WORDS:
-        text = _Writer(BRIEF, *keys).text(predicates)
+        text = _Writer(predicates, BRIEF, *keys).text()
     if len(text.split()) < FEW_WORDS:
-        text = _Writer(FULL, *keys, padded=True).text(predicates)
+        text = _Writer(predicates, FULL, *keys, padded=True).text()
     return text
 
 
@@ -71,7 +71,7 @@ def write_description(scene: Scene, start: int, stop: int, target: int, seed: in
     facts = extract_facts(scene, start, stop, target)
     if facts is None:
         return None
-    return _Writer(FULL, seed, scene.scene_id, start, stop, target).text(facts)
+    return _Writer(facts, FULL, seed, scene.scene_id, start, stop, target).text()
 
 
 def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:
@@ -79,9 +79,8 @@ def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str,
 
     The same arguments give the same lines.
     """
-    writer, key = _Writer(SPARSE, item.item_id, "matches"), most_discriminative_object(predicates)
-    expected = {o.object: o.target_region for o in predicates.objects}
-    return tuple(writer.match(c, key, expected) for c in predicates.candidates)
+    writer = _Writer(predicates, SPARSE, item.item_id, "matches")
+    return tuple(writer.match(c) for c in predicates.candidates)
 
 
 def most_discriminative_object(predicates: Predicates) -> ObjectFacts:
@@ -132,49 +131,49 @@ class _Writer:
     """Writes the parts of a text.
 
     Args:
+        facts: What to write about; a text about predicates analyses their candidates.
         detail: How many objects and pairs each part names.
         keys: Seed of the random choices of phrasing.
         padded: Whether to add two general sentences that lengthen a short text.
     """
 
-    def __init__(self, detail: Detail, *keys: int | str, padded: bool = False) -> None:
+    def __init__(
+        self, facts: Facts, detail: Detail, *keys: int | str, padded: bool = False
+    ) -> None:
         digest = hashlib.sha256(repr(keys).encode()).digest()
         self.rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-        self.detail = detail
-        self.padded = padded
+        self.facts, self.detail, self.padded = facts, detail, padded
+        self.ranked = _rank_objects(facts)
+        self.target_regions = {o.object: o.target_region for o in facts.objects}
+        self.key = most_discriminative_object(facts) if isinstance(facts, Predicates) else None
 
     def pick(self, *options: str) -> str:
         return options[self.rng.integers(len(options))]
 
-    def text(self, facts: Facts) -> str:
+    def text(self) -> str:
         """Return a rationale of predicates, or a description of facts without candidates."""
-        ranked = predicted = _rank_objects(facts)
-        if isinstance(facts, Predicates):
-            key = most_discriminative_object(facts)
-            predicted = sorted(ranked, key=lambda o: o is not key)
+        facts, answer = self.facts, None
         sections = {
-            "Scene parse": self.parse(facts, ranked),
-            "Motion analysis": self.motion(facts, ranked),
-            "Prediction": self.prediction(facts, predicted),
+            "Scene parse": self.parse(),
+            "Motion analysis": self.motion(),
+            "Prediction": self.prediction(),
         }
-        answer = None
         if isinstance(facts, Predicates):
             answer = facts.answer
-            expected = {o.object: o.target_region for o in facts.objects}
-            analysis = [self.candidate(c, key, expected) for c in facts.candidates]
-            sections["Candidate analysis"] = analysis
-        sections["Outcome"] = self.outcome(facts, ranked, answer)
+            sections["Candidate analysis"] = [self.candidate(c) for c in facts.candidates]
+        sections["Outcome"] = self.outcome(answer)
         lines = [f"{name}: {_sentences(parts)}" for name, parts in sections.items()]
         return "\n".join([*lines, f"Answer: {answer}"] if answer else lines)
 
-    def parse(self, facts: Facts, ranked: list[ObjectFacts]) -> list[str]:
-        parts = [self.observed(o) for o in ranked[: self.detail.parsed]]
-        parts[0] = f"{facts.instant}, {parts[0]}"
-        if not facts.courses:
-            free = self.pick("no pair is on a collision course", "no pair is heading for contact")
-            return [*parts, free]
-        for course in facts.courses[: self.detail.pairs]:
-            parts.append(f"{_pair(course.objects)} are on a collision course")
+    def parse(self) -> list[str]:
+        parts = [self.observed(o) for o in self.ranked[: self.detail.parsed]]
+        parts[0] = f"{self.facts.instant}, {parts[0]}"
+        courses = self.facts.courses[: self.detail.pairs]
+        parts += [f"{_pair(course.objects)} are on a collision course" for course in courses]
+        if not courses:
+            parts.append(
+                self.pick("no pair is on a collision course", "no pair is heading for contact")
+            )
         return parts
 
     def observed(self, o: ObjectFacts) -> str:
@@ -193,7 +192,8 @@ class _Writer:
             f"the {o.object} {o.region} is moving {motion}",
         )
 
-    def motion(self, facts: Facts, ranked: list[ObjectFacts]) -> list[str]:
+    def motion(self) -> list[str]:
+        facts, ranked = self.facts, self.ranked
         parts = [self.meeting(m) for m in facts.courses[: self.detail.pairs] if m.when != "unseen"]
         on_course = {frozenset(m.objects) for m in facts.courses}
         for contact in facts.contacts[: self.detail.pairs]:
@@ -240,13 +240,12 @@ class _Writer:
             cause = self.pick("", f"moving {o.speed}, ", "given its speed, ")
         return f"{cause}the {o.object} {o.extent}{_toward(o.travel)}"
 
-    def prediction(self, facts: Facts, ranked: list[ObjectFacts]) -> list[str]:
-        parts = [
-            f"{_pair(c.objects)} will be very close {c.region}"
-            for c in facts.close[: self.detail.pairs]
-        ]
-        parts += [self.expected(o) for o in ranked[: self.detail.predicted]]
-        parts[0] = f"{facts.moment}, {parts[0]}"
+    def prediction(self) -> list[str]:
+        close = self.facts.close[: self.detail.pairs]
+        parts = [f"{_pair(c.objects)} will be very close {c.region}" for c in close]
+        first_key = sorted(self.ranked, key=lambda o: self.key is not None and o is not self.key)
+        parts += [self.expected(o) for o in first_key[: self.detail.predicted]]
+        parts[0] = f"{self.facts.moment}, {parts[0]}"
         if self.padded:
             parts.append("the layout at the target moment follows from these motions")
         return parts
@@ -264,10 +263,9 @@ class _Writer:
             f"the {o.object} should be {o.target_region}",
         )
 
-    def candidate(
-        self, candidate: CandidateFacts, key: ObjectFacts, expected: dict[str, str]
-    ) -> str:
-        """Say where the `key` object is in a candidate, and then whether the candidate agrees."""
+    def candidate(self, candidate: CandidateFacts) -> str:
+        """Say where the key object is in a candidate, and then whether the candidate agrees."""
+        key = self.key
         name, shows = f"candidate {candidate.letter}", f"shows the {key.object}"
         if candidate.agrees:
             end = self.pick("", " with the prediction")
@@ -275,7 +273,7 @@ class _Writer:
         others = ", and shows other objects" * candidate.other_objects
         difference = {d.object: d for d in candidate.differences}.get(key.object)
         if difference is None:
-            why = self.difference(candidate.differences[0], expected)
+            why = self.difference(candidate.differences[0])
             return f"{name} {shows} {key.target_region} but {why}{others}"
         if difference.kind == "displaced":
             off = f"{difference.extent} off{_toward(difference.heading)}"
@@ -284,16 +282,16 @@ class _Writer:
             return f"{name} lacks the {key.object}{others}"
         return f"{name} {shows} {difference.region}, not {key.target_region}{others}"
 
-    def match(self, candidate: CandidateFacts, key: ObjectFacts, expected: dict[str, str]) -> str:
+    def match(self, candidate: CandidateFacts) -> str:
         name = f"Candidate {candidate.letter}"
         if candidate.agrees:
             return f"{name} matches: every object is where it should be."
-        first = min(candidate.differences, key=lambda d: d.object != key.object)
+        first = min(candidate.differences, key=lambda d: d.object != self.key.object)
         why = ["shows other objects"] * candidate.other_objects
-        why.append(self.difference(first, expected))
+        why.append(self.difference(first))
         return f"{name} does not match: it {' and '.join(why)}."
 
-    def difference(self, d: Difference, expected: dict[str, str]) -> str:
+    def difference(self, d: Difference) -> str:
         if d.kind == "missing":
             return self.pick(f"does not show the {d.object}", f"lacks the {d.object}")
         if d.kind == "extra":
@@ -302,9 +300,10 @@ class _Writer:
                 f"shows the {d.object} by mistake",
             )
         if d.kind == "region":
+            expected = self.target_regions[d.object]
             return self.pick(
-                f"shows the {d.object} {d.region}, not {expected[d.object]}",
-                f"has the {d.object} {d.region} and not {expected[d.object]}",
+                f"shows the {d.object} {d.region}, not {expected}",
+                f"has the {d.object} {d.region} and not {expected}",
             )
         toward = _toward(d.heading)
         return self.pick(
@@ -314,9 +313,10 @@ class _Writer:
             else f"has the {d.object} off",
         )
 
-    def outcome(self, facts: Facts, ranked: list[ObjectFacts], answer: str | None) -> list[str]:
-        parts = [f"{_pair(c.objects)} are very close {c.region}" for c in facts.close[:1]]
-        visible = [o for o in ranked if o.target_sight == "shown"]
+    def outcome(self, answer: str | None) -> list[str]:
+        close = self.facts.close[:1]
+        parts = [f"{_pair(c.objects)} are very close {c.region}" for c in close]
+        visible = [o for o in self.ranked if o.target_sight == "shown"]
         parts += [f"the {o.object} is {o.target_region}" for o in visible[: 2 - len(parts)]]
         if answer is not None:
             parts.append(

@@ -107,8 +107,8 @@ def _collect_rejections(responses: Iterable[Rationale]) -> dict[str, list[tuple[
     for response in responses:
         # A response with several numbers counts once under "number".
         for kind in rejection_kinds(response):
-            detail = next(r for r in response.reasons if r.partition(":")[0] == kind)
-            details[kind].append((response.item_id, detail.removeprefix(f"{kind}:").strip()))
+            reason = next(r for r in response.reasons if r.partition(":")[0] == kind)
+            details[kind].append((response.item_id, reason.partition(":")[2].strip()))
     return dict(sorted(details.items(), key=lambda pair: (-len(pair[1]), pair[0])))
 
 

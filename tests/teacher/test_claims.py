@@ -1,5 +1,6 @@
 """Claims of rationales: false ones are contradicted, true ones are not.
 
+facts.json has predicates, FACTS.
 claims.txt has sentences about FACTS, each with its truth and the letter of its section.
 claim_verdicts.jsonl has sentences about FACTS with the verdict on each claim.
 prose.jsonl has rationales by a language model, with the predicates in their prompts.
@@ -14,16 +15,7 @@ import pytest
 from benchmarks.experiments.mutations import MUTATIONS, parse_predicates
 from conf.schema import TeacherConfig
 from teacher.narrator import write_rationale
-from teacher.predicates import (
-    OUT_OF_VIEW,
-    CandidateFacts,
-    Closeness,
-    Difference,
-    Meeting,
-    ObjectFacts,
-    Predicates,
-    extract_predicates,
-)
+from teacher.predicates import extract_predicates
 from teacher.reading.phrases import PHRASES
 from teacher.sections import SECTIONS
 from teacher.validation.claim_extraction import extract_claims
@@ -31,48 +23,8 @@ from teacher.validation.validator import validate_rationale
 
 HERE = Path(__file__).parent
 SECTION = {"S": SECTIONS[0], "M": SECTIONS[1], "P": SECTIONS[2], "C": SECTIONS[3], "O": SECTIONS[4]}
-RED, BLUE, GREEN = "red metal cube", "blue rubber sphere", "green metal sphere"
-GRAY, PURPLE, CYAN = "gray rubber cylinder", "purple metal cylinder", "cyan rubber cube"
-LEFT, CENTER, RIGHT = "near the left", "near the center", "near the right"
-TOP_LEFT, TOP_RIGHT = "near the top-left", "near the top-right"
-BOTTOM, BOTTOM_LEFT = "near the bottom", "near the bottom-left"
-ACROSS, SHIFTS, SHOWN = "moves across", "shifts slightly", "shown"
-HIT = Meeting((RED, BLUE), "imminent")
-A = (
-    Difference(RED, "region", region=LEFT),
-    Difference(BLUE, "displaced", heading="west", extent="clearly"),
-)
-C = (Difference(RED, "missing"), Difference("yellow rubber cube", "extra"))
-D = (
-    Difference(GREEN, "displaced", heading="north", extent="slightly"),
-    Difference(CYAN, "extra"),
-)
-FACTS = Predicates(
-    instant="just before the contact",
-    moment="at the target moment",
-    objects=(
-        ObjectFacts(RED, LEFT, SHOWN, "quickly", "east", CENTER, SHOWN, ACROSS, "east"),
-        ObjectFacts(BLUE, CENTER, SHOWN, "stationary", None, RIGHT, SHOWN, SHIFTS, "southeast"),
-        ObjectFacts(GREEN, TOP_RIGHT, SHOWN, "slowly", "southwest",
-                    TOP_RIGHT, SHOWN, SHIFTS, "southwest"),
-        ObjectFacts(GRAY, BOTTOM, SHOWN, "stationary", None, BOTTOM, SHOWN, "stays", None),
-        ObjectFacts(PURPLE, OUT_OF_VIEW, OUT_OF_VIEW, None, None,
-                    BOTTOM_LEFT, SHOWN, ACROSS, "north"),
-        ObjectFacts(CYAN, TOP_LEFT, SHOWN, "steadily", "west",
-                    OUT_OF_VIEW, OUT_OF_VIEW, ACROSS, "west"),
-    ),
-    entering=(PURPLE,),
-    leaving=(CYAN,),
-    courses=(HIT, Meeting((GREEN, BLUE), None)),
-    contacts=(HIT,),
-    close=(Closeness((RED, BLUE), CENTER),),
-    candidates=(
-        CandidateFacts("A", False, False, A),
-        CandidateFacts("B", True, False, ()),
-        CandidateFacts("C", False, True, C),
-        CandidateFacts("D", False, False, D),
-    ),
-)  # fmt: skip
+RED, BLUE = "red metal cube", "blue rubber sphere"
+FACTS = parse_predicates(json.loads((HERE / "facts.json").read_text()))
 CASES = [line.split(" ", 2) for line in (HERE / "claims.txt").read_text().splitlines()]
 VERDICTS = [json.loads(line) for line in (HERE / "claim_verdicts.jsonl").read_text().splitlines()]
 PROSE = [json.loads(line) for line in (HERE / "prose.jsonl").read_text().splitlines()]
@@ -109,11 +61,7 @@ def test_ambiguous_pronoun_is_not_resolved():
         ("S", "The {0} is near the top.", "The {0} recalls somebody near the top."),
         ("S", "The {0} heads west.", "The {0} meets the {1} and heads west."),
         ("C", "Candidate B lacks the {0}.", "Candidate B lacks others, ones unlike the {0}."),
-        (
-            "C",
-            "Candidate D agrees.",
-            "Candidate D is off; with candidate B, everything agrees.",
-        ),
+        ("C", "Candidate D agrees.", "Candidate D is off; with candidate B, everything agrees."),
     ],
 )
 def test_ambiguous_claims_are_not_contradicted(section, plain, ambiguous):
