@@ -28,8 +28,8 @@ class CandidateReader(TopicReader):
         """Choose the candidate of an outcome that names only one and no error in it."""
         named = {str(t.value) for t in self.sentence if t.tag == "candidate"}
         wrong = {c.candidate for c in self.found if c.kind == "agrees" and not c.affirmed}
-        told = any(c.candidate == letter for c in self.found)
-        if not told and named <= wrong | {letter}:
+        described = any(c.candidate == letter for c in self.found)
+        if not described and named <= wrong | {letter}:
             tag = self.choice or self.sentence[-1]
             self.found.append(self.claim("agrees", (), "", True, TARGET, tag, letter))
 
@@ -40,7 +40,7 @@ class CandidateReader(TopicReader):
             return
         if not self.objects:
             if not (self.expected or self.negated):
-                self.tell_of_any("region", tag)
+                self.add_claim_of_any("region", tag)
             return
         if self.expected or self.negated:
             affirmed = self.contrasted or not (self.expected and self.negated)
@@ -49,20 +49,20 @@ class CandidateReader(TopicReader):
                     self.claim("region", (name,), str(tag.value), affirmed, TARGET, tag)
                 )
         else:
-            self.tell("region", str(tag.value), True, tag)
+            self.add_claim("region", str(tag.value), True, tag)
 
     on_into = on_region
 
     def on_direction(self, tag: Tag) -> None:
         if self.word(self.near(-1)) != "from" and not self.expected and not self.negated:
             if self.objects:
-                self.tell("displaced", str(tag.value), True, tag)
+                self.add_claim("displaced", str(tag.value), True, tag)
             elif self.near(-1).tag in ("off", "slight", "clear"):
-                self.tell_of_any("displaced", tag)
+                self.add_claim_of_any("displaced", tag)
 
     def on_off(self, tag: Tag) -> None:
         if not self.expected:
-            self.tell("displaced", "", not self.negated, tag)
+            self.add_claim("displaced", "", not self.negated, tag)
 
     def on_misplace(self, tag: Tag) -> None:
         self.moving = not self.negated
@@ -77,7 +77,7 @@ class CandidateReader(TopicReader):
     def _extent(self, extent: str, tag: Tag) -> None:
         beside = (self.near(1).tag, self.near(-1).tag)
         if not self.expected and not self.negated and {"off", "direction"} & set(beside):
-            self.tell("displaced", extent, True, tag)
+            self.add_claim("displaced", extent, True, tag)
 
     def on_lack(self, tag: Tag) -> None:
         if not self.negated and not self.skipped:
@@ -102,18 +102,18 @@ class CandidateReader(TopicReader):
         if self.near(1).tag == "object":
             self.lacking = not self.negated
         elif not self.expected:
-            self.tell("lacks", "", not self.negated, tag)
+            self.add_claim("lacks", "", not self.negated, tag)
 
     def on_out(self, tag: Tag) -> None:
         if not self.expected:
-            self.tell("lacks", "", not self.negated, tag)
+            self.add_claim("lacks", "", not self.negated, tag)
 
     on_hidden = on_out
     on_unseen = on_out
 
     def on_extra(self, tag: Tag) -> None:
         if self.objects:
-            self.tell("extra", "", True, tag)
+            self.add_claim("extra", "", True, tag)
         else:
             self.adding = True
 
@@ -124,7 +124,7 @@ class CandidateReader(TopicReader):
         if self.lacking or self.near(1).tag in ("region", "off", "direction", "expected"):
             self.lacking = False
         elif not self.skipped:
-            self.whole("other objects", not self.negated, tag)
+            self.add_candidate_claim("other objects", not self.negated, tag)
         self.objects, self.adding = [], False
 
     # Claims about a whole candidate.
@@ -138,7 +138,7 @@ class CandidateReader(TopicReader):
         elif not self.letters:
             self.passing = not self.negated and not (self.lasting and self.objects)
         elif not self.objects and not self._partial():
-            self.whole("agrees", not (self.negated or self.refused), tag)
+            self.add_candidate_claim("agrees", not (self.negated or self.refused), tag)
 
     def _is_choice_ahead(self) -> bool:
         """Whether the candidate named next is the one that agrees: "the answer is therefore B"."""
@@ -162,7 +162,7 @@ class CandidateReader(TopicReader):
             self.objects, self.skipped = [], True
             return
         if not self.objects and not self.negated and not self.lacking:
-            self.whole("agrees", False, tag)
+            self.add_candidate_claim("agrees", False, tag)
 
     def _is_between(self) -> bool:
         """Whether the candidates differ from each other."""

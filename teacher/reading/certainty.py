@@ -97,7 +97,7 @@ class Sentence:
         while ahead < len(self.tags) and self.tags[ahead].tag == "by":
             ahead += 1
         following = self.tags[ahead : ahead + 1]
-        return not any(_is_strange(tag) or tag.tag == "show" for tag in following)
+        return not any(_is_unknown_word(tag) or tag.tag == "show" for tag in following)
 
     def _is_named_last(self, letter: str | None, at: int) -> bool:
         last = at
@@ -127,7 +127,7 @@ class Sentence:
             return False
         back = at
         while back >= 0 and self.tags[back].tag not in NAMING:
-            if self.tags[back].tag in ("semicolon", "break") or _is_strange(self.tags[back]):
+            if self.tags[back].tag in ("semicolon", "break") or _is_unknown_word(self.tags[back]):
                 return False
             back -= 1
         return True
@@ -137,18 +137,18 @@ class Sentence:
         for name in claim.subjects:
             spots += self._nearest(name, at)
         following = self.tags[max(spots) + 1 : max(spots) + 2]
-        if len(claim.subjects) < 2 and any(map(_is_strange, following)):
+        if len(claim.subjects) < 2 and any(map(_is_unknown_word, following)):
             # "Touches nothing" and similar phrases.
             return False
         between = self.tags[min(spots) : max(spots) + 1]
-        told = self.tags[: max(spots) + 1]
-        return not any(map(_is_strange, between)) and not self._is_pronoun_open(claim, told)
+        opening = self.tags[: max(spots) + 1]
+        return not any(map(_is_unknown_word, between)) and not self._is_pronoun_open(claim, opening)
 
-    def _is_pronoun_open(self, claim: Claim, told: Sequence[Tag]) -> bool:
+    def _is_pronoun_open(self, claim: Claim, opening: Sequence[Tag]) -> bool:
         """Whether an "it" may refer to an object outside the claim."""
-        names = {name for t in told for name in self.bound.get(t.start, ())}
+        names = {name for t in opening for name in self.bound.get(t.start, ())}
         pronoun = any(
-            t.tag == "pronoun" and self.text[t.start : t.stop].lower() == "it" for t in told
+            t.tag == "pronoun" and self.text[t.start : t.stop].lower() == "it" for t in opening
         )
         return pronoun and not names <= set(claim.subjects)
 
@@ -160,7 +160,7 @@ class Sentence:
         if claim.kind == "lacks":
             return following.tag not in COMPARED and str(following.value) != "too"
         takes_object = claim.kind == "sight" and following.tag == "object"
-        return not (claim.kind in ("region", "sight") and _is_strange(following)) and not (
+        return not (claim.kind in ("region", "sight") and _is_unknown_word(following)) and not (
             takes_object and any(i < at for i in self.places.get(claim.subjects[0], ()))
         )
 
@@ -177,22 +177,22 @@ class Sentence:
         after = [i for i in self.places.get(name, []) if i > at]
         if not before and not after:
             # The previous sentence named it, and this one names no other object.
-            return not any(t.tag == "object" or _is_strange(t) for t in self.tags[:at])
-        return bool(before and self._is_told_after(before[-1], at)) or bool(
-            after and self._is_told_ahead(at, after[0])
+            return not any(t.tag == "object" or _is_unknown_word(t) for t in self.tags[:at])
+        return bool(before and self._follows_subject(before[-1], at)) or bool(
+            after and self._precedes_subject(at, after[0])
         )
 
-    def _is_told_after(self, spot: int, at: int) -> bool:
+    def _follows_subject(self, spot: int, at: int) -> bool:
         between = _without_aside(self.tags[spot + 1 : at])
-        return not any(map(_is_strange, between)) and _is_one_list(between)
+        return not any(map(_is_unknown_word, between)) and _is_one_list(between)
 
-    def _is_told_ahead(self, at: int, spot: int) -> bool:
+    def _precedes_subject(self, at: int, spot: int) -> bool:
         """Whether the claim opens the clause and its subject follows."""
         between = self.tags[at + 1 : spot]
         first = next((i for i, t in enumerate(between) if t.tag == "object"), len(between))
         if any(t.tag in ("semicolon", "stop", "and", "break") for t in between[:first]):
             return False
-        return not any(map(_is_strange, between)) and _is_one_list(between)
+        return not any(map(_is_unknown_word, between)) and _is_one_list(between)
 
     def _is_negation_plain(self, claim: Claim, at: int) -> bool:
         if claim.affirmed:
@@ -227,7 +227,7 @@ class Sentence:
         return [i for i in places if i < at][-1:] or places[:1]
 
 
-def _is_strange(tag: Tag) -> bool:
+def _is_unknown_word(tag: Tag) -> bool:
     return tag.tag == "word" and tag.value not in PLAIN
 
 

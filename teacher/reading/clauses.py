@@ -7,9 +7,9 @@ from teacher.reading.pairs import PairReader
 from teacher.reading.reader import BOUNDARIES, Names
 from teacher.reading.tagging import Tag
 
-SAID = {"from", "region", "direction", "speed", "still", "moving", "rest", "out", "hidden"}
+PRECEDING = {"from", "region", "direction", "speed", "still", "moving", "rest", "out", "hidden"}
 """Tags of claims that may precede the name of their object."""
-OPENING = SAID | {"into", "toward", "slight", "word", "by", "be", "comma", "pronoun", "future"}
+OPENING = PRECEDING | {"into", "toward", "slight", "word", "by", "be", "comma", "pronoun", "future"}
 OPENING |= {"expected"}
 """Tags allowed between the start of a clause and a late subject."""
 WAS = {"was", "were", "had"}
@@ -99,9 +99,14 @@ class ClauseReader(PairReader):
                 return
             step += 1
         if step > 1 and self.near(step - 1).tag not in ("by", "with"):
-            said = any(self.near(k).tag in SAID for k in range(1, step))
-            if said and self.near(step).tag == "object":
-                self.subjects, self.finite, self.blocked, self.nobody = [], False, False, False
+            precedes = any(self.near(k).tag in PRECEDING for k in range(1, step))
+            if precedes and self.near(step).tag == "object":
+                self.subjects, self.finite, self.blocked, self.denied_subject = (
+                    [],
+                    False,
+                    False,
+                    False,
+                )
 
     # Function words.
 
@@ -150,12 +155,12 @@ class ClauseReader(PairReader):
     def verb(self) -> None:
         if self.crossed:
             self.blocked = False
-        if self.subjects or self.nobody:
+        if self.subjects or self.denied_subject:
             self.finite = True
 
     # Claims about the subject.
 
-    def tell(
+    def add_claim(
         self,
         kind: str,
         value: str,
@@ -168,7 +173,7 @@ class ClauseReader(PairReader):
             return
         if subjects is None:
             if not self.subjects:
-                if not self.nobody:
+                if not self.denied_subject:
                     self.pending.append((kind, value, affirmed, when, tag))
                 return
             # Before the verb, "the A and the B near the top" may speak of the B alone.

@@ -37,10 +37,10 @@ class Claim(NamedTuple):
     certain: bool = True
 
     def __str__(self) -> str:
-        told = [self.kind, *([] if self.affirmed else ["not"]), self.value.lstrip(COARSE)]
+        words = [self.kind, *([] if self.affirmed else ["not"]), self.value.lstrip(COARSE)]
         names = " and ".join(self.subjects)
         where = f"in {self.candidate}" if self.candidate else ""
-        return " ".join(filter(None, (*told, f"({names})" if names else "", where)))
+        return " ".join(filter(None, (*words, f"({names})" if names else "", where)))
 
 
 class Ground:
@@ -96,9 +96,9 @@ class Ground:
         is then false whatever its subject is."""
         if claim.kind not in ("region", "direction") or not claim.affirmed:
             return None
-        told = [OBJECTS[claim.kind](o, claim.value, EITHER) for o in self.objects.values()]
+        truths = [OBJECTS[claim.kind](o, claim.value, EITHER) for o in self.objects.values()]
         near = claim.kind == "region" and any(_same(claim.value, r) for r in self.close.values())
-        return False if set(told) == {False} and not near else None
+        return False if set(truths) == {False} and not near else None
 
     def _of_none_shown(self, claim: Claim) -> bool | None:
         """False for a region or a displacement that no object of a candidate has."""
@@ -108,13 +108,13 @@ class Ground:
         if claim.kind == "displaced":
             if claim.value.lstrip(COARSE) not in COMPASS or any(d.kind == "region" for d in found):
                 return None
-            told = [_same(claim.value, d.heading) for d in found if d.heading]
+            truths = [_same(claim.value, d.heading) for d in found if d.heading]
         else:
             # The words may also describe where an object should be.
-            told = [_region(o, claim.value, EITHER) for o in self.objects.values()]
-            told += [_same(claim.value, d.region) for d in found if d.region]
-            told += [None for d in found if d.kind == "extra"]
-        return False if set(told) <= {False} else None
+            truths = [_region(o, claim.value, EITHER) for o in self.objects.values()]
+            truths += [_same(claim.value, d.region) for d in found if d.region]
+            truths += [None for d in found if d.kind == "extra"]
+        return False if set(truths) <= {False} else None
 
 
 def _mention(ground: Ground, claim: Claim) -> bool:

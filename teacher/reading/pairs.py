@@ -22,7 +22,7 @@ class Relation:
     value: str
     affirmed: bool
     subjects: Names
-    nobody: bool
+    denied_subject: bool
     partners: Names = field(default_factory=list)
     between: bool = False
 
@@ -44,7 +44,7 @@ class PairReader(Reader):
 
     def begin_pairs(self) -> None:
         self.subjects = []
-        self.nobody = False
+        self.denied_subject = False
         """Whether the subject is a phrase such as "no pair"."""
         self.relation: Relation | None = None
         self.time: tuple[str, Tag] | None = None
@@ -123,7 +123,7 @@ class PairReader(Reader):
         if self.relation is None and time:
             self.time = time
         self.relation = Relation(
-            kind, tag, value, affirmed and not self.maybe, list(self.subjects), self.nobody
+            kind, tag, value, affirmed and not self.maybe, list(self.subjects), self.denied_subject
         )
         if self.companions and self.near(1).tag not in ("object", "by", "with"):
             # "Its course with the B ends without contact."
@@ -148,7 +148,7 @@ class PairReader(Reader):
         if relation.between:
             return [tuple(relation.partners)] if len(relation.partners) == 2 else []
         if relation.partners:
-            if relation.nobody:
+            if relation.denied_subject:
                 return [(name,) for name in relation.partners]
             return [(a, b) for a in relation.subjects for b in relation.partners]
         if len(relation.subjects) <= 2:
@@ -163,22 +163,22 @@ class PairReader(Reader):
             self.time = None
         if relation is None or self.maybe:
             return
-        affirmed = relation.affirmed and not relation.nobody
+        affirmed = relation.affirmed and not relation.denied_subject
         when = CUT if self.moment == CUT else TARGET if relation.kind == "close" else BETWEEN
         if relation.kind == "close" and self.moment == EITHER and not self.future:
             when = EITHER
         if not affirmed and when == BETWEEN and self.is_limited():
             when = TARGET
         pairs = self._pairs(relation)
-        if relation.nobody and not pairs and relation.kind == "course":
+        if relation.denied_subject and not pairs and relation.kind == "course":
             pairs = [()]
         for pair in pairs:
             alone = len(pair) == 1
             if alone and (relation.kind == "close" or not (affirmed or relation.kind == "course")):
                 continue
-            self._hold(relation, pair, affirmed, when, time)
+            self._record(relation, pair, affirmed, when, time)
 
-    def _hold(
+    def _record(
         self,
         relation: Relation,
         pair: tuple[str | None, ...],

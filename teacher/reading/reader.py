@@ -11,7 +11,7 @@ from teacher.reading.tagging import Noun, Tag
 
 BOUNDARIES = {"comma", "semicolon", "and", "break", "stop"}
 END = Tag("stop", "", 0, 0)
-MOST = 9
+MAX_OBJECTS = 9
 """The largest number of objects tracked at a time."""
 
 Names = list[str | None]
@@ -76,7 +76,7 @@ class Reader:
         names = () if None in subjects else subjects
         return Claim(kind, names, value, affirmed, when, candidate, (span.start, span.stop))
 
-    def group(self, most: int = MOST) -> tuple[list[str | None], Tag]:
+    def group(self, most: int = MAX_OBJECTS) -> tuple[list[str | None], Tag]:
         """The listed objects from the current tag on, and the last tag; moves the cursor there.
         "The A, the B and the C" is a list, "the A, the B" is not."""
         ends = [self.at]
@@ -116,11 +116,11 @@ class Reader:
         """The claims without those that give several objects several values of one kind, since each
         value then belongs to one object ("near the top and near the left, respectively")."""
         for kind in {s[0] for s in self.shared} & {"region", "direction", "speed", "displaced"}:
-            told = [
+            several = [
                 s for s in self.shared if s[0] == kind and s[1] not in ("", "slightly", "clearly")
             ]
-            for subjects in {s[2] for s in told}:
-                values = [s for s in told if s[2] == subjects]
+            for subjects in {s[2] for s in several}:
+                values = [s for s in several if s[2] == subjects]
                 if len({s[1] for s in values}) < 2:
                     continue
                 spans = {(s[3].start, s[3].stop): i for i, s in enumerate(values)}

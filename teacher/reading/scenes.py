@@ -30,7 +30,7 @@ class SceneReader(SubjectReader):
                 self.close_region(relation, tag)
             return
         if self.negated and self._is_kept(tag):
-            self.tell("region", str(tag.value), True, EITHER, tag)
+            self.add_claim("region", str(tag.value), True, EITHER, tag)
             return
         if self.negated and self.near(-1).tag not in ("not", "be", "future", "contrast"):
             return
@@ -56,7 +56,7 @@ class SceneReader(SubjectReader):
             elif self.near(-1).tag == "object" and self.moment == TARGET:
                 # "The A near the top will be near the left."
                 when = EITHER
-        self.tell("region", str(tag.value), not self.negated, when, tag)
+        self.add_claim("region", str(tag.value), not self.negated, when, tag)
 
     def _is_kept(self, tag: Tag) -> bool:
         """Whether a negation keeps a region true: "has not moved from near the top", "does not
@@ -92,14 +92,14 @@ class SceneReader(SubjectReader):
             # "Toward the east, the A shifts slightly" describes the path from cut to target.
             ahead = not self.subjects and any(t.tag in ("slight", "across") for t in self.sentence)
             when = BETWEEN if self.slight or ahead else EITHER
-        self.tell("direction", str(tag.value), not self.negated, when, tag)
+        self.add_claim("direction", str(tag.value), not self.negated, when, tag)
 
     def on_speed(self, tag: Tag) -> None:
         following = self.near(1).tag
         moving = self.moved or following in ("moves", "moving", "across")
         if not moving or self.relation or following in RELATIONS:
             return
-        self.tell("speed", str(tag.value), not self.negated, CUT, tag)
+        self.add_claim("speed", str(tag.value), not self.negated, CUT, tag)
 
     def on_still(self, tag: Tag) -> None:
         if "not" in self.word(tag).split() and self.near(1).tag in ("direction", "speed"):
@@ -114,7 +114,7 @@ class SceneReader(SubjectReader):
             when = BETWEEN
         elif when == TARGET:
             when = EITHER
-        self.tell("still", "", not self.negated, when, tag)
+        self.add_claim("still", "", not self.negated, when, tag)
 
     def on_rest(self, tag: Tag) -> None:
         if self.near(1).tag in BOUNDARIES:
@@ -132,7 +132,7 @@ class SceneReader(SubjectReader):
         self.slight |= self.word(tag) in ("moved", "traveled", "travelled", "rolled")
         if self.negated and self.near(1).tag in BOUNDARIES:
             when = CUT if self.moment == CUT else EITHER
-            self.tell("still", "", True, when, tag)
+            self.add_claim("still", "", True, when, tag)
 
     def on_off(self, tag: Tag) -> None:
         self.moved = True
@@ -140,12 +140,12 @@ class SceneReader(SubjectReader):
     def on_slight(self, tag: Tag) -> None:
         if self.moved or self.near(1).tag in ("moves", "moving", "off"):
             self.slight = True
-            self.tell("extent", "shifts slightly", not self.negated, BETWEEN, tag)
+            self.add_claim("extent", "shifts slightly", not self.negated, BETWEEN, tag)
 
     def on_across(self, tag: Tag) -> None:
         self.moved = self.slight = True
         self.verb()
-        self.tell("extent", "moves across", not self.negated, BETWEEN, tag)
+        self.add_claim("extent", "moves across", not self.negated, BETWEEN, tag)
 
     def on_put(self, tag: Tag) -> None:
         clause = self.word(tag).split()[0] in ("where", "in", "as", "nearly", "almost", "roughly")
@@ -155,7 +155,7 @@ class SceneReader(SubjectReader):
                 self.on_still(tag)
                 return
             value = COARSE if tag.value == COARSE else "stays"
-            self.tell("extent", value, not self.negated, BETWEEN, tag)
+            self.add_claim("extent", value, not self.negated, BETWEEN, tag)
 
     def on_leaves(self, tag: Tag) -> None:
         self.verb()
@@ -169,7 +169,7 @@ class SceneReader(SubjectReader):
     def _event(self, kind: str, tag: Tag) -> None:
         # An event that has not happened by the cut may happen later.
         when = CUT if self.negated and self.moment == CUT and not self.future else BETWEEN
-        self.tell(kind, "", not self.negated, when, tag)
+        self.add_claim(kind, "", not self.negated, when, tag)
 
     def on_enters(self, tag: Tag) -> None:
         self.verb()
@@ -198,4 +198,4 @@ class SceneReader(SubjectReader):
         when = TARGET if self.future else self.moment
         if self.past or self.near(-1).tag == "by" or self._is_former():
             when = EITHER
-        self.tell("sight", value, not self.negated, when, tag)
+        self.add_claim("sight", value, not self.negated, when, tag)

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 from teacher.reading.clauses import ClauseReader
 from teacher.reading.pairs import RELATIONS
-from teacher.reading.reader import BOUNDARIES, END, MOST, Names
+from teacher.reading.reader import BOUNDARIES, END, MAX_OBJECTS, Names
 from teacher.reading.tagging import Tag
 
 VERBS = {"be", "moves", "stays", "rest", "future", "across", "leaves", "enters", "still", "past"}
@@ -40,20 +40,25 @@ class SubjectReader(ClauseReader):
             self.inner = previous.tag != "which"
             # The claims in "the A, which the B hits" are ambiguous.
             self.subjects, self.group_start = self.last if self.inner else [None], 0
-            self.finite = self.blocked = self.nobody = self.gapped = False
+            self.finite = self.blocked = self.denied_subject = self.gapped = False
             self.pending = []
             return
-        fresh = self.finite or not self.subjects or self.nobody
+        fresh = self.finite or not self.subjects or self.denied_subject
         fresh |= self.pronominal or self.gapped
         # "Near the top is the A, and the B ..." states the place of the A only.
-        names, _ = self.group(1 if self.pending and self._parted() else MOST)
-        self.subjects = names if fresh else [*self.subjects, *names][-MOST:]
+        names, _ = self.group(1 if self.pending and self._parted() else MAX_OBJECTS)
+        self.subjects = names if fresh else [*self.subjects, *names][-MAX_OBJECTS:]
         self.group_start = 0 if fresh else max(0, len(self.subjects) - len(names))
         self.last = names[-1:]
         # "With the A at rest, the B ...": the clause of the A ends with the comma.
         self.absolute = previous.tag == "with"
         inverted = bool(self.pending) and previous.tag in INVERTED
-        self.finite, self.blocked, self.nobody, self.complement = inverted, False, False, False
+        self.finite, self.blocked, self.denied_subject, self.complement = (
+            inverted,
+            False,
+            False,
+            False,
+        )
         self.pronominal = self.gapped = False
         if relation and not relation.subjects:
             relation.subjects = self.subjects
@@ -76,7 +81,7 @@ class SubjectReader(ClauseReader):
         """Apply the claims that precede the subject to it."""
         for pending in self.pending:
             if places or pending[0] != "region":
-                self.tell(*pending, subjects=self.subjects)
+                self.add_claim(*pending, subjects=self.subjects)
         self.pending = []
 
     def _is_pair_ahead(self) -> bool:
@@ -100,7 +105,7 @@ class SubjectReader(ClauseReader):
     def _complement(self) -> None:
         start = self.at
         # "Meets the A, and the B ...": the B begins a clause.
-        names, _ = self.group(1 if self._parted() else MOST)
+        names, _ = self.group(1 if self._parted() else MAX_OBJECTS)
         if len(names) > 1 and self.near(1).tag in VERBS | {"not", "word", "show", "speed"}:
             # "meets the A and the B stays": the B is a new subject.
             self.at = start
@@ -152,7 +157,7 @@ class SubjectReader(ClauseReader):
         self.subjects = [None] if self._is_ahead() else self._antecedent(str(tag.value))
         self.pronominal, self.gapped = True, False
         self.group_start = 0
-        self.finite = self.blocked = self.nobody = False
+        self.finite = self.blocked = self.denied_subject = False
         self._settle(places=False)
 
     def _listed(self, previous: Tag) -> Names:
@@ -198,7 +203,7 @@ class SubjectReader(ClauseReader):
             # "Has crossed the scene."
             return
         self.subjects, self.group_start = [None], 0
-        self.finite = self.blocked = self.nobody = False
+        self.finite = self.blocked = self.denied_subject = False
 
     def on_all(self, tag: Tag) -> None:
         self.on_rest_of(tag)
@@ -216,7 +221,7 @@ class SubjectReader(ClauseReader):
         if self.near(-1).tag in RELATIONS | {"by", "with"}:
             self.relation = None
             return
-        self.subjects, self.nobody, self.finite, self.pending = [], True, False, []
+        self.subjects, self.denied_subject, self.finite, self.pending = [], True, False, []
 
     def on_candidate(self, tag: Tag) -> None:
         self.subjects = [None]

@@ -10,7 +10,7 @@ COMPARED = {"of", "as", "like", "with", "what", "to", "does", "same"}
 """Words before a candidate that serves only as a comparison."""
 ASIDE = {"unlike", "like", "than", "besides", "beyond", "except"}
 """Words before a candidate that is never the topic."""
-TELLING = {"lack", "gone", "show", "stays", "misplace", "adds"}
+LISTED_AFTER = {"lack", "gone", "show", "stays", "misplace", "adds"}
 """Tags after which an object is one that the candidate shows or lacks."""
 COMPARING = {
     *("compared", "comparison", "similar", "similarly", "identical", "equal", "relative", "akin"),
@@ -131,7 +131,7 @@ class TopicReader(Reader):
             self.expected = self.contrasted = self.negated = False
             self.clause = len(self.found)
             if self.passing:
-                self.whole("agrees", not self.refused, tag)
+                self.add_candidate_claim("agrees", not self.refused, tag)
                 self.passing = False
 
     def _put_down_to(self, letters: tuple[str, ...]) -> None:
@@ -201,9 +201,9 @@ class TopicReader(Reader):
             self.objects = []
             return
         denied = self.near(-1).tag == "not" and self.letters != ()
-        start, told = self.at, self.near(-1).tag in TELLING
+        start, listed = self.at, self.near(-1).tag in LISTED_AFTER
         names, last = self.group()
-        if told and len(names) > 1 and self.near(1).tag in ("be", "stays", "moves", "gone"):
+        if listed and len(names) > 1 and self.near(1).tag in ("be", "stays", "moves", "gone"):
             # "A lacks the X, and the Y is ...": the Y begins a new clause.
             self.at = start
             names, last = self.group(1)
@@ -214,12 +214,12 @@ class TopicReader(Reader):
         if self.skipped:
             return
         if self.lacking:
-            self.tell("lacks", "", True, last)
+            self.add_claim("lacks", "", True, last)
             self.objects = []
         elif self.adding and self.near(1).tag not in ("slight", "clear", "off", "direction"):
-            self.tell("extra", "", True, last)
+            self.add_claim("extra", "", True, last)
         elif self.moving:
-            self.tell("displaced", "", True, last)
+            self.add_claim("displaced", "", True, last)
         self.lacking = self.adding = self.moving = self.negated = False
 
     def on_pronoun(self, tag: Tag) -> None:
@@ -258,7 +258,7 @@ class TopicReader(Reader):
 
     # Claims about the topic.
 
-    def tell(self, kind: str, value: str, affirmed: bool, tag: Tag) -> None:
+    def add_claim(self, kind: str, value: str, affirmed: bool, tag: Tag) -> None:
         if self.skipped or self.refused:
             return
         for name in self.objects:
@@ -267,12 +267,12 @@ class TopicReader(Reader):
         if len(self.objects) > 1 and affirmed:
             self.shared.append((kind, value, tuple(self.objects), tag))
 
-    def tell_of_any(self, kind: str, tag: Tag) -> None:
+    def add_claim_of_any(self, kind: str, tag: Tag) -> None:
         """Record a claim about an ambiguous object of a candidate."""
         for letter in () if self.refused or self.skipped else self.letters:
             self.found.append(self.claim(kind, (), str(tag.value), True, TARGET, tag, letter))
 
-    def whole(self, kind: str, affirmed: bool, tag: Tag) -> None:
+    def add_candidate_claim(self, kind: str, affirmed: bool, tag: Tag) -> None:
         if not self.skipped:
             for letter in self.letters:
                 self.found.append(self.claim(kind, (), "", affirmed, TARGET, tag, letter))
