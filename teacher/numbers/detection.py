@@ -139,10 +139,8 @@ def _scan(text: str) -> Spans:
     if max(map(len, words), default=0) > MAX_LETTERS:
         words = [word[:MAX_LETTERS] for word in words]
     for index, rule in enumerate(map(rule_of, words)):
-        if rule is not None:
-            stated = rule(prose, index)
-            if stated is not None:
-                spans.append(prose.span(*stated))
+        if rule is not None and (number := rule(prose, index)) is not None:
+            spans.append(prose.span(*number))
     return spans
 
 

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from transformers import PreTrainedTokenizerFast
 
 SPECIAL = ("<|endoftext|>", "<|im_start|>", "<|im_end|>")
 TEMPLATE = (
@@ -50,7 +46,7 @@ def save_tiny_qwen3(folder: Path, texts: Iterable[str], vocabulary: int = 1024) 
     return folder
 
 
-def _tokenizer(texts: Iterable[str], vocabulary: int) -> PreTrainedTokenizerFast:
+def _tokenizer(texts: Iterable[str], vocabulary: int):
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
     from transformers import PreTrainedTokenizerFast
 
