@@ -57,10 +57,7 @@ class Handler(JsonHandler):
     server: FaultyServer
 
     def get(self) -> None:
-        if self.path == "/health":
-            self.respond(200, {})
-        else:
-            self.respond(200, {"object": "list", "data": [{"id": "other", "object": "model"}]})
+        self.respond(200, {"object": "list", "data": [{"id": "other", "object": "model"}]})
 
     def post(self, request: dict[str, Any]) -> None:
         server, prompt = self.server, request["messages"][-1]["content"]
@@ -75,12 +72,12 @@ class Handler(JsonHandler):
             server.most = max(server.most, server.in_flight)
         time.sleep(server.delay)
         try:
-            self.respond(request, server.texts.get(prompt, "Hello."), fault)
+            self.respond_to_prompt(request, server.texts.get(prompt, "Hello."), fault)
         finally:
             with server.lock:
                 server.in_flight -= 1
 
-    def respond(self, request: dict[str, Any], text: str, fault: Fault | None) -> None:
+    def respond_to_prompt(self, request: dict[str, Any], text: str, fault: Fault | None) -> None:
         if isinstance(fault, int):
             self.respond(fault, {"error": {"message": "fault", "type": "t", "code": fault}})
         elif isinstance(fault, dict):
