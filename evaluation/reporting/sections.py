@@ -175,9 +175,10 @@ def _model_differences(benchmark: str, browser: ItemBrowser) -> list[Table]:
         return []
     overall = tables.paired_table([("", pairs[-1:]) for pairs in comparisons])
     by_family = tables.paired_table([("", pairs) for pairs in comparisons])
+    caption = f"{by_family.caption} by family"
     return [
         _name_table(replace(overall, name="differences"), benchmark),
-        _name_table(replace(by_family, folded=True), benchmark),
+        _name_table(replace(by_family, caption=caption, folded=True), benchmark),
     ]
 
 
