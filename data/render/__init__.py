@@ -13,7 +13,7 @@ from PIL import Image
 
 from data.records import Scene
 from data.render import blender, bullet
-from data.render.appearance import STANDARD_VIEW, View
+from data.world.camera import STANDARD_VIEW, View
 
 
 class Renderer(Protocol):

@@ -1,29 +1,12 @@
-"""Appearance of scenes: camera, light and floor, and the objects' colours, meshes and textures."""
+"""Appearance of objects: colours, meshes and textures."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
-from data.world.camera import STANDARD_CAMERA, Camera
 from data.world.shapes import CUBE_HALF, RADIUS
-
-
-@dataclass(frozen=True)
-class View:
-    """The camera, floor colour and light of scenes."""
-
-    camera: Camera = STANDARD_CAMERA
-    """Its eye must lie in the x-z plane."""
-    floor: tuple[float, float, float] = (158.0, 156.0, 152.0)
-    """RGB colour of the fully lit floor, 0 to 255."""
-    light: tuple[float, float, float] = (3.0, 3.0, 6.0)
-    """Position of the lamp."""
-
-
-STANDARD_VIEW = View()
 
 RGB = {
     "gray": (112, 112, 112),

@@ -19,7 +19,8 @@ from PIL import Image
 
 from conf.errors import UserError
 from data.records import Scene
-from data.render.appearance import RGB, STANDARD_VIEW, View
+from data.render.appearance import RGB
+from data.world.camera import STANDARD_VIEW, View
 from data.world.shapes import CUBE_HALF, RADIUS
 
 BPY = "4.2.23"

@@ -15,9 +15,9 @@ import numpy as np
 from PIL import Image
 
 from data.records import MATERIALS, Scene, SceneObject
-from data.render.appearance import RGB, STANDARD_VIEW, View, mesh, texture
+from data.render.appearance import RGB, mesh, texture
 from data.render.floor import Floor
-from data.world.camera import Camera
+from data.world.camera import STANDARD_VIEW, Camera, View
 from data.world.physics import connect
 
 VERSION = "bullet-1"

@@ -1,4 +1,4 @@
-"""A pinhole camera: projection of points, and rays through pixels."""
+"""A pinhole camera, and the view of scenes: camera, floor and light."""
 
 from __future__ import annotations
 
@@ -46,3 +46,18 @@ class Camera:
 
 
 STANDARD_CAMERA = Camera()
+
+
+@dataclass(frozen=True)
+class View:
+    """The camera, floor colour and light of scenes."""
+
+    camera: Camera = STANDARD_CAMERA
+    """Its eye must lie in the x-z plane."""
+    floor: tuple[float, float, float] = (158.0, 156.0, 152.0)
+    """RGB colour of the fully lit floor, 0 to 255."""
+    light: tuple[float, float, float] = (3.0, 3.0, 6.0)
+    """Position of the lamp."""
+
+
+STANDARD_VIEW = View()

@@ -18,8 +18,7 @@ import numpy as np
 
 from conf.schema import BenchmarkConfig
 from data.records import Scene, SceneObject
-from data.render.appearance import STANDARD_VIEW, View
-from data.world.camera import Camera
+from data.world.camera import STANDARD_VIEW, Camera, View
 from data.world.physics import GENERATOR_VERSION, Body, Physics, shared_simulator
 from data.world.sampling import is_on_screen, record_scene, sample_objects, unit_vector
 from data.world.shapes import RADIUS

@@ -14,9 +14,9 @@ from PIL import Image
 from conf.schema import BenchmarkConfig
 from data.records import Scene
 from data.render import blender, get_renderer
-from data.render.appearance import STANDARD_VIEW
 from data.render.bullet import BulletRenderer
 from data.render.floor import Floor
+from data.world.camera import STANDARD_VIEW
 from data.world.sampling import simulate_scene
 from tests.user_errors import raises_user_error
 
