@@ -34,8 +34,5 @@ def split_sections(text: str) -> list[tuple[str, int, int]]:
 
 def remove_section(text: str, section: str) -> str:
     """The text without one section and its heading."""
-    for heading in HEADING.finditer(text):
-        if heading[1] == section:
-            following = HEADING.search(text, heading.end())
-            return text[: heading.start()] + (text[following.start() :] if following else "")
-    return text
+    body = rf"^{section}:.*?(?={HEADING.pattern}|\Z)"
+    return re.sub(body, "", text, count=1, flags=re.MULTILINE | re.DOTALL)
