@@ -28,11 +28,11 @@ def main(cfg: StudyCommand, run: Run) -> None:
 
     path, links = run.folder / storage.DATABASE, run.folder / auth.LINKS_FILE
     with routes.listen(cfg.host, cfg.port) as listener:
-        if storage.exists(path):
-            db = storage.open_study(path)
-            setup.check_items(cfg, db)
-        else:
+        db = storage.open_study(path)
+        if db is None:
             db = setup.create_study(cfg, path)
+        else:
+            setup.check_items(cfg, db)
         setup.add_missing_media(cfg, db, path)
 
         # Links are secrets: they go to the screen and to their file, not into the run's log.

@@ -6,22 +6,22 @@ undecided and count as wrong.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from data.records import FAMILIES, LETTERS
 from evaluation.metrics.accuracy import accuracy_by_family
-from evaluation.study.storage import Vote
 
 
-def summary(votes: Sequence[Vote], items: int, annotators: Sequence[str]) -> dict[str, Any]:
+def summary(votes: pd.DataFrame, items: int, annotators: Sequence[str]) -> dict[str, Any]:
     """The report of a study, ready for JSON; undefined values are None.
 
     Args:
+        votes: As `storage.read_votes` returns them.
         items: Number of items in the study, answered or not.
         annotators: All annotators, with or without votes.
 
@@ -32,61 +32,55 @@ def summary(votes: Sequence[Vote], items: int, annotators: Sequence[str]) -> dic
         `fleiss_kappa` and its `items`, which all annotators answered; `krippendorff_alpha` and its
         `items`, which have two votes or more; and median `seconds` by family.
     """
-    by_item = _group(votes, "item_id")
-    by_annotator = _group(votes, "annotator")
-    choices = [[vote.choice for vote in of_item] for of_item in by_item.values()]
-    active = [name for name in annotators if name in by_annotator]
-    complete = [c for c in choices if 1 < len(c) == len(active)]
-    several = [c for c in choices if len(c) > 1]
-    depth = Counter(map(len, choices)) + Counter({0: items - len(choices)})
+    counts = count_votes(votes)
+    depth = counts.sum(axis=1)
+    active = [name for name in annotators if name in set(votes.annotator)]
+    complete = counts[(depth == len(active)) & (depth > 1)]
+    several = counts[depth > 1]
+    items_by_depth = {0: items - len(counts), **depth.value_counts()}
+    accuracy = {name: _accuracy(of) for name, of in votes.groupby("annotator")}
     return {
         "items": items,
         "judgments": len(votes),
         "annotators": active,
-        "depth": {str(count): depth[count] for count in sorted(depth)},
-        "accuracy": {name: _accuracy(by_annotator[name]) for name in active},
-        "majority": _majority_accuracy(by_item) if by_item else None,
+        "depth": {str(d): int(n) for d, n in sorted(items_by_depth.items()) if n},
+        "accuracy": {name: accuracy[name] for name in active},
+        "majority": _majority_accuracy(votes, counts) if len(votes) else None,
         "fleiss_kappa": {"value": fleiss_kappa(complete), "items": len(complete)},
         "krippendorff_alpha": {"value": krippendorff_alpha(several), "items": len(several)},
         "seconds": median_seconds(votes),
     }
 
 
-def majority(choices: Sequence[int]) -> int | None:
-    """The choice of more than half; None if there is no such choice."""
-    choice, count = Counter(choices).most_common(1)[0]
-    return choice if 2 * count > len(choices) else None
+def count_votes(votes: pd.DataFrame) -> pd.DataFrame:
+    """(items, 4) votes for each candidate."""
+    counts = pd.crosstab(votes.item_id, votes.choice)
+    return counts.reindex(columns=range(len(LETTERS)), fill_value=0)
 
 
-def fleiss_kappa(items: Sequence[Sequence[int]]) -> float | None:
-    """Fleiss' kappa of items with equal numbers of votes, two or more.
+def majority(counts: pd.DataFrame) -> pd.Series:
+    """The choice of more than half of each item's votes; NaN for an item without one."""
+    return counts.idxmax(axis=1).where(2 * counts.max(axis=1) > counts.sum(axis=1))
 
-    Returns:
-        None where it is undefined: no items, single votes, or all votes for one candidate index.
 
-    Raises:
-        ValueError: the numbers of votes differ.
-    """
+def fleiss_kappa(counts: pd.DataFrame) -> float | None:
+    """Fleiss' kappa of items with equal numbers of votes, two or more; None where it is undefined:
+    no items, or all votes for one candidate index."""
     from statsmodels.stats.inter_rater import fleiss_kappa as kappa
 
-    if not items or len(items[0]) < 2:
-        return None
-    table = _count_choices(items)
-    if len(set(table.sum(axis=1))) > 1:
-        raise ValueError("Fleiss' kappa needs the same number of votes for every item")
-    return None if _is_unanimous(table) else float(kappa(table))
+    return None if _is_undefined(counts) else float(kappa(counts.to_numpy()))
 
 
-def krippendorff_alpha(items: Sequence[Sequence[int]]) -> float | None:
+def krippendorff_alpha(counts: pd.DataFrame) -> float | None:
     """Krippendorff's alpha for nominal votes: one minus the disagreement within items over the
-    disagreement between any two votes. Items may differ in their number of votes.
+    disagreement between any two votes. None where it is undefined, as for Fleiss' kappa.
 
-    Returns:
-        None where it is undefined: no item has two votes, or all are for one candidate index.
+    Args:
+        counts: Items with two votes or more, which may differ in their number of votes.
     """
-    table = _count_choices([choices for choices in items if len(choices) > 1])
-    if not len(table) or _is_unanimous(table):
+    if _is_undefined(counts):
         return None
+    table = counts.to_numpy()
     depth, total = table.sum(axis=1), table.sum(axis=0)
     votes = total.sum()
     # Ordered pairs of unequal votes; a pair within an item weighs one over its other votes.
@@ -95,14 +89,14 @@ def krippendorff_alpha(items: Sequence[Sequence[int]]) -> float | None:
     return float(1 - within / between)
 
 
-def median_seconds(votes: Sequence[Vote]) -> dict[str, dict[str, float | int]]:
+def median_seconds(votes: pd.DataFrame) -> dict[str, dict[str, float | int]]:
     """Median decision times by family and clock, over votes whose page was loaded once: the total
     viewing time of the others is unknown."""
-    by_family = _group([vote for vote in votes if vote.loads == 1], "family")
+    by_family = dict(list(votes[votes.loads == 1].groupby("family")))
     return {
         family: {
-            "server": float(np.median([vote.seconds for vote in by_family[family]])),
-            "client": float(np.median([vote.client_seconds for vote in by_family[family]])),
+            "server": float(by_family[family].seconds.median()),
+            "client": float(by_family[family].client_seconds.median()),
             "votes": len(by_family[family]),
         }
         for family in FAMILIES
@@ -110,30 +104,16 @@ def median_seconds(votes: Sequence[Vote]) -> dict[str, dict[str, float | int]]:
     }
 
 
-def _accuracy(votes: Sequence[Vote]) -> dict[str, Any]:
-    return asdict(accuracy_by_family([vote.family for vote in votes], [v.right for v in votes]))
+def _accuracy(votes: pd.DataFrame) -> dict[str, Any]:
+    return asdict(accuracy_by_family(list(votes.family), list(votes.right)))
 
 
-def _majority_accuracy(by_item: Mapping[str, Sequence[Vote]]) -> dict[str, Any]:
-    decisions = [majority([vote.choice for vote in votes]) for votes in by_item.values()]
-    first = [votes[0] for votes in by_item.values()]
-    correct = [choice == vote.answer for choice, vote in zip(decisions, first, strict=True)]
-    accuracy = accuracy_by_family([vote.family for vote in first], correct)
-    return {**asdict(accuracy), "undecided": decisions.count(None)}
+def _majority_accuracy(votes: pd.DataFrame, counts: pd.DataFrame) -> dict[str, Any]:
+    choices = majority(counts)
+    items = votes.groupby("item_id").first().loc[counts.index]
+    accuracy = accuracy_by_family(list(items.family), list(choices == items.answer))
+    return {**asdict(accuracy), "undecided": int(choices.isna().sum())}
 
 
-def _count_choices(items: Sequence[Sequence[int]]) -> np.ndarray:
-    """(items, 4) votes for each candidate."""
-    rows = [np.bincount(choices, minlength=len(LETTERS)) for choices in items]
-    return np.array(rows, dtype=int).reshape(-1, len(LETTERS))
-
-
-def _is_unanimous(table: np.ndarray) -> bool:
-    return np.count_nonzero(table.sum(axis=0)) == 1
-
-
-def _group(votes: Sequence[Vote], key: str) -> dict[str, list[Vote]]:
-    groups: dict[str, list[Vote]] = defaultdict(list)
-    for vote in votes:
-        groups[getattr(vote, key)].append(vote)
-    return groups
+def _is_undefined(counts: pd.DataFrame) -> bool:
+    return np.count_nonzero(counts.sum(axis=0)) < 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,19 +23,6 @@ class Assignment:
     item_id: str
     rank: int
     order: Order
-
-
-@dataclass(frozen=True)
-class WaitingItem:
-    """An item that an annotator has not opened. `votes` counts the other annotators' answers and
-    recently opened pages."""
-
-    item_id: str
-    family: str
-    scene_id: str
-    prefix_stop: int
-    rank: int
-    votes: int
 
 
 def assign_items(
@@ -76,29 +63,4 @@ def _balanced_orders(items: Sequence[SelectionItem], rng: np.random.Generator) -
 
 def _rotate(order: Order, letters: int) -> Order:
     """The order with every candidate moved on by a number of letters, cyclically."""
-    shift = letters % len(order)
-    return order[-shift:] + order[:-shift] if shift else order
-
-
-def next_item(
-    waiting: Sequence[WaitingItem], opened: Mapping[str, int], total: Mapping[str, int]
-) -> str:
-    """The id of the item that an annotator opens next.
-
-    The families advance evenly, so that an annotator who stops early has answered each in
-    proportion; within a family the item with the fewest votes comes first, so that depth grows
-    evenly. Within a scene the earliest prefix comes first: a later one reveals its outcome.
-
-    Args:
-        waiting: At least one item.
-        opened, total: By family, the items that the annotator has opened, and all items.
-    """
-    earliest: dict[str, int] = {}
-    for item in waiting:
-        stop = earliest.get(item.scene_id, item.prefix_stop)
-        earliest[item.scene_id] = min(item.prefix_stop, stop)
-    best = min(
-        (item for item in waiting if item.prefix_stop == earliest[item.scene_id]),
-        key=lambda item: (opened.get(item.family, 0) / total[item.family], item.votes, item.rank),
-    )
-    return best.item_id
+    return tuple(np.roll(order, letters).tolist())

@@ -1,37 +1,31 @@
-"""Who may do what: sign-in links, sessions, and the refusal of other sites' forms."""
+"""Sign-in links, sessions, and protection against other sites."""
 
 from __future__ import annotations
 
 import hashlib
-import os
 import secrets
 import sqlite3
 from pathlib import Path
-from urllib.parse import urlsplit
 
-from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import PlainTextResponse
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.datastructures import Headers
 
 from evaluation.study.storage import transaction
 
 LINKS_FILE = "links.txt"
-POLICY = "; ".join(
-    [
-        "default-src 'none'",
-        "script-src 'self'",
-        "style-src 'self'",
-        # The script fetches a page's media and shows them from memory.
-        "img-src 'self' blob:",
-        "media-src blob:",
-        "connect-src 'self'",
-        "form-action 'self'",
-        "frame-ancestors 'none'",
-        "base-uri 'none'",
-    ]
+POLICY = (
+    "default-src 'none'",
+    "script-src 'self'",
+    "style-src 'self'",
+    # The script fetches a page's media and shows them from memory.
+    "img-src 'self' blob:",
+    "media-src blob:",
+    "connect-src 'self'",
+    "form-action 'self'",
+    "frame-ancestors 'none'",
+    "base-uri 'none'",
 )
 HEADERS = {
-    "Content-Security-Policy": POLICY,
+    "Content-Security-Policy": "; ".join(POLICY),
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -43,7 +37,7 @@ HEADERS = {
     # An answered item must not be shown again from a cache.
     "Cache-Control": "no-store",
 }
-DEFAULT_PORTS = {"http": 80, "https": 443}
+"""Headers of every response."""
 
 
 def new_token() -> str:
@@ -59,34 +53,29 @@ def write_links(db: sqlite3.Connection, path: Path, address: str) -> dict[str, s
     rows = db.execute("SELECT name, link FROM annotator ORDER BY rowid")
     links = {row["name"]: f"{address}/link/{row['link']}" for row in rows}
     note = "# A link signs in once; a new one then replaces it, for another device of that person."
-    lines = [note, *(f"{name}  {link}" for name, link in links.items())]
-    part = path.with_name(f"{path.name}.tmp")
-    handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    with open(handle, "w", encoding="utf-8") as file:
-        file.write("\n".join(lines) + "\n")
-    os.replace(part, path)
+    path.touch(mode=0o600)
+    path.chmod(0o600)
+    path.write_text("\n".join([note, *(f"{name}  {link}" for name, link in links.items()), ""]))
     return links
 
 
-def find_link_owner(db: sqlite3.Connection, link: str) -> str | None:
-    """The annotator of an unused link."""
-    row = db.execute("SELECT name FROM annotator WHERE link = ?", (link,)).fetchone()
-    return row and row["name"]
+def is_unused(db: sqlite3.Connection, link: str) -> bool:
+    return db.execute("SELECT 1 FROM annotator WHERE link = ?", (link,)).fetchone() is not None
 
 
-def sign_in(db: sqlite3.Connection, link: str) -> str | None:
+def sign_in(db: sqlite3.Connection, link: str) -> tuple[str, str] | None:
     """Use a link. The annotator's previous session ends.
 
     Returns:
-        The secret of the new session; None if the link is used or unknown.
+        The annotator and the secret of the new session; None if the link is used or unknown.
     """
     session = new_token()
     with transaction(db):
-        changed = db.execute(
-            "UPDATE annotator SET session = ?, form_key = ?, link = ? WHERE link = ?",
-            (_hash(session), new_token(), new_token(), link),
-        )
-    return session if changed.rowcount else None
+        row = db.execute(
+            "UPDATE annotator SET session = ?, link = ? WHERE link = ? RETURNING name",
+            (_hash(session), new_token(), link),
+        ).fetchone()
+    return row and (row["name"], session)
 
 
 def find_annotator(db: sqlite3.Connection, session: str) -> sqlite3.Row | None:
@@ -99,45 +88,10 @@ def _hash(session: str) -> str:
     return hashlib.sha256(session.encode()).hexdigest()
 
 
-class SiteGuard:
-    """Middleware: adds `HEADERS` to every response and refuses forms from other sites.
-
-    Args:
-        public: The study's address behind a proxy, if there is one.
-    """
-
-    def __init__(self, app: ASGIApp, public: str | None) -> None:
-        self._app = app
-        self._public = _host_and_port(public) if public else None
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        async def send_with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(HEADERS)
-            await send(message)
-
-        if scope["type"] != "http":
-            return
-        if scope["method"] == "POST" and self._is_cross_site(Headers(scope=scope)):
-            refusal = PlainTextResponse("This form comes from another site.", 403)
-            await refusal(scope, receive, send_with_headers)
-        else:
-            await self._app(scope, receive, send_with_headers)
-
-    def _is_cross_site(self, headers: Headers) -> bool:
-        """Whether a browser names another site as the form's origin; other clients name none."""
-        origin = headers.get("origin")
-        if origin is None:
-            return headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none")
-        own = f"{origin.partition(':')[0]}://{headers.get('host', '')}"
-        return _host_and_port(origin) not in {_host_and_port(own), self._public} - {None}
-
-
-def _host_and_port(url: str) -> tuple[str, int | None] | None:
-    """The normalized host and port of a URL; None if it has no host."""
-    try:
-        parts = urlsplit(url)
-        port = parts.port or DEFAULT_PORTS.get(parts.scheme)
-    except ValueError:
-        return None
-    return (parts.hostname, port) if parts.hostname else None
+def is_cross_site(headers: Headers) -> bool:
+    """Whether a browser says that a form comes from another site."""
+    if (site := headers.get("sec-fetch-site")) is not None:
+        return site not in ("same-origin", "none")
+    # Browsers omit that header on plain http, except on this machine.
+    origin = headers.get("origin")
+    return origin is not None and origin.partition("://")[2] != headers.get("host")

@@ -24,21 +24,22 @@ def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
 
     studies = Path(cfg.checkpoints) / "study"
     path = studies / resolve_run_name(cfg.run, str(studies)) / storage.DATABASE
-    if not storage.exists(path):
+    db = storage.open_study(path)
+    if db is None:
         raise UserError(
             f"{path} does not exist: start a study with python -m evaluation.study",
             code="missing-run",
         )
-    db = storage.open_study(path)
     with storage.transaction(db, read_only=True):
-        votes = list(storage.read_votes(db))
+        votes = storage.read_votes(db)
         about, items = storage.read_about(db), len(storage.item_ids(db, practice=False))
         annotators = storage.annotator_names(db)
-    if not votes:
+    if votes.empty:
         raise UserError(f"{path} has no votes yet", code="no-votes")
     benchmark = {"benchmark": about["benchmark"], "build": about["identity"]}
     report = benchmark | summary(votes, items, annotators)
-    write_text(run.folder / VOTES_FILE, "".join(json.dumps(v.to_row()) + "\n" for v in votes))
+    rows = votes.to_json(orient="records", lines=True, double_precision=15)
+    write_text(run.folder / VOTES_FILE, rows)
     write_text(run.folder / "report.json", json.dumps(report, indent=1))
     table = human_table(report)
     write_text(run.folder / "report.txt", f"{table}\n")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+from PIL import Image
 
 from conf.errors import UserError
 from data.records import SelectionItem
@@ -37,37 +38,27 @@ def encode_media(item: SelectionItem, frames: FrameReader) -> list[Medium]:
     Raises:
         UserError: the frames differ in size, or cannot be read.
     """
-    shown = list(range(item.prefix_start, item.prefix_stop + 1))
-    prefix = frames.stack(item.scene_id, shown)
-    video = encode_video(prefix, frames.scene(item.scene_id).fps)
-    images = [frames.array(c.scene_id, c.frame) for c in item.candidates]
-    if len({prefix[0].shape, *(image.shape for image in images)}) > 1:
+    prefix = frames.stack(item.scene_id, list(range(item.prefix_start, item.prefix_stop + 1)))
+    candidates = [frames.array(c.scene_id, c.frame) for c in item.candidates]
+    sizes = {pixels.shape[:2] for pixels in (prefix[0], *candidates)}
+    if len(sizes) > 1:
         raise UserError(
             f"item {item.item_id} has frames of different sizes, which would distinguish its "
             "candidates: choose the study's items without it by items=FILE",
             code="frame-size",
         )
-    files = pad_files([encode_image(pixels) for pixels in images])
+    [(height, width)] = sizes
+    images = []
+    for pixels in candidates:
+        Image.fromarray(pixels).save(target := io.BytesIO(), "PNG")
+        images.append(target.getvalue())
+    # File sizes must not distinguish candidates. Decoders ignore what follows the end of a PNG.
+    size = max(map(len, images))
+    video = encode_video(prefix, frames.scene(item.scene_id).fps)
     return [
-        _medium(PREFIX, VIDEO, prefix[0], video),
-        *(_medium(k, IMAGE, images[k], file) for k, file in enumerate(files)),
+        Medium(PREFIX, VIDEO, width, height, video),
+        *(Medium(k, IMAGE, width, height, png.ljust(size, b"\0")) for k, png in enumerate(images)),
     ]
-
-
-def encode_image(pixels: np.ndarray) -> bytes:
-    """A PNG of (height, width, 3) uint8."""
-    from PIL import Image
-
-    target = io.BytesIO()
-    Image.fromarray(pixels).save(target, "PNG")
-    return target.getvalue()
-
-
-def pad_files(files: list[bytes]) -> list[bytes]:
-    """The files padded to the size of the largest, so that sizes do not distinguish candidates.
-    Decoders ignore what follows the end of a PNG."""
-    size = max(map(len, files))
-    return [file.ljust(size, b"\0") for file in files]
 
 
 def encode_video(pixels: np.ndarray, fps: float) -> bytes:
@@ -91,8 +82,3 @@ def encode_video(pixels: np.ndarray, fps: float) -> bytes:
                 container.mux(plain.filter(packet))
         container.mux(plain.filter(None))
     return target.getvalue()
-
-
-def _medium(slot: int, kind: str, pixels: np.ndarray, content: bytes) -> Medium:
-    height, width, _ = pixels.shape
-    return Medium(slot, kind, width, height, content)

@@ -5,11 +5,9 @@ from __future__ import annotations
 import errno
 import logging
 import math
-import secrets
 import socket
 import sqlite3
 from collections.abc import Callable
-from importlib.resources import files
 from urllib.parse import parse_qsl
 
 import jinja2
@@ -18,8 +16,8 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response
-from starlette.routing import Route
-from starlette.types import ASGIApp
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
 
 from conf.errors import UserError
 from conf.schema import StudyCommand
@@ -35,12 +33,11 @@ MAX_SECONDS = 1e7
 """Longest plausible time of a browser's clock."""
 BACKLOG = 2048
 """Connections that may wait to be accepted."""
-STATIC = {"study.css": "text/css", "study.js": "text/javascript", "icon.svg": "image/svg+xml"}
 REFUSALS = {
     400: "The server could not read this request.",
     401: "You are not signed in on this device. Open your link; if it has been used, ask for a new "
     "one.",
-    403: "This form has expired.",
+    403: "This form comes from another site.",
     404: "This page does not exist.",
     405: "This page does not exist.",
     410: "This link has been used or is not valid. Ask for a new one.",
@@ -66,20 +63,17 @@ class Pages:
             loader=jinja2.PackageLoader("evaluation.study"), autoescape=True,
             undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         )  # fmt: skip
-        folder = files("evaluation.study") / "static"
-        self._static = {name: (folder / name).read_bytes() for name in STATIC}
 
-    def routes(self) -> list[Route]:
+    def routes(self) -> list[Route | Mount]:
         return [
             Route("/", self.home),
             Route("/link/{link}", self.link),
             Route("/link", self.sign_in, methods=["POST"]),
-            Route("/consent", self.consent, methods=["POST"]),
             Route("/continue", self.leave_page, methods=["POST"]),
             Route("/loaded", self.loaded, methods=["POST"]),
             Route("/answer", self.answer, methods=["POST"]),
-            Route("/media/{name}", self.media),
-            Route("/static/{name}", self.static),
+            Route("/media/{key}/{place}", self.media),
+            Mount("/static", StaticFiles(packages=[("evaluation.study", "static")])),
         ]
 
     async def home(self, request: Request) -> Response:
@@ -88,21 +82,20 @@ class Pages:
         has_question = stage.page in ("practice", "feedback", "item")
         question = workflow.load_question(self._db, stage.key) if has_question else None
         page = "question" if has_question else stage.page
-        return self._render(page, stage=stage, question=question, form_key=annotator["form_key"])
+        return self._render(page, stage=stage, question=question)
 
     async def link(self, request: Request) -> Response:
         # Only the form below uses the link: mail programs open links, too.
         link = request.path_params["link"]
-        if auth.find_link_owner(self._db, link) is None:
+        if not auth.is_unused(self._db, link):
             raise HTTPException(410)
         return self._render("link", link=link)
 
     async def sign_in(self, request: Request) -> Response:
-        link = (await read_form(request)).get("link", "")
-        name = auth.find_link_owner(self._db, link)
-        session = auth.sign_in(self._db, link)
-        if session is None:
+        signed_in = auth.sign_in(self._db, (await read_form(request)).get("link", ""))
+        if signed_in is None:
             raise HTTPException(410)
+        name, session = signed_in
         log.info("%s signed in", name)
         try:
             self._on_sign_in()
@@ -116,23 +109,18 @@ class Pages:
         )  # fmt: skip
         return response
 
-    async def consent(self, request: Request) -> Response:
-        annotator, _ = await self._read_own_form(request)
-        workflow.record_consent(self._db, annotator)
-        return RedirectResponse("/", 303)
-
     async def leave_page(self, request: Request) -> Response:
-        annotator, form = await self._read_own_form(request)
+        annotator, form = self._annotator(request), await read_form(request)
         workflow.leave_page(self._db, annotator, form.get("key", ""), self._rest_every)
         return RedirectResponse("/", 303)
 
     async def loaded(self, request: Request) -> Response:
-        annotator, form = await self._read_own_form(request)
+        annotator, form = self._annotator(request), await read_form(request)
         is_open = workflow.record_loaded(self._db, annotator["name"], form.get("key", ""))
         return Response(status_code=204 if is_open else 409)
 
     async def answer(self, request: Request) -> Response:
-        annotator, form = await self._read_own_form(request)
+        annotator, form = self._annotator(request), await read_form(request)
         letter, seconds = form.get("choice", ""), _parse_seconds(form.get("seconds", ""))
         if letter not in tuple(LETTERS) or seconds is None:
             raise HTTPException(400)
@@ -145,16 +133,11 @@ class Pages:
 
     async def media(self, request: Request) -> Response:
         annotator = self._annotator(request)
-        medium = workflow.load_medium(self._db, annotator["name"], request.path_params["name"])
+        key, place = request.path_params["key"], request.path_params["place"]
+        medium = workflow.load_medium(self._db, annotator["name"], key, place)
         if medium is None:
             raise HTTPException(404)
         return Response(medium["content"], media_type=medium["kind"])
-
-    async def static(self, request: Request) -> Response:
-        name = request.path_params["name"]
-        if name not in STATIC:
-            raise HTTPException(404)
-        return Response(self._static[name], media_type=STATIC[name])
 
     async def refuse(self, request: Request, error: Exception) -> Response:
         """The page of a refused request; it repeats nothing of the request."""
@@ -169,19 +152,6 @@ class Pages:
             raise HTTPException(401)
         return annotator
 
-    async def _read_own_form(self, request: Request) -> tuple[sqlite3.Row, dict[str, str]]:
-        """The annotator and the fields of a form from one of their own pages.
-
-        Raises:
-            HTTPException: 401 without a session, 403 for a form of another session.
-        """
-        annotator = self._annotator(request)
-        form = await read_form(request)
-        key = form.get("form_key", "").encode()
-        if not secrets.compare_digest(key, annotator["form_key"].encode()):
-            raise HTTPException(403)
-        return annotator, form
-
     def _render(self, template: str, status_code: int = 200, **values: object) -> HTMLResponse:
         page = self._templates.get_template(f"{template}.html").render(values)
         return HTMLResponse(page, status_code)
@@ -189,20 +159,20 @@ class Pages:
 
 def build_app(
     db: sqlite3.Connection, cfg: StudyCommand, on_sign_in: Callable[[], object]
-) -> ASGIApp:
+) -> Starlette:
     """The study as an ASGI application."""
     pages = Pages(db, cfg, on_sign_in)
-    app = Starlette(
+    return Starlette(
         routes=pages.routes(),
         exception_handlers={HTTPException: pages.refuse, 500: pages.refuse},
         max_body_size=MAX_FORM_BYTES,
     )
-    # The outermost layer, so that Starlette's own error responses pass through it.
-    return auth.SiteGuard(app, cfg.public)
 
 
 async def read_form(request: Request) -> dict[str, str]:
-    """The fields of a form. Raises HTTPException 400 for another body."""
+    """The fields of a form. Raises HTTPException 403 for another site's, 400 for another body."""
+    if auth.is_cross_site(request.headers):
+        raise HTTPException(403)
     try:
         body = (await request.body()).decode("ascii")
         return dict(parse_qsl(body, keep_blank_values=True, max_num_fields=16))
@@ -221,36 +191,24 @@ def _parse_seconds(text: str) -> float | None:
 
 def listen(host: str, port: int) -> socket.socket:
     """A listening socket. Raises UserError if the address is taken or not this machine's."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    reasons = {
+        errno.EADDRINUSE: f"port={port} is in use: stop the server there, or choose another port=",
+        errno.EACCES: f"port={port} needs more rights: choose a port above 1023",
+    }
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM
-        )[0]
-        listener = socket.socket(family, kind, protocol)
-        try:
-            # Lingering connections of the previous server do not block the port.
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(address)
-            listener.listen(BACKLOG)
-        except OSError:
-            listener.close()
-            raise
-        return listener
+        return socket.create_server((host, port), family=family, backlog=BACKLOG)
     except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            reason = f"port={port} is in use: stop the server there, or choose another port="
-        elif error.errno == errno.EACCES:
-            reason = f"port={port} needs more rights: choose a port above 1023"
-        else:
-            reason = f"host={host} is not an address of this machine"
+        reason = reasons.get(error.errno, f"host={host} is not an address of this machine")
         raise UserError(f"cannot serve the study: {reason}", code="invalid-address") from error
 
 
-def serve(app: ASGIApp, listener: socket.socket) -> None:
+def serve(app: Starlette, listener: socket.socket) -> None:
     """Serve until Ctrl-C or SIGTERM."""
     # Uvicorn's own log would record who requested what.
     settings = uvicorn.Config(
         app, log_config=None, log_level="warning", access_log=False, server_header=False,
         proxy_headers=False, lifespan="off", ws="none", backlog=BACKLOG,
-        timeout_graceful_shutdown=5,
+        timeout_graceful_shutdown=5, headers=list(auth.HEADERS.items()),
     )  # fmt: skip
     uvicorn.Server(settings).run(sockets=[listener])

@@ -1,9 +1,11 @@
-"""Creates a study and encodes the media of its items."""
+"""Creates a study, chooses its items and encodes their media."""
 
 from __future__ import annotations
 
-import logging
+import json
 import sqlite3
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 from tqdm import tqdm
@@ -11,16 +13,14 @@ from tqdm import tqdm
 from conf.errors import UserError
 from conf.schema import StudyCommand
 from data.build import ensure_benchmark
-from data.records import SelectionItem
+from data.records import FAMILIES, SelectionItem
 from data.render.frame_cache import FrameReader
 from data.store import Store
 from data.tracks.controls import MATCHED_ANCHOR
+from data.tracks.quota import interleave, named_rng
 from evaluation.study import auth, storage
 from evaluation.study.assignment import assign_items
-from evaluation.study.items import count_shared_scenes, find_items, read_item_ids, sample_items
 from evaluation.study.media import encode_media
-
-log = logging.getLogger(__name__)
 
 
 def create_study(cfg: StudyCommand, path: Path) -> sqlite3.Connection:
@@ -28,13 +28,6 @@ def create_study(cfg: StudyCommand, path: Path) -> sqlite3.Connection:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     items = choose_items(cfg, store)
     practice = sample_items(store.selection("train"), cfg.practice, cfg.seed, "practice")
-    if shared := count_shared_scenes(items):
-        log.warning(
-            "%d of %d items show a scene of another item; of one scene, the earliest prefix comes "
-            "first",
-            shared,
-            len(items),
-        )
     names = [f"A{k + 1}" for k in range(cfg.annotators)]
     assignments = [a for of in (items, practice) for a in assign_items(of, names, cfg.seed)]
     links = {name: auth.new_token() for name in names}
@@ -60,11 +53,8 @@ def add_missing_media(cfg: StudyCommand, db: sqlite3.Connection, path: Path) -> 
         )
     by_id = {i.item_id: i for i in store.selection() + store.selection(suite=MATCHED_ANCHOR)}
     frames = FrameReader(store)
-    total = len(storage.item_ids(db, False)) + len(storage.item_ids(db, True))
-    with tqdm(total=total, initial=total - len(missing), desc="encoding items", unit="item") as bar:
-        for item_id in missing:
-            storage.add_media(db, item_id, encode_media(by_id[item_id], frames))
-            bar.update()
+    for item_id in tqdm(missing, desc="encoding items", unit="item"):
+        storage.add_media(db, item_id, encode_media(by_id[item_id], frames))
 
 
 def choose_items(cfg: StudyCommand, store: Store) -> list[SelectionItem]:
@@ -72,7 +62,16 @@ def choose_items(cfg: StudyCommand, store: Store) -> list[SelectionItem]:
     if cfg.items.isdecimal():
         return sample_items(store.selection("test"), int(cfg.items), cfg.seed, "items")
     pool = store.selection("test") + store.selection("test", MATCHED_ANCHOR)
-    return find_items(pool, read_item_ids(Path(cfg.items)), str(store.folder))
+    by_id = {item.item_id: item for item in pool}
+    ids = read_item_ids(Path(cfg.items))
+    if missing := [item_id for item_id in ids if item_id not in by_id]:
+        more = f" ({len(missing) - 1} more are missing)" if len(missing) > 1 else ""
+        raise UserError(
+            f"item {missing[0]} is not a test item of {store.folder}{more}: name items of its "
+            "selection.parquet, or choose another benchmark=",
+            code="unknown-item",
+        )
+    return [by_id[item_id] for item_id in ids]
 
 
 def check_items(cfg: StudyCommand, db: sqlite3.Connection) -> None:
@@ -85,3 +84,69 @@ def check_items(cfg: StudyCommand, db: sqlite3.Connection) -> None:
             "file, or start another study with run=NAME",
             code="different-items",
         )
+
+
+def read_item_ids(path: Path) -> list[str]:
+    """The ids in a file, one a line, plain or as the item_id of a JSON object.
+
+    Raises:
+        UserError: the file cannot be read, names no item, or names an item twice.
+    """
+    try:
+        lines = [line.strip() for line in path.read_text("utf-8").splitlines() if line.strip()]
+        ids = [str(json.loads(x)["item_id"]) if x.startswith("{") else x for x in lines]
+    except OSError as error:
+        raise UserError(
+            f"items={path}: {error.strerror}; give a number of items, or a file of item ids",
+            code="missing-file",
+        ) from error
+    except (ValueError, KeyError) as error:
+        raise UserError(
+            f"items={path} cannot be read ({error}): give one item_id, or one JSON object with an "
+            "item_id, per line",
+            code="invalid-items",
+        ) from error
+    repeated = [item_id for item_id, count in Counter(ids).items() if count > 1]
+    if repeated or not ids:
+        problem = f"names {repeated[0]} more than once" if repeated else "names no item"
+        raise UserError(f"items={path} {problem}", code="invalid-items")
+    return ids
+
+
+def sample_items(
+    pool: Sequence[SelectionItem], count: int, seed: int, setting: str
+) -> list[SelectionItem]:
+    """`count` items, the families in turn and the subtypes in turn within a family. Scenes repeat
+    only if there are no others: one item's images could answer another item.
+
+    Args:
+        setting: The setting that asks for the items, for the error.
+
+    Raises:
+        UserError: the pool has fewer items.
+    """
+    if count > len(pool):
+        raise UserError(
+            f"{setting}={count} is more than the {len(pool)} items of the benchmark's split",
+            code="too-few-items",
+        )
+    rng = named_rng(seed, "study", "items")
+    shuffled = [pool[k] for k in rng.permutation(len(pool))]
+    queues = [
+        interleave([i for i in shuffled if i.family == family], lambda i: i.subtype)
+        for family in FAMILIES
+    ]
+    chosen: list[SelectionItem] = []
+    used: set[str] = set()
+    while len(chosen) < count:
+        for queue in [q for q in queues if q][: count - len(chosen)]:
+            item = next((i for i in queue if not item_scenes(i) & used), queue[0])
+            queue.remove(item)
+            used |= item_scenes(item)
+            chosen.append(item)
+    return chosen
+
+
+def item_scenes(item: SelectionItem) -> set[str]:
+    """Every scene that an item shows a frame of."""
+    return {item.scene_id, *(c.scene_id for c in item.candidates)}

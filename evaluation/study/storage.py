@@ -6,23 +6,21 @@ consistent at any time. One server writes; an export may read at the same time.
 
 from __future__ import annotations
 
-import os
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from conf.errors import UserError
 from data.records import SelectionItem
 from evaluation.study.assignment import Assignment
 from evaluation.study.media import Medium
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 DATABASE = "study.sqlite"
-APPLICATION_ID = 0x44795078
-"""Marks the file as a study's in SQLite's header."""
 VERSION = 1
 MEDIA_PER_ITEM = 5
 
@@ -39,7 +37,7 @@ CREATE TABLE medium (
     PRIMARY KEY (item_id, slot)
 ) STRICT;
 CREATE TABLE annotator (
-    name TEXT PRIMARY KEY, link TEXT NOT NULL UNIQUE, session TEXT UNIQUE, form_key TEXT,
+    name TEXT PRIMARY KEY, link TEXT NOT NULL UNIQUE, session TEXT UNIQUE,
     consented REAL, begun REAL, rests INTEGER NOT NULL DEFAULT 0
 ) STRICT;
 CREATE TABLE plan (
@@ -53,50 +51,7 @@ CREATE TABLE turn (
     UNIQUE (annotator, item_id), FOREIGN KEY (annotator, item_id) REFERENCES plan
 ) STRICT;
 CREATE INDEX turn_item ON turn (item_id);
-CREATE TABLE name (
-    token TEXT PRIMARY KEY, turn TEXT NOT NULL REFERENCES turn, slot INTEGER NOT NULL,
-    UNIQUE (turn, slot)
-) STRICT;
 """
-
-
-@dataclass(frozen=True)
-class Vote:
-    """One annotator's answer to one item.
-
-    Seconds run from the moment when the page was completely visible; if it was loaded more than
-    once (`loads`), from the last time.
-
-    Attributes:
-        answer, choice: Indices of the correct and the chosen candidate in the benchmark's order.
-        letter: The letter at which the chosen candidate stood.
-        seconds, client_seconds: By the server's and by the browser's clock.
-        answered: Time of the answer, UTC.
-    """
-
-    annotator: str
-    item_id: str
-    suite: str
-    family: str
-    subtype: str
-    answer: int
-    choice: int
-    letter: str
-    seconds: float
-    client_seconds: float
-    loads: int
-    answered: str
-
-    @property
-    def right(self) -> bool:
-        return self.choice == self.answer
-
-    def to_row(self) -> dict[str, Any]:
-        return {**asdict(self), "right": self.right}
-
-    @classmethod
-    def from_row(cls, row: dict[str, Any]) -> Vote:
-        return cls(**{key: value for key, value in row.items() if key != "right"})
 
 
 def create(
@@ -114,55 +69,45 @@ def create(
         assignments: Those of the items and of the practice items.
     """
     # SQLite gives its side files the mode of the database.
-    os.close(os.open(path, os.O_CREAT | os.O_WRONLY, 0o600))
+    path.touch(mode=0o600)
     path.chmod(0o600)
     db = _connect(path)
     db.execute("PRAGMA journal_mode = WAL")
-    all_items = [*((False, item) for item in items), *((True, item) for item in practice)]
     item_rows = [
-        (
-            i.item_id, is_practice, place, i.suite, i.family, i.subtype, i.question, i.scene_id,
-            i.prefix_stop, i.answer,
-        )
-        for place, (is_practice, i) in enumerate(all_items)
-    ]  # fmt: skip
+        {**vars(item), "practice": is_practice, "place": place}
+        for is_practice, chosen in ((False, items), (True, practice))
+        for place, item in enumerate(chosen)
+    ]
     plan_rows = [(a.annotator, a.item_id, a.rank, "".join(map(str, a.order))) for a in assignments]
     with transaction(db):
         for statement in SCHEMA.split(";"):
             db.execute(statement)
         db.executemany("INSERT INTO about VALUES (?, ?)", about.items())
-        db.executemany(f"INSERT INTO item VALUES ({', '.join('?' * 10)})", item_rows)
+        db.executemany(
+            "INSERT INTO item VALUES (:item_id, :practice, :place, :suite, :family, :subtype, "
+            ":question, :scene_id, :prefix_stop, :answer)",
+            item_rows,
+        )
         db.executemany("INSERT INTO annotator (name, link) VALUES (?, ?)", links.items())
         db.executemany("INSERT INTO plan VALUES (?, ?, ?, ?)", plan_rows)
-        db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         db.execute(f"PRAGMA user_version = {VERSION}")
     return db
 
 
-def exists(path: Path) -> bool:
-    """Whether a file holds a study. If the creation was killed, the file has no tables yet."""
-    if not path.exists() or path.stat().st_size == 0:
-        return False
-    try:
-        with closing(_connect(path)) as db:
-            return db.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0] > 0
-    except sqlite3.DatabaseError:
-        return True
-
-
-def open_study(path: Path) -> sqlite3.Connection:
-    """The database of an existing study.
+def open_study(path: Path) -> sqlite3.Connection | None:
+    """The database of a study; None if there is none yet, or its creation was killed.
 
     Raises:
-        UserError: it is damaged, of another version, or not a study.
+        UserError: it is damaged or of another version.
     """
+    if not path.exists():
+        return None
     remedy = "delete its folder, or start another study with run=NAME"
     try:
         db = _connect(path)
-        application = db.execute("PRAGMA application_id").fetchone()[0]
+        if not db.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]:
+            return None
         version = db.execute("PRAGMA user_version").fetchone()[0]
-        if application != APPLICATION_ID:
-            raise UserError(f"{path} is not a study's database: {remedy}", code="not-a-study")
         if version != VERSION:
             raise UserError(
                 f"{path} has the format {version} of another release, this one reads {VERSION}: "
@@ -218,17 +163,26 @@ def add_media(db: sqlite3.Connection, item_id: str, media: Sequence[Medium]) -> 
         db.executemany("INSERT OR REPLACE INTO medium VALUES (?, ?, ?, ?, ?, ?)", rows)
 
 
-def read_votes(db: sqlite3.Connection) -> Iterator[Vote]:
-    """The votes in temporal order, without practice."""
-    rows = db.execute(
+def read_votes(db: sqlite3.Connection) -> pd.DataFrame:
+    """The votes in temporal order, without practice; one row is one annotator's answer to one item.
+
+    Columns of the item: `annotator`, `item_id`, `suite`, `family`, `subtype`. `answer` and `choice`
+    are the indices of the correct and the chosen candidate in the benchmark's order, `letter` is
+    where the chosen one stood, and `right` is whether they agree. `seconds` and `client_seconds`
+    run by the server's and the browser's clock from the moment when the page was completely
+    visible; if it was loaded more than once (`loads`), from the last time. `answered` is in UTC.
+    """
+    import pandas as pd
+
+    votes = pd.read_sql(
         "SELECT annotator, item_id, suite, family, subtype, answer, choice, letter, "
-        "answered - loaded AS seconds, client_seconds, loads, answered "
+        "max(0.0, answered - loaded) AS seconds, client_seconds, loads, "
+        "strftime('%Y-%m-%dT%H:%M:%S+00:00', CAST(answered AS INTEGER), 'unixepoch') AS answered "
         "FROM turn JOIN item USING (item_id) "
-        "WHERE NOT practice AND answered IS NOT NULL ORDER BY answered, token"
+        "WHERE NOT practice AND turn.answered IS NOT NULL ORDER BY turn.answered, token",
+        db,
     )
-    for row in rows:
-        time = datetime.fromtimestamp(row["answered"], UTC).isoformat(timespec="seconds")
-        yield Vote(**{**dict(row), "answered": time, "seconds": max(0.0, row["seconds"])})
+    return votes.assign(right=votes.choice == votes.answer)
 
 
 def _connect(path: Path) -> sqlite3.Connection:

@@ -55,8 +55,7 @@ async function show() {
   try {
     await Promise.all([...page.querySelectorAll("[data-src]")].map(load));
     if (isOpen) {
-      const fields = { key: page.dataset.key, form_key: page.dataset.formKey };
-      const response = await post("/loaded", fields);
+      const response = await post("/loaded", { key: page.dataset.key });
       if (!response.ok) throw new Error("closed");
     }
   } catch (error) {

@@ -8,14 +8,13 @@ from pathlib import Path
 
 from conf.schema import ExportStudyCommand
 from data.records import FAMILIES
-from evaluation.study.agreement import summary
 from tests.evaluation.reporting.measured import (
     finish,
     read_table,
     reported,
     retrieve_run,
 )
-from tests.evaluation.study.test_agreement import vote
+from tests.evaluation.study.test_agreement import summarize, vote
 
 
 def change_first_row(report: Path, **row: object) -> None:
@@ -49,7 +48,11 @@ def test_a_common_base_has_one_curve_and_two_runs_have_names(runs, micro, micro_
 
 def test_the_majority_vote_of_the_same_build_is_a_row_that_does_not_compete(runs, micro_store):
     votes = [vote(name, k, 0, FAMILIES[k % 3]) for k in range(6) for name in ("A1", "A2")]
-    found = {"benchmark": "micro", "build": micro_store.identity, **summary(votes, 6, ["A1", "A2"])}
+    found = {
+        "benchmark": "micro",
+        "build": micro_store.identity,
+        **summarize(votes, 6, ["A1", "A2"]),
+    }
     finish(runs / "export_study" / "pilot", ExportStudyCommand(run="pilot"), found)
     folder = reported(runs, micro_store.folder.parent, items=0)
     # Every vote is correct, and no cell is bold.

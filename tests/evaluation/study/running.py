@@ -47,7 +47,7 @@ class Server:
 
     def kill(self) -> None:
         self.process.kill()
-        self.process.wait()
+        self.process.wait(timeout=60)
 
     def links(self) -> dict[str, str]:
         lines = (self.folder / "links.txt").read_text().splitlines()
@@ -120,15 +120,16 @@ class Visitor:
         return self
 
     def load(self, page: Reply) -> Reply:
-        return self.request("POST", "/loaded", both(page))
+        return self.request("POST", "/loaded", key_of(page))
 
     def answer(self, page: Reply, letter: str, seconds: float = 1.5) -> Reply:
-        return self.request("POST", "/answer", both(page) | {"choice": letter, "seconds": seconds})
+        return self.request(
+            "POST", "/answer", key_of(page) | {"choice": letter, "seconds": seconds}
+        )
 
     def leave(self, page: Reply) -> Reply:
         """Leave a page without a question."""
-        return self.request("POST", page.action, both(page) if page.action == "/continue" else
-                        {"form_key": page.hidden("form_key")})  # fmt: skip
+        return self.request("POST", "/continue", key_of(page))
 
     def to_question(self) -> Reply:
         """The first page of the study itself."""
@@ -143,8 +144,8 @@ class Visitor:
                 return page
 
 
-def both(page: Reply) -> dict[str, str]:
-    return {"form_key": page.hidden("form_key"), "key": page.hidden("key")}
+def key_of(page: Reply) -> dict[str, str]:
+    return {"key": page.hidden("key")}
 
 
 @dataclass

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from conf.schema import StudyCommand
 from data.records import FAMILIES, Candidate, SelectionItem
-from evaluation.study.assignment import WaitingItem, assign_items, next_item
-from evaluation.study.items import (
-    count_shared_scenes,
-    find_items,
-    read_item_ids,
-    sample_items,
-)
+from evaluation.study import storage
+from evaluation.study.assignment import assign_items
+from evaluation.study.setup import choose_items, item_scenes, read_item_ids, sample_items
+from evaluation.study.workflow import _open_item
 from tests.user_errors import raises_user_error
 
 NAMES = ["A1", "A2", "A3", "A4", "A5"]
@@ -85,26 +84,33 @@ def test_orders_depend_on_the_seed_the_items_and_the_annotator(items) -> None:
     assert [a.order for a in others] != [a.order for a in assignments]
 
 
-def test_families_and_depth_stay_even_if_annotators_stop_early(items) -> None:
-    names = NAMES[:3]
+def open_next(db: sqlite3.Connection, annotator: str) -> str:
+    """Open and answer the annotator's next item; return its id."""
+    token = _open_item(db, annotator, practice=False)
+    db.execute("UPDATE turn SET loaded = opened, answered = opened WHERE token = ?", (token,))
+    [row] = db.execute("SELECT item_id FROM turn WHERE token = ?", (token,))
+    return row["item_id"]
+
+
+def new_study(folder: Path, items: list[SelectionItem], names: list[str]) -> sqlite3.Connection:
+    links = {name: name for name in names}
     assignments = assign_items(items, names, 0)
+    return storage.create(folder / storage.DATABASE, {}, items, [], links, assignments)
+
+
+def test_families_and_depth_stay_even_if_annotators_stop_early(items, tmp_path) -> None:
+    names = NAMES[:3]
+    db = new_study(tmp_path, items, names)
     total = Counter(i.family for i in items)
-    by_id = {i.item_id: i for i in items}
+    family_of = {i.item_id: i.family for i in items}
     done: dict[str, list[str]] = {name: [] for name in names}
     rng = np.random.default_rng(0)
     for answers in range(1, 128):
         name = names[rng.integers(3)]
         if len(done[name]) == len(items):
             continue
-        votes = Counter(i for own in done.values() for i in own)
-        waiting = [
-            WaitingItem(i.item_id, i.family, i.scene_id, i.prefix_stop, a.rank, votes[i.item_id])
-            for a in assignments
-            if a.annotator == name and (i := by_id[a.item_id]).item_id not in done[name]
-        ]
-        opened = Counter(by_id[i].family for i in done[name])
-        done[name].append(next_item(waiting, opened, total))
-        opened[by_id[done[name][-1]].family] += 1
+        done[name].append(open_next(db, name))
+        opened = Counter(family_of[i] for i in done[name])
         shares = [opened[f] / total[f] for f in FAMILIES]
         assert max(shares) - min(shares) <= 1 / min(total.values()) + 1e-9
         if answers == len(items) - 4:
@@ -115,60 +121,50 @@ def test_families_and_depth_stay_even_if_annotators_stop_early(items) -> None:
     assert len(depth) == len(items)
 
 
-def test_the_earliest_prefix_of_a_scene_comes_first() -> None:
-    waiting = [
-        WaitingItem("late", "event", "s", 90, 0, 0),
-        WaitingItem("early", "event", "s", 25, 7, 5),
-        WaitingItem("elsewhere", "event", "t", 95, 3, 1),
-    ]
-    order = []
-    while waiting:
-        order.append(next_item(waiting, {}, {"event": 3}))
-        waiting = [w for w in waiting if w.item_id != order[-1]]
-    assert order == ["elsewhere", "early", "late"]
+def test_the_earliest_prefix_of_a_scene_comes_first(tmp_path) -> None:
+    scene = [item(k, "event", scene=0, stop=stop) for k, stop in enumerate((40, 25, 30))]
+    db = new_study(tmp_path, [*scene, item(3, "event", scene=1, stop=45)], ["A1"])
+    order = [open_next(db, "A1") for _ in range(4)]
+    assert [i for i in order if i != "i3"] == ["i1", "i2", "i0"]
 
 
 def test_sampled_items_are_even_and_share_scenes_only_if_they_must() -> None:
     pool = [item(k, FAMILIES[k % 3], scene=k // 2) for k in range(60)]
     sampled = sample_items(pool, 20, 0, "items")
     assert sorted(Counter(i.family for i in sampled).values()) == [6, 7, 7]
-    assert count_shared_scenes(sampled) == 0
+    assert len(set.union(*map(item_scenes, sampled))) == len(sampled)
     assert max(Counter((i.family, i.subtype) for i in sampled).values()) <= 4
     assert sampled == sample_items(pool, 20, 0, "items") != sample_items(pool, 20, 1, "items")
     assert sorted(sample_items(pool, 60, 0, "items"), key=pool.index) == pool
-    assert count_shared_scenes(pool) == 60
     with raises_user_error("too-few-items", contains=("practice=61", "60")):
         sample_items(pool, 61, 0, "practice")
 
 
-def test_a_file_names_items_plainly_or_in_json(tmp_path: Path) -> None:
-    pool = [item(k, "time") for k in range(4)]
+def test_a_file_names_items_plainly_or_in_json(micro_store, tmp_path) -> None:
+    first, second, *_ = [i.item_id for i in micro_store.selection("test")]
     file = tmp_path / "items.txt"
-    file.write_text('i3\n\n{"item_id": "i1", "note": 2}\n')
-    found = find_items(pool, read_item_ids(file), "store/x")
-    assert [i.item_id for i in found] == ["i3", "i1"]
+    file.write_text(f'{second}\n\n{{"item_id": "{first}", "note": 2}}\n')
+    chosen = choose_items(StudyCommand(items=str(file)), micro_store)
+    assert [i.item_id for i in chosen] == [second, first]
+    file.write_text("elsewhere\n")
+    with raises_user_error("unknown-item", contains=("elsewhere", str(micro_store.folder))):
+        choose_items(StudyCommand(items=str(file)), micro_store)
 
 
 @pytest.mark.parametrize(
-    ("content", "code", "named"),
+    ("content", "code"),
     [
-        (b"", "invalid-items", "items.txt"),
-        (b"i1\ni1\n", "invalid-items", "i1 2 times"),
-        (b'{"item": 1}', "invalid-items", "line 1"),
-        (b'{"item_id": 7}', "invalid-items", "line 1"),
-        (b"i1\n{", "invalid-items", "line 2"),
-        (b"\xff\xfe\x00", "invalid-items", "items.txt"),
-        (None, "missing-file", "items.txt"),
+        (b"", "invalid-items"),
+        (b"i1\ni1\n", "invalid-items"),
+        (b'{"item": 1}', "invalid-items"),
+        (b"i1\n{", "invalid-items"),
+        (b"\xff\xfe\x00", "invalid-items"),
+        (None, "missing-file"),
     ],
 )
-def test_an_invalid_file_of_items_is_refused(tmp_path, content, code, named) -> None:
+def test_an_invalid_file_of_items_is_refused(tmp_path, content, code) -> None:
     file = tmp_path / "items.txt"
     if content is not None:
         file.write_bytes(content)
-    with raises_user_error(code, contains=named):
+    with raises_user_error(code, contains="items.txt"):
         read_item_ids(file)
-
-
-def test_an_unknown_item_is_refused() -> None:
-    with raises_user_error("unknown-item", contains=("i9", "store/x")):
-        find_items([item(1, "time")], ["i1", "i9"], "store/x")

@@ -42,14 +42,14 @@ def test_candidates_are_lossless_images_of_equal_file_size(micro_store, item) ->
 def test_a_prefix_is_a_video_of_every_frame_without_metadata(micro_store, item) -> None:
     frames = FrameReader(micro_store)
     prefix = encode_media(item, frames)[0]
-    shown = list(range(item.prefix_start, item.prefix_stop + 1))
+    prefix_frames = list(range(item.prefix_start, item.prefix_stop + 1))
     with av.open(io.BytesIO(prefix.content)) as video:
         stream = video.streams.video[0]
         assert float(stream.average_rate) == frames.scene(item.scene_id).fps
         decoded = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
         metadata = {**video.metadata, **stream.metadata}
-    assert len(decoded) == len(shown)
-    expected = frames.stack(item.scene_id, shown).astype(int)
+    assert len(decoded) == len(prefix_frames)
+    expected = frames.stack(item.scene_id, prefix_frames).astype(int)
     assert np.abs(np.stack(decoded) - expected).mean() < 3
     assert set(metadata) <= {"major_brand", "minor_version", "compatible_brands", "language",
                          "handler_name"}  # fmt: skip

@@ -17,18 +17,16 @@ from urllib.parse import urlencode
 import numpy as np
 import pytest
 from PIL import Image
-from starlette.responses import PlainTextResponse
 
 from conf.entry import Run
 from conf.schema import ExportStudyCommand, StudyCommand
 from data.records import LETTERS
 from data.render.frame_cache import FrameReader
 from evaluation.study import auth, export, storage
-from evaluation.study.auth import HEADERS, SiteGuard
+from evaluation.study.auth import HEADERS
 from evaluation.study.routes import build_app
-from evaluation.study.storage import Vote, read_votes
 from tests.evaluation.study.conftest import ITEMS, SMALL
-from tests.evaluation.study.running import Annotator, Visitor, both
+from tests.evaluation.study.running import Annotator, Visitor, key_of
 
 pytestmark = pytest.mark.slow
 
@@ -75,36 +73,37 @@ def test_a_study_survives_kills_with_three_concurrent_annotators(serve, prepared
         thread.join(timeout=300)
     assert [len(a.answers) for a in annotators] == [ITEMS] * 3
     assert [a.rests for a in annotators] == [2] * 3
-    kept = rows(
+    stored = rows(
         server, "SELECT token, letter FROM turn JOIN item USING (item_id) WHERE NOT practice"
     )
-    assert dict(map(tuple, kept)) == {k: v for a in annotators for k, v in a.answers.items()}
+    assert dict(map(tuple, stored)) == {k: v for a in annotators for k, v in a.answers.items()}
 
     run = Run("x", tmp_path)
     cfg = ExportStudyCommand(run=server.folder.name, checkpoints=str(server.folder.parents[1]))
     export.main.__wrapped__(cfg, run)
     text = (tmp_path / export.VOTES_FILE).read_text()
-    votes = [Vote.from_row(json.loads(line)) for line in text.splitlines()]
-    assert Counter(v.annotator for v in votes) == {"A1": ITEMS, "A2": ITEMS, "A3": ITEMS}
-    assert len({(v.annotator, v.item_id) for v in votes}) == 3 * ITEMS
+    votes = [json.loads(line) for line in text.splitlines()]
+    assert Counter(v["annotator"] for v in votes) == {"A1": ITEMS, "A2": ITEMS, "A3": ITEMS}
+    assert len({(v["annotator"], v["item_id"]) for v in votes}) == 3 * ITEMS
+    assert all(v["right"] == (v["choice"] == v["answer"]) for v in votes)
     secrets = [r["link"] for r in rows(server, "SELECT link FROM annotator")]
     assert not any(secret in text for secret in secrets)
     found = json.loads((tmp_path / "report.json").read_text())
     assert found["depth"] == {"3": ITEMS}
     assert found["fleiss_kappa"]["items"] == ITEMS
     # Three annotators have an item's correct candidate at three letters.
-    places = Counter((v.item_id, _place_of_answer(server, v)) for v in votes)
+    places = Counter((v["item_id"], _place_of_answer(server, v)) for v in votes)
     assert set(places.values()) == {1}
 
 
-def _place_of_answer(server, vote: Vote) -> int:
+def _place_of_answer(server, vote: dict) -> int:
     query = "SELECT shown FROM plan WHERE annotator = ? AND item_id = ?"
-    [row] = rows(server, query, vote.annotator, vote.item_id)
-    assert int(row["shown"][LETTERS.index(vote.letter)]) == vote.choice
-    return row["shown"].index(str(vote.answer))
+    [row] = rows(server, query, vote["annotator"], vote["item_id"])
+    assert int(row["shown"][LETTERS.index(vote["letter"])]) == vote["choice"]
+    return row["shown"].index(str(vote["answer"]))
 
 
-def test_a_letter_chooses_the_candidate_that_stood_there(small, micro_store) -> None:
+def test_a_letter_chooses_the_candidate_at_its_place(small, micro_store) -> None:
     visitor = Visitor(small.port).sign_in(small.links()["A2"])
     page = visitor.to_question()
     images = [visitor.request("GET", path).body for path in page.media()[1:]]
@@ -196,29 +195,27 @@ def test_every_response_has_the_security_headers(small, visitor) -> None:
     for path in ("/", "/nothing", "/static/study.css", "/static/nothing", "/link/x", "/media/x"):
         headers = visitor.request("GET", path).headers
         assert {name: headers[name] for name in HEADERS} == HEADERS
-        assert not {"server", "etag", "last-modified"} & {name.lower() for name in headers}
+        assert "server" not in headers
+    headers = visitor.request("POST", "/link", {"link": "x" * 5000}).headers
+    assert {name: headers[name] for name in HEADERS} == HEADERS
     assert "unsafe" not in HEADERS["Content-Security-Policy"]
 
 
-def test_server_errors_have_the_headers_and_lock_nobody_out(small) -> None:
+def test_a_full_disk_locks_nobody_out(small) -> None:
     def full() -> None:
         raise OSError("No space left on device")
 
     db = storage.open_study(small.folder / storage.DATABASE)
-    message = first_message(build_app(db, StudyCommand(), full), small.links()["A1"])
+    response = post_link(build_app(db, StudyCommand(), full), small.links()["A1"])
     auth.write_links(db, small.folder / auth.LINKS_FILE, "http://here")
-    assert message["status"] == 303
-    assert any(name == b"set-cookie" for name, _ in message["headers"])
+    assert response["status"] == 303
+    assert any(name == b"set-cookie" for name, _ in response["headers"])
     # Without its tables no page can be rendered.
     broken = build_app(sqlite3.connect(":memory:"), StudyCommand(), full)
-    for body, status in (("x" * 10, 500), ("x" * 5000, 413)):
-        message = first_message(broken, body)
-        assert message["status"] == status
-        heads = {name.decode().lower(): value.decode() for name, value in message["headers"]}
-        assert {name: heads[name.lower()] for name in HEADERS} == HEADERS
+    assert post_link(broken, "x" * 10)["status"] == 500
 
 
-def first_message(app, link: str) -> dict:
+def post_link(app, link: str) -> dict:
     """The beginning of an application's response to the form of a link."""
     messages = []
 
@@ -228,12 +225,11 @@ def first_message(app, link: str) -> dict:
     async def send(message: dict) -> None:
         messages.append(message)
 
-    headers = [(b"host", b"here"), (b"content-length", str(len(link) + 5).encode())]
     scope = {
         "type": "http", "method": "POST", "path": "/link", "raw_path": b"/link",
-        "query_string": b"", "headers": headers, "http_version": "1.1",
+        "query_string": b"", "headers": [(b"host", b"here")], "http_version": "1.1",
     }  # fmt: skip
-    # The application re-raises errors for the server to log.
+    # The application raises errors again for the server to log.
     with contextlib.suppress(sqlite3.Error):
         asyncio.run(app(scope, receive, send))
     return messages[0]
@@ -257,8 +253,7 @@ def test_repeated_early_and_forged_answers_change_nothing(small, visitor) -> Non
     other = Visitor(small.port).sign_in(small.links()["A2"])
     theirs = other.to_question()
     other.load(theirs)
-    mine = visitor.home()
-    forged = {"form_key": mine.hidden("form_key"), "key": theirs.hidden("key")}
+    forged = key_of(theirs)
     assert visitor.request("POST", "/loaded", forged).status == 409
     visitor.request("POST", "/answer", forged | {"choice": "A", "seconds": "1"})
     [turn] = rows(small, "SELECT * FROM turn WHERE token = ?", theirs.hidden("key"))
@@ -280,8 +275,6 @@ def test_repeated_early_and_forged_answers_change_nothing(small, visitor) -> Non
         ({"key": "' OR 1=1 --"}, 303),
         ({"key": "\x00\ud7ff"}, 303),
         ({"key": "x" * 5000}, 413),
-        ({"form_key": "x"}, 403),
-        ({"form_key": "é"}, 403),
         ({f"f{k}": "" for k in range(50)}, 400),
     ],
 )
@@ -290,7 +283,7 @@ def test_hostile_fields_change_nothing(small, visitor, changes, status) -> None:
     visitor.load(page)
     before = rows(small, "SELECT count(*), count(answered), max(rests) FROM turn, annotator")
     reply = visitor.request(
-        "POST", "/answer", {**both(page), "choice": "A", "seconds": "1", **changes}
+        "POST", "/answer", {**key_of(page), "choice": "A", "seconds": "1", **changes}
     )
     assert reply.status == status
     assert "<script>alert" not in reply.text
@@ -304,35 +297,18 @@ def test_forms_of_other_sites_are_refused(visitor) -> None:
         {"Origin": "http://evil.example"},
         {"Origin": "null"},
         {"Origin": "http://["},
+        {"Origin": ""},
         {"Origin": f"https://127.0.0.1:{visitor.port + 1}"},
         {"Sec-Fetch-Site": "cross-site"},
         {"Sec-Fetch-Site": "same-site"},
     ):
-        for path in ("/consent", "/continue", "/loaded", "/answer", "/link"):
-            assert visitor.request("POST", path, both(page), **headers).status == 403
-    own = {"Origin": f"http://127.0.0.1:{visitor.port}"}
-    assert visitor.request("POST", "/loaded", both(page), **own).status == 204
-
-
-@pytest.mark.parametrize(
-    ("origin", "status"),
-    [("https://study.example.org", 200), ("https://study.example.org:443", 200),
-     ("http://study.example.org", 403), ("https://study.example.org:8443", 403),
-     ("https://study.example.org.evil.example", 403), ("https://:443", 403),
-     ("https://study.example.org:x", 403), ("http://INSIDE:8000", 200), ("http://[", 403),
-     ("", 403), (":", 403)],
-)  # fmt: skip
-def test_forms_of_the_public_address_are_accepted_in_every_spelling(origin, status) -> None:
-    messages = []
-
-    async def send(message: dict) -> None:
-        messages.append(message)
-
-    headers = [(b"host", b"inside:8000"), (b"origin", origin.encode())]
-    scope = {"type": "http", "method": "POST", "path": "/", "headers": headers}
-    guard = SiteGuard(PlainTextResponse("taken"), "https://Study.Example.org:443/")
-    asyncio.run(guard(scope, None, send))
-    assert messages[0]["status"] == status
+        for path in ("/continue", "/loaded", "/answer", "/link"):
+            assert visitor.request("POST", path, key_of(page), **headers).status == 403
+    for headers in (
+        {"Origin": f"http://127.0.0.1:{visitor.port}"},
+        {"Origin": "https://proxied.example", "Sec-Fetch-Site": "same-origin"},
+    ):
+        assert visitor.request("POST", "/loaded", key_of(page), **headers).status == 204
 
 
 @pytest.mark.parametrize(
@@ -364,7 +340,7 @@ def test_of_a_thousand_concurrent_answers_one_counts(small, visitor) -> None:
     votes = len(rows(small, "SELECT 1 FROM turn WHERE answered IS NOT NULL"))
 
     async def one(k: int) -> int:
-        body = urlencode({**both(page), "choice": LETTERS[k % 4], "seconds": 1})
+        body = urlencode({**key_of(page), "choice": LETTERS[k % 4], "seconds": 1})
         head = "GET /" if k % 2 else "POST /answer"
         sent = "" if k % 2 else body
         reader, writer = await asyncio.open_connection("127.0.0.1", small.port)
@@ -383,12 +359,3 @@ def test_of_a_thousand_concurrent_answers_one_counts(small, visitor) -> None:
     assert asyncio.run(all_at_once()) == {200: 500, 303: 500}
     assert len(rows(small, "SELECT 1 FROM turn WHERE answered IS NOT NULL")) == votes + 1
     assert visitor.home().status == 200
-
-
-def test_votes_exclude_practice(small) -> None:
-    db = storage.open_study(small.folder / storage.DATABASE)
-    practice = set(storage.item_ids(db, practice=True))
-    votes = list(read_votes(db))
-    db.close()
-    assert votes
-    assert not {v.item_id for v in votes} & practice
