@@ -13,7 +13,6 @@ from conf.schema import SelectCommand, SftCommand
 
 if TYPE_CHECKING:
     from data.records import SelectionItem
-    from data.render.frame_cache import FrameReader
     from data.store import Store
 
 log = logging.getLogger(__name__)
@@ -67,15 +66,12 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     results = selection_report.write_report(
         choices, items, store.name, cfg.seed, run.folder, cfg.suite, **about
     )
-    metrics = {
+    return {
         f"{r.mode}_{name}": value
         for r in results
         if r.control == cfg.control
         for name, value in (*r.metrics.items(), ("parse_rate", r.parse_rate))
     }
-    letter = answers[modes[0], cfg.control][0].letter
-    draw_item(items[0], letter, FrameReader(store), run.folder / "item.png")
-    return metrics
 
 
 def default_modes(cfg: SelectCommand, regime: str) -> list[str]:
@@ -85,23 +81,6 @@ def default_modes(cfg: SelectCommand, regime: str) -> list[str]:
     if cfg.model is not None:
         return modes_of(regime) or ["answer"]
     return ["record", "constrained"]
-
-
-def draw_item(item: SelectionItem, letter: str | None, frames: FrameReader, path: Path) -> None:
-    """Draw an item's prefix and candidates at full size, with the chosen letter."""
-    from data.records import LETTERS, sample_prefix_frames
-    from evaluation.reporting.figures import item_figure
-
-    prefix = sample_prefix_frames(item.prefix_start, item.prefix_stop, 6)
-    item_figure(
-        [frames.image(item.scene_id, f) for f in prefix],
-        [frames.image(c.scene_id, c.frame) for c in item.candidates],
-        LETTERS,
-        item.letter,
-        letter,
-        item.question,
-        path,
-    )
 
 
 def select_items(

@@ -26,23 +26,19 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.records import FrameRef
-    from data.render.frame_cache import FrameReader
-    from evaluation.embedders.base import embed_frames, embed_queries, open_embedders
+    from evaluation.embedders.base import open_embedders
     from evaluation.metrics.results import SIMILARITY
     from evaluation.reporting.selection_report import Choices, write_report
     from evaluation.retrieval import nearest_candidate
     from evaluation.select import select_items
-    from models.precision import resolve_precision
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     candidates = {FrameRef(c.scene_id, c.frame) for item in items for c in item.candidates}
-    frames = FrameReader(store, preset.image_size)
-    precision = resolve_precision(trained.train.precision)
     choices, score_lines = [], []
-    for embedder in open_embedders(folder, preset, precision, store, run.folder):
+    for embedder in open_embedders(folder, trained, store, run.folder, cfg.batch):
         name = embedder.name
-        queries = embed_queries(embedder, items, store, frames, cfg.batch)
-        embeddings = embed_frames(embedder, candidates, store, frames, cfg.batch)
+        queries = embedder.embed_queries(items)
+        embeddings = embedder.embed_frames(candidates)
         log.info("scoring %s items with %s", f"{len(items):,}", name)
         scores = nearest_candidate.score_candidates(items, queries, embeddings, preset)
         credits = nearest_candidate.credit_choices(scores, [item.answer for item in items])

@@ -26,7 +26,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         cfg.matcher, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides, "matcher.model"
     )
     # The paper's routes: a student's rationale, or all three of a base.
-    routes = cfg.routes or (["cot_text"] if cfg.model is not None else list(ROUTES[:3]))
+    routes = cfg.routes or (["cot_text"] if cfg.model is not None else list(ROUTES))
     check_routes(routes, folder, trained.train.regime, frozen)
 
     from data.build import ensure_benchmark
@@ -38,31 +38,31 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from evaluation.generators.base import open_generator
     from evaluation.metrics import results
     from evaluation.reporting import tables
-    from evaluation.retrieval import predicted_texts, standard_test, text_matching
-    from models.precision import resolve_precision
+    from evaluation.retrieval import standard_test, text_matching
     from models.student.prompts import text_sample
 
     queries, database = standard_test.load_standard_test(store)
-    precision = resolve_precision(frozen.train.precision)
-    matcher = next(open_embedders(matcher_folder, frozen.retriever, precision, store, run.folder))
+    matcher = next(open_embedders(matcher_folder, frozen, store, run.folder, cfg.matcher.batch))
     student = trained.student
     sample_of = partial(text_sample, FrameReader(store, student.image_size), student.frames)
     model = open_generator(cfg, folder, trained)
     name = model.name
     log.info("collecting texts of %s", name)
-    modes = predicted_texts.modes_of(routes)
-    responses = predicted_texts.write_texts(
-        cfg, student, model, sample_of, modes, queries, database, store
+    chosen = [text_matching.ROUTES[key] for key in routes]
+    responses = text_matching.write_texts(
+        cfg, student, model, sample_of, chosen, queries, database, store
     )
-    texts = {mode: predicted_texts.texts_of(of_mode) for mode, of_mode in responses.items()}
+    texts = {
+        mode: {r.item_id: text_matching.future_text(r.text) for r in of_mode}
+        for mode, of_mode in responses.items()
+    }
     # The matcher needs its memory.
     del model
 
     rows, curves, matched, metrics = [], [], [], {}
-    for key in routes:
-        route = predicted_texts.ROUTES[key]
+    for key, route in zip(routes, chosen, strict=True):
         log.info("matching %s with %s", route.title, matcher.name)
-        ranks = text_matching.rank_by_text(cfg, route, matcher, texts, queries, database, store)
+        ranks = text_matching.rank_by_text(route, matcher, texts, queries, database)
         title = f"{name} {route.title}, {matcher.name.removeprefix(results.UNTRAINED).strip()}"
         route_rows = results.retrieval_results(store.name, title, ranks, queries, cfg.seed)
         rows += route_rows
@@ -71,7 +71,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         measures = route_rows[0].measures
         metrics |= {f"{key}_{m}": i.value for m, i in measures.items() if m != "tie_rate"}
 
-    counts = {mode: predicted_texts.count_texts(of_mode) for mode, of_mode in responses.items()}
+    counts = {mode: text_matching.count_texts(of_mode) for mode, of_mode in responses.items()}
     standard_test.write_report(
         run.folder,
         rows,
@@ -79,7 +79,6 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         [tables.parsing_table(counts)],
         "two_stage",
         build=store.identity,
-        indexes=[],
         texts=counts,
     )
     write_text(run.folder / "matched.jsonl", "".join(json.dumps(m) + "\n" for m in matched))

@@ -32,6 +32,11 @@ PROCESSOR_FILES = (
 """Files that define how text and pixels become a model's input."""
 
 
+def settings_key(settings: Any) -> str:
+    """Return a short hash of settings as JSON: the name under which their results are stored."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+
+
 def weights_digest(*models: str | Path | None) -> str:
     """Return a short hash of the weights of several models.
 

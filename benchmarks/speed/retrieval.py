@@ -1,8 +1,7 @@
-"""The time and memory of ranking a database, compared with one matrix product and with faiss.
+"""The time and memory of ranking a database, compared with one matrix product.
 
     python -m benchmarks.speed.retrieval ranks
     python -m benchmarks.speed.retrieval large
-    python -m benchmarks.speed.retrieval index
 
 `ranks` computes the exact ranks of 2,002 queries over 10,000 frames at all seven widths up to
 4,096, alternating with one fp32 product of the same two tables; medians of the rounds.
@@ -10,8 +9,6 @@
 `large` ranks 256 queries over 1,000,000 frames in cache files, which it writes first (16 GiB,
 deleted at the end): seconds and peak memory. Time is linear in the queries; memory grows by 100 KiB
 per query.
-
-`index` (extra `index`) compares faiss with exact ranks over 100,000 frames: recall, size, seconds.
 
 Embeddings are random but clustered: the 128 frames of a scene lie around one point, and a query
 lies near its target. OMP_NUM_THREADS=1 restricts it to one thread.
@@ -36,7 +33,6 @@ import numpy as np
 from data.records import FRAMES as SCENE
 from evaluation.embedders.cache import EmbeddingCache
 from evaluation.retrieval.exact_search import Ranks, exact_ranks
-from evaluation.retrieval.faiss_index import approximate_ranks, import_faiss
 
 WIDTHS = (4096, 2048, 1024, 512, 256, 128, 64)
 
@@ -44,17 +40,15 @@ WIDTHS = (4096, 2048, 1024, 512, 256, 128, 64)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(required=True)
-    for name, queries, frames, widths, measure in (
-        ("ranks", 2_002, 10_000, WIDTHS, measure_ranks),
-        ("large", 256, 1_000_000, WIDTHS, measure_large),
-        ("index", 512, 100_000, (4096, 256), measure_index),
+    for name, queries, frames, measure in (
+        ("ranks", 2_002, 10_000, measure_ranks),
+        ("large", 256, 1_000_000, measure_large),
     ):
         command = commands.add_parser(name)
         command.add_argument("--queries", type=int, default=queries)
         command.add_argument("--frames", type=int, default=frames)
-        command.add_argument("--widths", type=int, nargs="+", default=widths, help="widest first")
+        command.add_argument("--widths", type=int, nargs="+", default=WIDTHS, help="widest first")
         command.add_argument("--rounds", type=int, default=3)
-        command.add_argument("--probes", type=int, default=16)
         command.add_argument(
             "--folder", help="parent of the folder with the embeddings; by default /tmp"
         )
@@ -86,28 +80,8 @@ def measure_large(args: argparse.Namespace) -> None:
     queries, targets = embed_queries(args)
     with temporary_folder(args) as folder:
         writing, cache = timed(lambda: write_embeddings(folder, args))
-        checking, _ = timed(lambda: write_embeddings(folder, args))
         ranking, ranks = timed(lambda: rank_exactly(cache, queries, targets, args))
-    print(f"written in {writing:.0f} s, checked in {checking:.1f} s, ranked in {ranking:.1f} s")
-    print_ranks(ranks)
-
-
-def measure_index(args: argparse.Namespace) -> None:
-    import_faiss()
-    queries, targets = embed_queries(args)
-    with temporary_folder(args) as folder:
-        cache = write_embeddings(folder, args)
-        exact, _ = timed(lambda: rank_exactly(cache, queries, targets, args))
-        names = [frame_name(k) for k in range(args.frames)]
-        target_names = [frame_name(k) for k in targets]
-        arguments = (queries, target_names, cache, names, args.widths, args.probes, 0)
-        first, (ranks, reports) = timed(lambda: approximate_ranks(*arguments))
-        second, _ = timed(lambda: approximate_ranks(*arguments))
-    print(f"{args.probes} probes; exact ranks {exact:.1f} s; faiss, with its comparison to exact")
-    print(f"ranks: {first:.1f} s with building the indexes, {second:.1f} s later")
-    for r in reports:
-        recalls = ", ".join(f"{key} {r[key]:.3f}" for key in r if key.startswith("recall"))
-        print(f"width {r['width']}: {recalls}; {r['bytes'] / 2**20:.0f} MiB, {r['seconds']:.2f} s")
+    print(f"written in {writing:.0f} s, ranked in {ranking:.1f} s")
     print_ranks(ranks)
 
 
@@ -116,7 +90,7 @@ def rank_exactly(
 ) -> Ranks:
     """The exact ranks of the targets among the frames of a cache."""
     gold = cache.rows([frame_name(k) for k in targets])
-    parts = (rows for _, rows in cache.parts([frame_name(k) for k in range(args.frames)]))
+    parts = cache.parts([frame_name(k) for k in range(args.frames)])
     return exact_ranks(queries, gold, parts, args.widths)
 
 

@@ -36,5 +36,5 @@ from conf.schema.models import (
     RetrieverConfig,
     StudentConfig,
 )
-from conf.schema.servers import ImageServerConfig, ServerConfig, ServersConfig, TeacherConfig
+from conf.schema.servers import ServerConfig, ServersConfig, TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainConfig

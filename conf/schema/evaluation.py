@@ -11,12 +11,12 @@ from omegaconf import MISSING
 from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.commands import CommandConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
-from conf.schema.servers import ImageServerConfig, ServerConfig
+from conf.schema.servers import ServerConfig
 from conf.schema.settings import Settings, check_choices, check_run, is_url, setting
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
 
 RESPONSE_MODES = ("reasoning", "answer", "record", "constrained")
-ROUTES = ("cot_text", "predict_caption", "predict_image", "predict_generated_image")
+ROUTES = ("cot_text", "predict_caption", "predict_image")
 
 
 @dataclass
@@ -81,11 +81,7 @@ class EmbeddingCommand(CommandConfig):
 
 @dataclass
 class RetrieveCommand(EmbeddingCommand):
-    index: str = setting("exact", ("exact", "faiss"))
-    """exact compares each query with every frame; faiss uses an approximate index (extra `index`)
-    for databases of millions of frames, and reports its recall against exact search."""
-    probes: int = setting(16, least=1)
-    """Lists of the approximate index that a query searches, of about sqrt(number of frames)."""
+    """Settings of evaluation.retrieve."""
 
 
 @dataclass
@@ -137,30 +133,18 @@ class TwoStageCommand(CommandConfig):
     """Writing model: run folder of train.sft or folder that train.export wrote, with its own
     student and recipe; null uses the student's base."""
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
-    images: ImageServerConfig = field(default_factory=ImageServerConfig)
     routes: list[str] | None = None
     """Routes to measure: cot_text (the future state in a rationale, matched to frames),
     predict_caption (a description of the future frame, matched to the same model's descriptions of
-    the database's frames), predict_image (that description, matched to frames) and
-    predict_generated_image (an image that the image server generates from it, matched to frames).
-    null uses cot_text for a student, and the first three for a base."""
+    the database's frames) and predict_image (that description, matched to frames). null uses
+    cot_text for a student, and all three for a base."""
     batch: int = setting(16, least=1)
     """Queries or frames per forward pass of the writing model."""
     seed: int = setting(0, least=0)
     """Seed of sampled texts and of the bootstrap."""
 
     def find_problems(self, group: str) -> list[str]:
-        routes = self.routes or ()
-        if "predict_drawn" in routes:
-            return ["routes: predict_drawn is now called predict_generated_image"]
-        problems = check_choices("routes", self.routes, ROUTES)
-        generates = "predict_generated_image" in routes
-        if generates and not (self.images.urls and self.images.model):
-            problems.append(
-                "routes: predict_generated_image needs an image server: set "
-                "images.url=http://HOST:PORT/v1 and images.model=NAME"
-            )
-        return problems
+        return check_choices("routes", self.routes, ROUTES)
 
 
 @dataclass

@@ -1,8 +1,7 @@
-"""Settings of the clients of OpenAI-compatible servers: teacher, measured model and images."""
+"""Settings of the clients of OpenAI-compatible servers: teacher and measured model."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -63,27 +62,6 @@ class ServerConfig(ServersConfig):
         yield from super().find_problems(group)
         if self.model is not None and self.url is None:
             yield f"{group}model={self.model} without a server: give {group}url=..."
-
-
-@dataclass
-class ImageServerConfig(ServersConfig):
-    """Servers that generate images from text (/v1/images/generations, as in vLLM-Omni)."""
-
-    GROUP: ClassVar[str] = "images"
-
-    concurrency: int = setting(4, least=1)
-    """Concurrent requests over all servers."""
-    timeout: float = setting(600.0, least=1)
-    """Timeout of a request (s)."""
-    size: str = "480x320"
-    """Width x height (px) of a generated image, before it is preprocessed like a frame."""
-    seed: int = setting(0, least=0)
-    """Seed of every image, so that the same text gives the same image."""
-
-    def find_problems(self, group: str) -> Iterator[str]:
-        yield from super().find_problems(group)
-        if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", self.size):
-            yield f"{group}size={self.size} is not a size in px, such as 480x320"
 
 
 @dataclass

@@ -7,7 +7,8 @@ prefix's and its question's unit embeddings.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,10 +60,7 @@ class DualEncoder:
         return unit_rows(prefixes + self.texts([q.question for q in queries]))
 
     def frames(self, refs: list[FrameRef], frames: FrameReader) -> np.ndarray:
-        return self.images([frames.array(f.scene_id, f.frame) for f in refs])
-
-    def images(self, images: list[np.ndarray]) -> np.ndarray:
-        return self._embed_images(np.stack(images))
+        return self._embed_images(np.stack([frames.array(f.scene_id, f.frame) for f in refs]))
 
     def texts(self, texts: list[str]) -> np.ndarray:
         """Texts beyond the model's maximum length are truncated, as by its authors."""
@@ -133,9 +131,8 @@ def load_dual(preset: RetrieverConfig, precision: str) -> DualEncoder:
         UserError: It cannot be loaded, is of another type, is incomplete, or needs another image
             size.
     """
-    check_reachable("retriever", preset.model)
     origin = {"revision": preset.revision, "trust_remote_code": preset.trust_remote_code}
-    try:
+    with reading_model(preset.model):
         config = AutoConfig.from_pretrained(preset.model, **origin)
         if config.model_type not in DUAL:
             raise UserError(
@@ -144,9 +141,7 @@ def load_dual(preset: RetrieverConfig, precision: str) -> DualEncoder:
                 code="wrong-model-type",
             )
         processor = AutoProcessor.from_pretrained(preset.model, **origin)
-        model = load_complete(AutoModel, preset.model, precision, "model", **origin)
-    except UNREADABLE as error:
-        raise load_error("retriever", preset.model, error) from error
+        model = load_complete(AutoModel, preset.model, precision, **origin)
     for part in ("image_processor", "tokenizer"):
         if not hasattr(processor, part):
             raise UserError(
@@ -159,8 +154,18 @@ def load_dual(preset: RetrieverConfig, precision: str) -> DualEncoder:
     return DualEncoder(preset, model, model, processor.tokenizer, processor.image_processor)
 
 
+@contextmanager
+def reading_model(source: str, key: str = "model") -> Iterator[None]:
+    """Raise a UserError that names the setting `key` if its model's files cannot be read."""
+    check_reachable("retriever", source, key)
+    try:
+        yield
+    except UNREADABLE as error:
+        raise load_error("retriever", source, error, key) from error
+
+
 def load_complete(
-    kind: Any, source: str, precision: str, key: str, **options: Any
+    kind: Any, source: str, precision: str, key: str = "model", **options: Any
 ) -> PreTrainedModel:
     """Load a model from safetensors, onto a GPU if there is one.
 

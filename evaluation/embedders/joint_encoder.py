@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PIL import Image
 
 from conf.schema import RetrieverConfig
 from data.records import FrameRef
 from data.render.frame_cache import FrameReader
 from evaluation.embedders.base import Encoder, Query
-from evaluation.retrieval.late_interaction import embed_rows
+from evaluation.embedders.cache import pad_rows
 from models.compat import keep_freed_memory
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
 
@@ -36,11 +35,7 @@ class JointEncoder:
 
     def frames(self, refs: list[FrameRef], frames: FrameReader) -> np.ndarray:
         inputs = [frame_input(ref, frames) for ref in refs]
-        return self._encode(inputs, self._preset.frame_instruction, "frame")
-
-    def images(self, images: list[np.ndarray]) -> np.ndarray:
-        inputs = [Image.fromarray(pixels) for pixels in images]
-        return self._encode(inputs, self._preset.frame_instruction, "frame")
+        return self._encode(inputs, self._preset.frame_instruction, "document")
 
     def texts(self, texts: list[str]) -> np.ndarray:
         longest = max(map(len, self._model.tokenizer(texts)["input_ids"]))
@@ -50,27 +45,24 @@ class JointEncoder:
         return np.concatenate([self._encode(batch, instruction, "query") for batch in batches])
 
     def _encode(self, inputs: list[Any], prompt: str, kind: str) -> np.ndarray:
-        if self._preset.late is not None:
-            return embed_rows(self._model, inputs, prompt, kind)
+        """A row holds one vector, or an input's vectors one after the other."""
+        task = {} if self._preset.late is None else {"task": kind}
         embeddings = self._model.encode(
-            inputs, prompt=prompt, batch_size=len(inputs), show_progress_bar=False
-        )
-        return np.asarray(embeddings, dtype=np.float32)
+            inputs, prompt=prompt, batch_size=len(inputs), convert_to_numpy=True,
+            show_progress_bar=False, **task,
+        )  # fmt: skip
+        return pad_rows([np.ravel(e) for e in embeddings])
 
 
-def trained_encoder(preset: RetrieverConfig, precision: str, saved: Path) -> Encoder:
-    """Load a retriever that `train.contrastive` saved. Errors are those of `load_trained`."""
-    keep_freed_memory()
-    return JointEncoder(load_trained(preset, precision, saved), preset)
-
-
-def released_encoder(preset: RetrieverConfig, precision: str, folder: Path) -> Encoder:
-    """Load a preset's model as it was released; `folder` holds a base that was built from a seed.
+def load_encoder(preset: RetrieverConfig, precision: str, saved: Path | None) -> Encoder:
+    """Load the retriever in `saved`, or without a folder a preset's model as it was released.
 
     Raises:
         UserError: The model cannot be loaded, is incomplete, or is not of the preset's encoder.
     """
     keep_freed_memory()
+    if saved is not None:
+        return JointEncoder(load_trained(preset, precision, saved), preset)
     if preset.encoder == "vlm2vec":
         from evaluation.embedders.vlm2vec import load_vlm2vec
 
@@ -83,4 +75,5 @@ def released_encoder(preset: RetrieverConfig, precision: str, folder: Path) -> E
         from evaluation.embedders.languagebind import load_languagebind
 
         return load_languagebind(preset, precision)
-    return JointEncoder(load_retriever(preset, precision, [], folder), preset)
+    # A base that is built from a seed was built before, and is loaded from its folder.
+    return JointEncoder(load_retriever(preset, precision, [], Path()), preset)

@@ -14,7 +14,6 @@ import torch
 from torch import nn
 from transformers import CLIPConfig, CLIPImageProcessor, CLIPModel, CLIPTokenizer
 from transformers.models.clip.modeling_clip import CLIPAttention, CLIPEncoderLayer
-from transformers.utils import logging as transformers_logging
 
 from conf.errors import UserError
 from conf.schema import RetrieverConfig
@@ -24,9 +23,9 @@ from evaluation.embedders.dual_encoder import (
     check_tokenizer,
     image_features,
     load_complete,
+    reading_model,
     unit_rows,
 )
-from models.loading import UNREADABLE, check_reachable, load_error
 
 
 class TemporalLayer(CLIPEncoderLayer):
@@ -72,11 +71,13 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
         UserError: A model cannot be loaded, is of another type, is incomplete, or needs another
             number or size of frames.
     """
-    check_reachable("retriever", preset.model)
-    check_reachable("retriever", preset.image_model, "image_model")
-    video_config = _config(preset.model, preset.revision, "model")
+    image_source = preset.image_model, "image_model"
+    with reading_model(preset.model):
+        video_config = read_config(preset.model, preset.revision)
+    with reading_model(*image_source):
+        image_config = read_config(preset.image_model, preset.image_revision)
     times = getattr(video_config.vision_config, "num_frames", None)
-    if not _is_video_model(video_config):
+    if not is_video_model(video_config):
         raise UserError(
             f"retriever.model={preset.model} has no attention over time: set a fully fine-tuned "
             "LanguageBind video model, such as LanguageBind/LanguageBind_Video_FT",
@@ -88,8 +89,7 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
             f"set retriever.frames={times}",
             code="wrong-frame-count",
         )
-    image_config = _config(preset.image_model, preset.image_revision, "image_model")
-    if _is_video_model(image_config):
+    if is_video_model(image_config):
         raise UserError(
             f"retriever.image_model={preset.image_model} is a video model: set an image model of "
             "LanguageBind, such as LanguageBind/LanguageBind_Image",
@@ -97,21 +97,14 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
         )
     check_size(preset, video_config)
     check_size(preset, image_config)
-    try:
+    with reading_model(preset.model):
         origin = {"revision": preset.revision}
         tokenizer = CLIPTokenizer.from_pretrained(preset.model, **origin)
-        video = load_complete(
-            LanguageBindVideo, preset.model, precision, "model", config=video_config, **origin
-        )
-    except UNREADABLE as error:
-        raise load_error("retriever", preset.model, error) from error
-    try:
-        origin = {"revision": preset.image_revision}
-        image = load_complete(
-            CLIPModel, preset.image_model, precision, "image_model", config=image_config, **origin
-        )
-    except UNREADABLE as error:
-        raise load_error("retriever", preset.image_model, error, "image_model") from error
+        origin["config"] = video_config
+        video = load_complete(LanguageBindVideo, preset.model, precision, **origin)
+    with reading_model(*image_source):
+        origin = {"revision": preset.image_revision, "config": image_config}
+        image = load_complete(CLIPModel, preset.image_model, precision, "image_model", **origin)
     check_tokenizer(preset, video_config, tokenizer)
     size = {"height": preset.image_size, "width": preset.image_size}
     # The released models lack a processor file; their authors' transform is CLIP's.
@@ -130,17 +123,11 @@ def spread(frames: int, wanted: int) -> list[int]:
     return [int(k) for k in np.linspace(0, frames - 1, wanted).round()]
 
 
-def _is_video_model(config: CLIPConfig) -> bool:
+def is_video_model(config: CLIPConfig) -> bool:
     return getattr(config.vision_config, "add_time_attn", False)
 
 
-def _config(source: str, revision: str | None, key: str) -> CLIPConfig:
-    # transformers warns each time that the file has another model type.
-    before = transformers_logging.get_verbosity()
-    transformers_logging.set_verbosity_error()
-    try:
-        return CLIPConfig.from_pretrained(source, revision=revision)
-    except UNREADABLE as error:
-        raise load_error("retriever", source, error, key) from error
-    finally:
-        transformers_logging.set_verbosity(before)
+def read_config(source: str, revision: str | None) -> CLIPConfig:
+    # CLIPConfig.from_pretrained would warn that the file has another model type.
+    config, _ = CLIPConfig.get_config_dict(source, revision=revision)
+    return CLIPConfig.from_dict(config)

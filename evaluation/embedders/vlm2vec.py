@@ -10,8 +10,9 @@ from sentence_transformers.sentence_transformer.modules import Normalize, Poolin
 
 from conf.errors import UserError
 from conf.schema import RetrieverConfig
+from evaluation.embedders.dual_encoder import reading_model
 from models.checks import check_processor
-from models.loading import DTYPES, UNREADABLE, check_reachable, load_error, pin_sizes
+from models.loading import DTYPES, pin_sizes
 from models.retriever.embedder import PROCESSING
 
 TEMPLATE = (
@@ -35,9 +36,8 @@ def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer
         UserError: The model or its base cannot be loaded, is not a Qwen2-VL, is incomplete, or has
             the processor of another model.
     """
-    check_reachable("retriever", preset.model)
     origin = {"revision": preset.revision, "trust_remote_code": preset.trust_remote_code}
-    try:
+    with reading_model(preset.model):
         backbone = Transformer(
             preset.model,
             model_kwargs={"dtype": DTYPES[precision], "use_safetensors": True, **origin},
@@ -45,8 +45,6 @@ def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer
             config_kwargs=origin,
             processing_kwargs=PROCESSING,
         )
-    except UNREADABLE as error:
-        raise load_error("retriever", preset.model, error) from error
     config = backbone.model.config
     if config.model_type != "qwen2_vl":
         raise UserError(

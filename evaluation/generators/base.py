@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
 from conf.schema import SelectCommand, SftCommand, StudentConfig, TwoStageCommand
 from data.records import SelectionItem
 from data.render.frame_cache import FrameReader
-from evaluation.generators.response_log import RECORD_MODES, SaveResponses, Subject
+from evaluation.generators.response_log import RECORD_MODES, SampleOf, SaveResponses, Subject
 from evaluation.generators.response_schema import instruction as record_instruction
 from evaluation.generators.response_schema import schema
 from models.precision import resolve_precision
@@ -33,14 +32,14 @@ class Generator(Protocol):
     revision: dict[str, Any]
 
     def respond(
-        self,
-        mode: str,
-        sample_of: Callable[[Subject], Sample],
-        subjects: list[Subject],
-        save: SaveResponses,
+        self, mode: str, sample_of: SampleOf, subjects: list[Subject], save: SaveResponses
     ) -> None:
         """Respond to the prompt `sample_of(subject)` of each subject, and save responses as they
-        finish."""
+        finish.
+
+        Raises:
+            UserError: Memory runs out, no server responds, or a subject gets no response.
+        """
 
 
 def open_generator(
@@ -97,9 +96,10 @@ def response_settings(
 ) -> dict[str, Any]:
     """Return everything except the subject that a response in a mode depends on."""
     sampling: dict[str, Any] = {
-        "max_new_tokens": response_token_limit(mode, student.max_new_tokens, student.thinking)
+        "max_new_tokens": response_token_limit(mode, student.max_new_tokens, student.thinking),
+        "thinking": student.thinking,
+        "temperature": student.temperature,
     }
-    sampling |= {"thinking": student.thinking, "temperature": student.temperature}
     if student.temperature:
         sampling |= {"top_p": student.top_p, "top_k": student.top_k, "seed": seed}
     return {

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import xgrammar
 from torch import nn
 from transformers import ProcessorMixin
 from xgrammar.contrib.hf import LogitsProcessor
 
 from conf.schema import SelectCommand, StudentConfig, TwoStageCommand
-from evaluation.generators.constrained_decoding import compile_record_grammar
-from evaluation.generators.response_log import SaveResponses, Subject, response_seed
+from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
+from evaluation.generators.response_schema import schema
 from models import loading
 from models.compat import keep_freed_memory
 from models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
@@ -22,7 +23,6 @@ from models.memory import explain_out_of_memory
 from models.resolved import check_base
 from models.student.collator import Collator
 from models.student.generation import THOUGHT, generate, response_token_limit
-from models.student.prompts import Sample
 from models.student.token_sampling import sampling_processors
 from models.trained_runs import product_folder, run_title
 
@@ -64,7 +64,8 @@ class LocalModel:
             self.revision["architecture"] = asdict(student.architecture)
 
     @cached_property
-    def _loaded(self) -> tuple[nn.Module, ProcessorMixin]:
+    def loaded(self) -> tuple[nn.Module, ProcessorMixin]:
+        """The model and its processor."""
         keep_freed_memory()
         if self._weights is not None:
             return loading.load_trained(self._student, self._precision, self._weights)
@@ -72,52 +73,46 @@ class LocalModel:
         return loading.for_inference(model), processor
 
     def respond(
-        self,
-        mode: str,
-        sample_of: Callable[[Subject], Sample],
-        subjects: list[Subject],
-        save: SaveResponses,
+        self, mode: str, sample_of: SampleOf, subjects: list[Subject], save: SaveResponses
     ) -> None:
-        generate_responses(
-            *self._loaded, self._student, self._precision, self._batch, self._seed,
-            mode, sample_of, subjects, save,
-        )  # fmt: skip
+        """Respond to a batch of subjects at a time.
+
+        In constrained mode the tokens are restricted to those of a valid record.
+        """
+        (model, processor), cfg = self.loaded, self._student
+        collator = Collator(processor, cfg.max_length, cfg.thinking)
+        limit = response_token_limit(mode, cfg.max_new_tokens, cfg.thinking)
+        grammar = compile_record_grammar(model, processor) if mode == "constrained" else None
+        for start in range(0, len(subjects), self._batch):
+            group = subjects[start : start + self._batch]
+            steps = sampling_processors(cfg, [response_seed(self._seed, s, mode) for s in group])
+            if grammar is not None:
+                # The grammar comes first, so that tokens are sampled from those that it allows.
+                steps.insert(0, LogitsProcessor(grammar))
+            inputs = collator([sample_of(subject) for subject in group])
+            with explain_out_of_memory(
+                f"with {len(group)} items in a batch", "lower batch, in a separate run (run=NAME)"
+            ):
+                texts = generate(model, processor, inputs, limit, self._precision, steps)
+            if grammar is not None:
+                # A response that is a record from its first token on holds no thought.
+                texts = [replace(t, text=t.text.removeprefix(THOUGHT)) for t in texts]
+            save(list(zip(group, texts, strict=True)))
 
 
-def generate_responses(
-    model: nn.Module,
-    processor: ProcessorMixin,
-    cfg: StudentConfig,
-    precision: str,
-    batch: int,
-    seed: int,
-    mode: str,
-    sample_of: Callable[[Subject], Sample],
-    subjects: list[Subject],
-    save: SaveResponses,
-) -> None:
-    """Generate a response to each subject, `batch` at a time.
+def compile_record_grammar(model: nn.Module, processor: ProcessorMixin) -> xgrammar.CompiledGrammar:
+    """Compile the record's JSON schema over a model's tokens.
 
-    In constrained mode the tokens are restricted to those of a valid record.
-
-    Raises:
-        UserError: Memory runs out.
+    Each batch needs its own `LogitsProcessor`, which keeps the state of its responses.
     """
-    collator = Collator(processor, cfg.max_length, cfg.thinking)
-    limit = response_token_limit(mode, cfg.max_new_tokens, cfg.thinking)
-    grammar = compile_record_grammar(model, processor) if mode == "constrained" else None
-    for start in range(0, len(subjects), batch):
-        group = subjects[start : start + batch]
-        processors = sampling_processors(cfg, [response_seed(seed, s, mode) for s in group])
-        if grammar is not None:
-            # The grammar comes first, so that tokens are sampled from those that it allows.
-            processors.insert(0, LogitsProcessor(grammar))
-        inputs = collator([sample_of(subject) for subject in group])
-        with explain_out_of_memory(
-            f"with {len(group)} items in a batch", "lower batch, in a separate run (run=NAME)"
-        ):
-            texts = generate(model, processor, inputs, limit, precision, processors)
-        if grammar is not None:
-            # A response that is a record from its first token on holds no thought.
-            texts = [replace(t, text=t.text.removeprefix(THOUGHT)) for t in texts]
-        save(list(zip(group, texts, strict=True)))
+    tokenizer = processor.tokenizer
+    tokens = xgrammar.TokenizerInfo.from_huggingface(
+        tokenizer,
+        vocab_size=model.config.get_text_config().vocab_size,
+        # Both end a response, so the grammar must not allow them inside a string.
+        stop_token_ids=[tokenizer.eos_token_id, tokenizer.pad_token_id],
+    )
+    # Free whitespace would let a model write spaces until the token limit.
+    return xgrammar.GrammarCompiler(tokens).compile_json_schema(
+        json.dumps(schema()), any_whitespace=False
+    )

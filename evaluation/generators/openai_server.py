@@ -6,7 +6,6 @@ import asyncio
 import base64
 import io
 import logging
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from PIL import Image
 
 from conf.errors import UserError
 from conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageCommand
-from evaluation.generators.response_log import SaveResponses, Subject, response_seed
+from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
 from evaluation.generators.response_schema import schema
 from models.fingerprints import processor_digest, weights_digest
 from models.student.generation import THOUGHT, GeneratedText, response_token_limit
@@ -97,65 +96,45 @@ class ServedModel:
             )
 
     def respond(
-        self,
-        mode: str,
-        sample_of: Callable[[Subject], Sample],
-        subjects: list[Subject],
-        save: SaveResponses,
+        self, mode: str, sample_of: SampleOf, subjects: list[Subject], save: SaveResponses
     ) -> None:
-        asyncio.run(
-            generate_responses(
-                self._server, self._student, self._seed, mode, sample_of, subjects, save
-            )
-        )
+        """Respond to `server.concurrency` subjects at a time."""
+        asyncio.run(self._respond(mode, sample_of, subjects, save))
 
+    async def _respond(
+        self, mode: str, sample_of: SampleOf, subjects: list[Subject], save: SaveResponses
+    ) -> None:
+        cfg, server = self._student, self._server
+        loop = asyncio.get_running_loop()
+        # A response that is a record from its first token on holds no thought.
+        opened = cfg.thinking and mode != "constrained"
+        # The frame cache is not thread-safe, so one thread prepares all samples.
+        with ThreadPoolExecutor(1) as preparer:
 
-async def generate_responses(
-    server: ServerConfig,
-    cfg: StudentConfig,
-    seed: int,
-    mode: str,
-    sample_of: Callable[[Subject], Sample],
-    subjects: list[Subject],
-    save: SaveResponses,
-) -> None:
-    """Generate a response to each subject, `server.concurrency` at a time.
+            def prepare(subject: Subject) -> tuple[Messages, RequestFields]:
+                sample = sample_of(subject)
+                return build_messages(sample), request_fields(cfg, mode, sample.clip)
 
-    Raises:
-        UserError: No server responds, a server does not accept a clip and images, or a single
-            subject has no response.
-    """
-    loop = asyncio.get_running_loop()
-    # A response that is a record from its first token on holds no thought.
-    opened = cfg.thinking and mode != "constrained"
-    # The frame cache is not thread-safe, so one thread prepares all samples.
-    with ThreadPoolExecutor(1) as preparer:
+            first = await loop.run_in_executor(preparer, sample_of, subjects[0])
+            canary = build_messages(blank_sample(first))
+            async with ServerPool(server, request_fields(cfg, mode, first.clip), canary) as pool:
 
-        def messages_of(subject: Subject) -> tuple[Messages, Clip | None]:
-            sample = sample_of(subject)
-            return build_messages(sample), sample.clip
+                async def respond(subject: Subject) -> None:
+                    messages, fields = await loop.run_in_executor(preparer, prepare, subject)
+                    if cfg.temperature:
+                        fields["seed"] = response_seed(self._seed, subject, mode)
+                    try:
+                        [response] = await pool.complete(messages, **fields)
+                    except NoResponseError as error:
+                        raise UserError(
+                            f"{server.model} has no response to {subject.name} ({error}): correct "
+                            "that and run the same command again; it resumes after the responses "
+                            "in its log",
+                            code="no-response",
+                        ) from error
+                    save([(subject, restore_thought(response, opened))])
 
-        first = await loop.run_in_executor(preparer, sample_of, subjects[0])
-        request = request_fields(cfg, mode, first.clip)
-        async with ServerPool(server, request, build_messages(blank_sample(first))) as pool:
-
-            async def respond(subject: Subject) -> None:
-                messages, clip = await loop.run_in_executor(preparer, messages_of, subject)
-                fields = request_fields(cfg, mode, clip)
-                if cfg.temperature:
-                    fields["seed"] = response_seed(seed, subject, mode)
-                try:
-                    [response] = await pool.complete(messages, **fields)
-                except NoResponseError as error:
-                    raise UserError(
-                        f"{server.model} has no response to {subject.name} ({error}): correct "
-                        "that and run the same command again; it resumes after the responses in "
-                        "its log",
-                        code="no-response",
-                    ) from error
-                save([(subject, restore_thought(response, opened))])
-
-            await run_limited(subjects, server.concurrency, respond)
+                await run_limited(subjects, server.concurrency, respond)
 
 
 def build_messages(sample: Sample) -> Messages:
@@ -272,16 +251,11 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
             "python -m teacher.serve frames=true, and run this again",
             code="no-server",
         )
-    (url, origin), *others = origins.items()
-    for other_url, other in others:
-        if other != origin:
-            raise UserError(
-                f"server.url: the name {server.model} is {_describe(origin)} at {url} and "
-                f"{_describe(other)} at {other_url}: list servers of one model",
-                code="different-models",
-            )
+    first, origin = next(iter(origins.items()))
+    if others := [url for url, other in origins.items() if other != origin]:
+        raise UserError(
+            f"server.url: {first} and {others[0]} serve different models by the name "
+            f"{server.model}: list servers of one model",
+            code="different-models",
+        )
     return origin
-
-
-def _describe(origin: dict[str, str | None]) -> str:
-    return f"{origin['root']} over {origin['parent']}" if origin["parent"] else f"{origin['root']}"

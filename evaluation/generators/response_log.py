@@ -14,11 +14,16 @@ from tqdm import tqdm
 
 from data.records import FrameRef, RetrievalQuery, SelectionItem
 from evaluation.generators.response_schema import Record, read_record
+from evaluation.reporting.runs import json_lines
+from models.fingerprints import settings_key
 from models.student.answer_parser import parse_choice
 from models.student.generation import GeneratedText
+from models.student.prompts import Sample
 
 Subject = SelectionItem | RetrievalQuery | FrameRef
 """What a response is about."""
+SampleOf = Callable[[Subject], Sample]
+"""Builds the prompt about a subject."""
 SaveResponses = Callable[[list[tuple[Subject, GeneratedText]]], None]
 """Saves the responses of a batch as soon as it is finished."""
 Respond = Callable[[list[Subject], SaveResponses], None]
@@ -29,24 +34,34 @@ RECORD_MODES = ("record", "constrained")
 
 
 @dataclass(frozen=True)
-class Answer:
-    """A response to an item in a mode.
+class ModelResponse:
+    """A response in a mode.
 
     Attributes:
-        letter: The chosen letter; None if the response cannot be parsed.
-        reason: Why the letter is None.
-        valid: Whether the structured record is valid; None in modes without a record.
+        item_id: Name of the item, query or frame.
         cut: Whether generation stopped at the token limit.
     """
 
     item_id: str
     mode: str
     text: str
+    cut: bool
+
+
+@dataclass(frozen=True)
+class Answer(ModelResponse):
+    """A response to a selection item.
+
+    Attributes:
+        letter: The chosen letter; None if the response cannot be parsed.
+        reason: Why the letter is None.
+        valid: Whether the structured record is valid; None in modes without a record.
+    """
+
     letter: str | None
     reason: str | None
     right: bool
     valid: bool | None
-    cut: bool
 
     @property
     def record(self) -> Record | None:
@@ -54,36 +69,16 @@ class Answer:
         return read_record(self.text) if self.valid else None
 
 
-@dataclass(frozen=True)
-class FreeTextResponse:
-    """A response without a letter, to the query or frame named `item_id`."""
-
-    item_id: str
-    mode: str
-    text: str
-    cut: bool
-
-
-Response = Answer | FreeTextResponse
-
-
-def score_response(item: SelectionItem, mode: str, generated: GeneratedText) -> Answer:
-    """Parse a response to an item and compare its letter with the item's."""
-    answer = parse_choice(generated.text, cut=generated.cut)
-    return Answer(
-        item.item_id,
-        mode,
-        generated.text,
-        answer.letter,
-        str(answer.reason) if answer.letter is None and answer.reason else None,
-        right=answer.letter == item.letter,
-        valid=read_record(generated.text) is not None if mode in RECORD_MODES else None,
-        cut=generated.cut,
-    )
-
-
-def free_text_response(subject: Subject, mode: str, generated: GeneratedText) -> FreeTextResponse:
-    return FreeTextResponse(subject.name, mode, generated.text, generated.cut)
+def score_response(subject: Subject, mode: str, generated: GeneratedText) -> ModelResponse:
+    """Return a response; one to an item is parsed, and its letter compared with the item's."""
+    text, cut = generated.text, generated.cut
+    if not isinstance(subject, SelectionItem):
+        return ModelResponse(subject.name, mode, text, cut)
+    parsed = parse_choice(text, cut=cut)
+    letter, is_right = parsed.letter, parsed.letter == subject.letter
+    reason = str(parsed.reason) if letter is None and parsed.reason else None
+    valid = read_record(text) is not None if mode in RECORD_MODES else None
+    return Answer(subject.name, mode, text, cut, letter, reason, is_right, valid)
 
 
 class ResponseLog:
@@ -96,18 +91,13 @@ class ResponseLog:
     """
 
     def __init__(
-        self,
-        path: Path,
-        settings: dict[str, dict[str, Any]],
-        subjects: Sequence[Subject],
-        score: Callable[[Subject, str, GeneratedText], Response] = score_response,
+        self, path: Path, settings: dict[str, dict[str, Any]], subjects: Sequence[Subject]
     ) -> None:
         self._path = path
-        self.keys = {mode: _key(mode, of_mode) for mode, of_mode in settings.items()}
-        self.score = score
+        self.keys = {mode: settings_key([mode, of_mode]) for mode, of_mode in settings.items()}
         self._subject_of = {subject.name: subject for subject in subjects}
-        rows = _read_rows(path)
-        self.answers = self._answers(rows)
+        rows = list(json_lines(path)) if path.exists() else []
+        self.responses = self._score(rows)
         recorded = {row.get("key") for row in rows if "asked" in row}
         heads = [
             {"key": key, "mode": mode, "asked": settings[mode]}
@@ -120,28 +110,28 @@ class ResponseLog:
 
     def take_over(self, others: Iterable[Path]) -> int:
         """Add other files' responses under the same keys; return their number."""
-        before = len(self.answers)
+        before = len(self.responses)
         for path in others:
-            found = self._answers(_read_rows(path))
-            self.append([answer for key, answer in found.items() if key not in self.answers])
-        return len(self.answers) - before
+            found = self._score(json_lines(path))
+            self.append([r for key, r in found.items() if key not in self.responses])
+        return len(self.responses) - before
 
-    def _answers(self, rows: list[dict[str, Any]]) -> dict[tuple[str, str], Response]:
+    def _score(self, rows: Iterable[dict[str, Any]]) -> dict[tuple[str, str], ModelResponse]:
         """Score the rows under this log's keys; damaged ones are left out and generated again."""
-        answers = {}
+        responses = {}
         for row in rows:
             try:
                 name, mode = row["item_id"], row["mode"]
                 if name in self._subject_of and row["key"] == self.keys.get(mode, ""):
                     generated = GeneratedText(row["text"], row["cut"])
-                    answers[name, mode] = self.score(self._subject_of[name], mode, generated)
+                    responses[name, mode] = score_response(self._subject_of[name], mode, generated)
             except (ValueError, TypeError, KeyError, AttributeError):
                 continue
-        return answers
+        return responses
 
-    def append(self, answers: list[Response]) -> None:
-        self._write([json.dumps({**asdict(a), "key": self.keys[a.mode]}) for a in answers])
-        self.answers |= {(a.item_id, a.mode): a for a in answers}
+    def append(self, responses: list[ModelResponse]) -> None:
+        self._write([json.dumps({**asdict(r), "key": self.keys[r.mode]}) for r in responses])
+        self.responses |= {(r.item_id, r.mode): r for r in responses}
 
     def _write(self, lines: list[str]) -> None:
         """Append lines durably: they survive a crash of the machine."""
@@ -151,38 +141,21 @@ class ResponseLog:
             os.fsync(file.fileno())
 
 
-def _read_rows(path: Path) -> list[dict[str, Any]]:
-    """Read the JSON objects of a file, without lines that a kill cut off."""
-    rows = []
-    for line in path.read_bytes().splitlines() if path.exists() else []:
-        try:
-            row = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(row, dict):
-            rows.append(row)
-    return rows
-
-
-def _key(mode: str, settings: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps([mode, settings], sort_keys=True).encode()).hexdigest()[:16]
-
-
 def collect_responses(
     subjects: Sequence[Subject], mode: str, respond: Respond, log: ResponseLog, unit: str = "item"
-) -> list[Response]:
+) -> list[ModelResponse]:
     """Return the response to each subject in `mode`, and generate those that the log lacks."""
-    missing = [s for s in subjects if (s.name, mode) not in log.answers]
+    missing = [s for s in subjects if (s.name, mode) not in log.responses]
     done = len(subjects) - len(missing)
     with tqdm(total=len(subjects), initial=done, desc=mode, unit=unit) as bar:
 
-        def save(responses: list[tuple[Subject, GeneratedText]]) -> None:
-            log.append([log.score(subject, mode, generated) for subject, generated in responses])
-            bar.update(len(responses))
+        def save(generated: list[tuple[Subject, GeneratedText]]) -> None:
+            log.append([score_response(subject, mode, text) for subject, text in generated])
+            bar.update(len(generated))
 
         if missing:
             respond(missing, save)
-    return [log.answers[s.name, mode] for s in subjects]
+    return [log.responses[s.name, mode] for s in subjects]
 
 
 def response_seed(seed: int, subject: Subject, mode: str) -> int:

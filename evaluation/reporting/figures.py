@@ -5,7 +5,6 @@ Figures are built without pyplot, so that they leave no global state and need no
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,12 +20,10 @@ from train.common.curves import COLORS, empty_figure
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from PIL.Image import Image
 
-INK, FAINT, GRID, GREEN, RED = "#333333", "#bbbbbb", "#eeeeee", "#228833", "#cc3311"
+INK, FAINT, GRID = "#333333", "#bbbbbb", "#eeeeee"
 GRAY = "#999999"
 """Color of untrained retrievers."""
-PREFIX_COLUMNS = 6
 """Prefix frames in one line of an item's figure."""
 
 
@@ -145,47 +142,6 @@ def recall_figure(curves: Mapping[str, Mapping[str, Any]], path: Path) -> None:
     _recall_axes(axes, "k", 10)
     axes.set_ylabel("Queries (%)")
     _legend_above(figure, axes)
-    figure.savefig(path)
-
-
-def item_figure(
-    prefix_images: Sequence[Image],
-    candidate_images: Sequence[Image],
-    letters: str,
-    answer: str,
-    chosen: str | None,
-    question: str,
-    path: Path | str,
-) -> None:
-    """One selection item: the prefix in temporal order, the question, and the candidates.
-
-    The target has a green frame and a wrong choice a red one. `chosen` is None without an answer.
-    """
-    aspect = prefix_images[0].height / prefix_images[0].width
-    columns = min(len(prefix_images), PREFIX_COLUMNS)
-    lines, title = -(-len(prefix_images) // columns), textwrap.wrap(question, 100)
-    heights = [0.25 + lines * 9 / columns * aspect, 0.7 + 0.2 * len(title) + 9 / 4 * aspect]
-    figure = empty_figure(9, sum(heights))
-    top, bottom = figure.subfigures(2, 1, height_ratios=heights)
-    for axes in top.subplots(lines, columns, squeeze=False).flat:
-        axes.set_axis_off()
-    for axes, image in zip(top.axes, prefix_images, strict=False):
-        axes.imshow(image)
-    bottom.suptitle("\n".join(title), x=0.01, ha="left", fontsize=12, color=INK)
-
-    panels = bottom.subplots(1, len(candidate_images), squeeze=False)[0]
-    for axes, image, letter in zip(panels, candidate_images, letters, strict=True):
-        axes.imshow(image)
-        axes.set(xticks=[], yticks=[])
-        notes = [name for name, at in (("target", answer), ("chosen", chosen)) if letter == at]
-        color = GREEN if letter == answer else RED if letter == chosen else None
-        axes.set_title(
-            f"{letter}  {', '.join(notes)}", fontsize=11, loc="left", color=color or INK,
-            fontweight="bold" if color else "normal",
-        )  # fmt: skip
-        axes.spines[:].set(visible=True, edgecolor=color or FAINT, linewidth=4 if color else 0.8)
-    if chosen is None:
-        bottom.text(0.99, 0.01, "no answer", ha="right", va="bottom", fontsize=11, color=RED)
     figure.savefig(path)
 
 

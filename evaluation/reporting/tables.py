@@ -204,22 +204,6 @@ def builder_tables(results: Sequence[RetrievalResult]) -> list[Table]:
     return tables
 
 
-def index_table(indexes: Iterable[Mapping[str, Any]]) -> Table:
-    """Approximate indexes compared with an exact search, as `evaluation.retrieval.faiss_index`
-    describes them, each with a `name`."""
-    rows = [
-        {
-            "name": index["name"], "Width": str(index["width"]),
-            **{f"R@{k}": index[f"recall@{k}"] for k in RECALLS},
-            "MiB": f"{index['bytes'] / 2**20:,.1f}", "s": f"{index['seconds']:.2f}",
-        }
-        for index in indexes
-    ]  # fmt: skip
-    note = "R@k: share of the exact first k that the index also ranks among its first k."
-    caption = "Approximate indexes compared with exact search (recall in %)"
-    return Table("indexes", caption, ["Width", *RECALL_COLUMNS, "MiB", "s"], {"": rows}, (note,))
-
-
 def rank_differences_table(differences: Iterable[RetrieverDifference]) -> Table:
     """Differences grouped by the pair of retrievers, with a row for each width."""
     columns = [*RECALL_COLUMNS, "MRR"]

@@ -32,11 +32,10 @@ class Ranks:
         widths: Widest first.
         greater, tied: (widths, queries) frames that score above the target, and other frames that
             score exactly as it does.
-        found: (widths, queries) whether the target was found; an exact search always finds it.
+        found: (widths, queries) False for a query that cannot be ranked: a miss.
         frames: Size of the database.
-        bytes: Size of the database's vectors or of their index, at each width.
-        seconds: Time to rank for all queries, at each width; an exact search ranks all widths at
-            once.
+        bytes: Size of the database's vectors at each width.
+        seconds: Time to rank for all queries, at all widths together.
     """
 
     widths: tuple[int, ...]
@@ -152,23 +151,6 @@ def exact_ranks(
     sizes = tuple(frames * width * FP32 for width in widths)
     seconds = (time.perf_counter() - began,) * len(widths)
     return Ranks(tuple(widths), greater, equal - 1, found, frames, sizes, seconds)
-
-
-def kth_scores(
-    queries: np.ndarray, database: Iterable[np.ndarray], widths: Sequence[int], ks: Sequence[int]
-) -> np.ndarray:
-    """Return the k-th highest score of each query's ranking: (widths, ks, queries) fp32.
-
-    Widths are widest first; a score is -inf if the database has fewer than k frames.
-    """
-    grid = GridEmbeddings(queries, widths)
-    best = [np.full((len(queries), max(ks)), -np.inf, np.float32) for _ in widths]
-    for block in blocks(database, widths):
-        for k, scores in enumerate(block_scores(grid, block)):
-            both = np.concatenate([best[k], scores], axis=1)
-            best[k] = np.partition(both, -max(ks), axis=1)[:, -max(ks) :]
-    falling = np.sort(np.stack(best[::-1]), axis=2)[:, :, ::-1]
-    return falling[:, :, [k - 1 for k in ks]].transpose(0, 2, 1)
 
 
 def blocks(database: Iterable[np.ndarray], widths: Sequence[int]) -> Iterator[GridEmbeddings]:

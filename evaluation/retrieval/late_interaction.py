@@ -8,17 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from evaluation.embedders.cache import pad_rows
 from evaluation.metrics.ranking import count_above_and_equal
 from evaluation.retrieval.exact_search import FP32, Ranks
-
-if TYPE_CHECKING:
-    from sentence_transformers import MultiVectorEncoder
 
 GRID = 2.0**20
 """Steps of a unit vector's entries. In this unit the product of two vectors is an integer of up to
@@ -26,22 +21,6 @@ GRID = 2.0**20
 order and block of the additions. The grid changes a cosine by about 2^-20."""
 VECTORS, CELLS = 4096, 2**23
 """Maximum frame vectors of a block, and their products with query vectors."""
-
-TASKS = {"query": "query", "frame": "document"}
-"""The library's names for the kinds of inputs."""
-
-
-def embed_rows(model: MultiVectorEncoder, inputs: list, prompt: str, kind: str) -> np.ndarray:
-    """Embed inputs of a kind, query or frame, as fp32 rows (inputs, entries)."""
-    embeddings = model.encode(
-        inputs,
-        prompt=prompt,
-        task=TASKS[kind],
-        batch_size=len(inputs),
-        convert_to_numpy=True,
-        show_progress_bar=False,
-    )
-    return pad_rows([vectors.astype(np.float32).reshape(1, -1) for vectors in embeddings])
 
 
 def late_ranks(
@@ -58,7 +37,7 @@ def late_ranks(
         database: Parts (frames, entries) of any size and order, of which one is in memory.
     """
     began = time.perf_counter()
-    target_scores = np.concatenate(list(pair_scores(queries, targets, width)))
+    target_scores = pair_scores(queries, targets, width)
     counts = np.zeros((2, 1, len(queries)), np.int64)
     frames = vectors = 0
     for rows in blocks(database, width):
@@ -77,10 +56,10 @@ def late_ranks(
     return Ranks((width,), greater, equal - 1, found, frames, (size,), (seconds,))
 
 
-def pair_scores(queries: np.ndarray, frames: np.ndarray, width: int) -> Iterator[np.ndarray]:
-    """Score each query and the frame in the same row, bit-identical to `block_scores`."""
-    for query, frame in zip(queries, frames, strict=True):
-        yield block_scores(to_grid(query[None], width), vectors_of(frame[None], width))[0]
+def pair_scores(queries: np.ndarray, frames: np.ndarray, width: int) -> np.ndarray:
+    """Score each query and the frame in the same row, bit-identical to `block_scores`: (rows,)."""
+    pairs = zip(queries[:, None], frames[:, None], strict=True)
+    return np.array([block_scores(to_grid(q, width), vectors_of(f, width))[0, 0] for q, f in pairs])
 
 
 def block_scores(queries: torch.Tensor, frames: torch.Tensor) -> np.ndarray:

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from conf.runs import write_text
 from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
 from data.tracks.retrieval.checks import check_test
-from evaluation.embedders.cache import EmbeddingCache
 from evaluation.metrics.results import RetrievalResult
 from evaluation.reporting import figures, tables
 from evaluation.reporting.table import Table
@@ -31,14 +29,6 @@ def load_standard_test(store: Store) -> tuple[list[RetrievalQuery], list[FrameRe
     queries, database = store.standard_test(), store.database("test")
     check_test(store, queries, database)
     return queries, database
-
-
-def read_parts(embeddings: EmbeddingCache, names: Sequence[str]) -> Iterator[np.ndarray]:
-    """Yield the embeddings of `names` one file at a time, in any order, with a progress bar."""
-    with tqdm(total=len(names), desc="ranking", unit="frame", leave=False) as bar:
-        for indices, rows in embeddings.parts(names):
-            yield rows
-            bar.update(len(indices))
 
 
 def rank_targets(

@@ -1,79 +1,192 @@
-"""Rank a database by the texts that a model wrote about queries, with a frozen encoder."""
+"""Two-stage retrieval: texts that a model writes about queries and frames, and the ranks by them.
+
+store/<name>/texts/<key>/
+    texts.jsonl         the texts, in a `ResponseLog`; the key is the hash of the model's revision,
+                        so that they serve any matcher
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import compress
 from typing import Any
 
 import numpy as np
 
 from conf.errors import UserError
-from conf.schema import TwoStageCommand
+from conf.runs import lock_folder
+from conf.schema import StudentConfig, TwoStageCommand
 from data.records import FrameRef, RetrievalQuery
-from data.render.frame_cache import FrameReader
 from data.store import Store
-from evaluation.embedders.base import Embedder, embed_frames, embed_images, embed_texts
-from evaluation.generators.image_server import ImageGenerator
+from evaluation.embedders.base import Embedder
+from evaluation.generators.base import Generator, response_settings
+from evaluation.generators.response_log import (
+    ModelResponse,
+    ResponseLog,
+    Subject,
+    collect_responses,
+)
 from evaluation.metrics.ranking import query_metrics
 from evaluation.retrieval.exact_search import Ranks
-from evaluation.retrieval.predicted_texts import TEXTS, Route, Texts
-from evaluation.retrieval.standard_test import rank_targets, read_parts
+from evaluation.retrieval.standard_test import rank_targets
+from models.fingerprints import settings_key
+from models.student.answer_parser import strip_thought
+from models.student.prompts import Sample
+from teacher.sections import SECTIONS, split_sections
+
+TEXTS = "texts"
+"""Their folder in a store."""
+FUTURE_SECTIONS = ("Prediction", "Outcome")
+"""The sections of a rationale that describe the future state."""
+HEADING = re.compile(
+    rf"^[\W\d_]*({'|'.join(SECTIONS)})(?:[*_ \t]*:[*_ \t]*|[*_ \t]*$)", re.MULTILINE | re.IGNORECASE
+)
+"""A section heading with the markup that models add, such as "### 3. **Prediction**"."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """A pipeline from a query to its ranking.
+
+    Attributes:
+        title: Its name in tables, as in the paper's.
+        mode: The mode in which the model writes about a query.
+        captions: Whether captions of the database's frames are matched instead of the frames.
+    """
+
+    title: str
+    mode: str
+    captions: bool = False
+
+
+ROUTES = {
+    "cot_text": Route("CoT -> text", "rationale"),
+    "predict_caption": Route("predict -> caption", "prediction", captions=True),
+    "predict_image": Route("predict -> image", "prediction"),
+}
+"""The paper's three routes (Models and metrics)."""
+
+Texts = dict[str, str]
+"""Texts by the name of a query or frame; empty if nothing usable was written."""
+
+
+def write_texts(
+    cfg: TwoStageCommand,
+    student: StudentConfig,
+    model: Generator,
+    sample_of: Callable[[str, Subject], Sample],
+    routes: Sequence[Route],
+    queries: Sequence[RetrievalQuery],
+    database: Sequence[FrameRef],
+    store: Store,
+) -> dict[str, list[ModelResponse]]:
+    """Return a model's responses in the modes that some routes need, by mode: to every frame in
+    caption mode, else to every query.
+
+    Raises:
+        UserError: Another process collects this model's texts, or the model cannot respond.
+    """
+    modes = sorted({route.mode for route in routes}, reverse=True)
+    modes += ["caption"] if any(route.captions for route in routes) else []
+    settings = {
+        mode: response_settings(mode, "", student, cfg.seed, model.revision, store.identity, None)
+        for mode in modes
+    }
+    folder = store.folder / TEXTS / settings_key(model.revision)
+    folder.mkdir(parents=True, exist_ok=True)
+    busy = f"{folder} is in use by another process; run this again when it is done"
+    with lock_folder(folder, busy):
+        log = ResponseLog(folder / "texts.jsonl", settings, [*queries, *database])
+        responses = {}
+        for mode in modes:
+            subjects, unit = (database, "frame") if mode == "caption" else (queries, "query")
+            # By scene, so that each scene's frames are decoded once.
+            ordered = sorted(subjects, key=lambda s: (s.scene_id, s.name))
+            respond = partial(model.respond, mode, partial(sample_of, mode))
+            responses[mode] = collect_responses(ordered, mode, respond, log, unit)
+        return responses
+
+
+def future_text(text: str) -> str:
+    """Return the prediction and outcome of a response if it has these sections, else all of it.
+
+    A thought is left out; one that is not closed leaves nothing.
+    """
+    # A tokenizer cannot read half of a surrogate pair, which a server may return.
+    text = text.encode(errors="replace").decode()
+    return " ".join(_future_sections(text)) or _without_thought(text)
+
+
+def _without_thought(text: str) -> str:
+    return (strip_thought(text) or "").strip()
+
+
+def _future_sections(text: str) -> list[str]:
+    plain = HEADING.sub(lambda h: f"{h[1].capitalize()}: ", _without_thought(text))
+    sections = [
+        plain[start:stop].strip()
+        for name, start, stop in split_sections(plain)
+        if name in FUTURE_SECTIONS
+    ]
+    return [section for section in sections if section]
+
+
+def count_texts(responses: Sequence[ModelResponse]) -> dict[str, int]:
+    """Count the texts, the empty and truncated ones, and those with future sections."""
+    texts = [response.text for response in responses]
+    return {
+        "texts": len(texts),
+        "  empty: a miss": sum(not _without_thought(text) for text in texts),
+        "  cut off at student.max_new_tokens": sum(response.cut for response in responses),
+        "  prediction and outcome alone": sum(bool(_future_sections(text)) for text in texts),
+    }
 
 
 def rank_by_text(
-    cfg: TwoStageCommand,
     route: Route,
     matcher: Embedder,
     texts: Mapping[str, Texts],
     queries: Sequence[RetrievalQuery],
     database: Sequence[FrameRef],
-    store: Store,
 ) -> Ranks:
     """Rank the database for every query by its text.
 
     A query without a text is a miss, and so is one whose target has no caption on a route that
     matches captions.
 
+    Args:
+        texts: The texts of queries, and the captions of frames, by mode.
+
     Raises:
-        UserError: No query has a text, or embedding or image generation fails.
+        UserError: No query has a text, or embedding fails.
     """
-    batch, preset = cfg.matcher.batch, matcher.preset
     names = [frame.name for frame in database]
     captions = texts["caption"] if route.captions else {name: name for name in names}
     text_of = [texts[route.mode][query.name] for query in queries]
     valid = [bool(t and captions[q.target.name]) for t, q in zip(text_of, queries, strict=True)]
     if not any(valid):
         raise UserError(
-            f"{route.title}: no query has a text to match, see {store.folder / TEXTS}; a thought "
-            "may have taken all of student.max_new_tokens",
+            f"{route.title}: no query has a text to match, see {matcher.store.folder / TEXTS}; a "
+            "thought may have taken all of student.max_new_tokens",
             code="no-texts",
         )
     text_of = list(compress(text_of, valid))
     targets = [query.target.name for query in compress(queries, valid)]
 
-    if route.generates_image:
-        images = ImageGenerator(cfg.images, store).respond(sorted(set(text_of)))
-        name_of = {text: f"{path.parent.name}/{path.stem}" for text, path in images.items()}
-        files = {name_of[text]: path for text, path in images.items()}
-        embeddings = embed_images(matcher, files, store, batch)
-        query_rows = embeddings.rows([name_of[text] for text in text_of])
-    else:
-        query_rows = embed_texts(matcher, text_of, store, batch).rows(text_of)
-
+    query_rows = matcher.embed_texts(text_of).rows(text_of)
     if route.captions:
         present = [captions[name] for name in names if captions[name]]
-        embeddings = embed_texts(matcher, present, store, batch)
+        embeddings = matcher.embed_texts(present)
         target_rows = embeddings.rows([captions[target] for target in targets])
         # Frames with the same caption tie, and each of them counts.
-        ranks = rank_targets(preset, query_rows, target_rows, [embeddings.rows(present)])
+        parts = [embeddings.rows(present)]
     else:
-        frames = FrameReader(store, preset.image_size)
-        embeddings = embed_frames(matcher, database, store, frames, batch)
-        ranks = rank_targets(
-            preset, query_rows, embeddings.rows(targets), read_parts(embeddings, names)
-        )
+        embeddings = matcher.embed_frames(database)
+        target_rows, parts = embeddings.rows(targets), embeddings.parts(names)
+    ranks = rank_targets(matcher.preset, query_rows, target_rows, parts)
     return add_misses(ranks, np.array(valid), len(names))
 
 

@@ -50,7 +50,6 @@ class ServerPool:
         cfg: The servers.
         fields: Fields of every request.
         canary: A prompt that any working server of this kind answers.
-        kind: The client class of one server.
     """
 
     def __init__(
@@ -58,10 +57,9 @@ class ServerPool:
         cfg: ServersConfig,
         fields: RequestFields,
         canary: Messages = CANARY,
-        kind: type[Server] = Server,
     ) -> None:
         self.cfg, self.fields, self.canary = cfg, fields, canary
-        self.servers = [kind(url, cfg) for url in dict.fromkeys(cfg.urls)]
+        self.servers = [Server(url, cfg) for url in dict.fromkeys(cfg.urls)]
         self.failing_since: float | None = None
         """Time of the first failure after the last response of any server."""
 

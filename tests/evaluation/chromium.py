@@ -1,4 +1,4 @@
-"""A headless Chromium to look at pages with."""
+"""A headless Chromium that opens pages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OVERFLOW = "return document.documentElement.scrollWidth > document.documentEleme
 
 
 def chromium_in(profile: Path) -> Iterator[webdriver.Chrome]:
-    """One with its profile in a folder, which keeps what its console says; closed at the end."""
+    """A browser with its profile in a folder, which records its console; closed at the end."""
     browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
     assert browser, "pages are tested in Chromium: apt-get install chromium"
     assert driver, "pages are tested in Chromium: apt-get install chromium-driver"

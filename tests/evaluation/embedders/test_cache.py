@@ -1,9 +1,7 @@
-"""Embeddings on disk: read back byte for byte, gone on with after a kill, never taken damaged."""
+"""Embeddings on disk: read back byte for byte, resumed after a kill, never taken damaged."""
 
 from __future__ import annotations
 
-import logging
-import os
 import signal
 import subprocess
 import sys
@@ -12,151 +10,132 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conf.runs import lock_folder
 from evaluation.embedders import cache
 from evaluation.embedders.cache import EmbeddingCache
 from tests.user_errors import raises_user_error
 
 ABOUT = {"weights": "ab12", "image_size": 96}
-THINGS = {f"scene-{k:03d}/{k}": k for k in range(2500)}
+INPUTS = {f"scene-{k:03d}/{k}": k for k in range(2500)}
 
 
 class Model:
-    """Embeds a number, and counts what it was asked for."""
+    """Embeds a number, and records its inputs."""
 
     def __init__(self, bad: tuple[int, ...] = ()) -> None:
-        self.asked: list[int] = []
+        self.inputs: list[int] = []
         self._bad = bad
 
     def __call__(self, some: list[int]) -> np.ndarray:
-        self.asked += some
+        self.inputs += some
         rows = np.stack([np.random.default_rng(k).random(8, np.float32) for k in some])
         rows[[k in self._bad for k in some], 3] = np.nan
         return rows
 
 
 def filled(folder: Path) -> EmbeddingCache:
-    kept = EmbeddingCache(folder, "frame", ABOUT)
-    kept.complete(THINGS, Model(), 64)
-    return kept
+    embeddings = EmbeddingCache(folder, "frame", ABOUT)
+    embeddings.complete(INPUTS, Model(), 64)
+    return embeddings
 
 
-def test_they_are_read_back_byte_for_byte_and_made_once(tmp_path) -> None:
+def test_embeddings_are_computed_once_and_read_back_byte_for_byte(tmp_path) -> None:
     model = Model()
-    expected = Model()(list(THINGS.values()))
+    expected = Model()(list(INPUTS.values()))
     for _ in range(2):
-        kept = EmbeddingCache(tmp_path, "frame", ABOUT)
-        kept.complete(THINGS, model, 64)
-        assert kept.rows(list(THINGS)).tobytes() == expected.tobytes()
-        assert kept.width == 8
-    assert model.asked == list(THINGS.values())
+        embeddings = EmbeddingCache(tmp_path, "frame", ABOUT)
+        embeddings.complete(INPUTS, model, 64)
+        assert embeddings.rows(list(INPUTS)).tobytes() == expected.tobytes()
+        assert embeddings.width == 8
+    assert model.inputs == list(INPUTS.values())
 
 
-def test_parts_hold_each_asked_one_once(tmp_path) -> None:
-    kept = filled(tmp_path)
-    some = list(THINGS)[::-7]
-    seen = {}
-    for numbers, rows in kept.parts(some):
-        assert len(rows) <= cache.PART_ROWS
-        seen |= dict(zip(numbers.tolist(), rows, strict=True))
-    assert sorted(seen) == list(range(len(some)))
-    assert np.array_equal(np.stack([seen[k] for k in range(len(some))]), kept.rows(some))
+def test_parts_hold_each_requested_embedding_once(tmp_path) -> None:
+    embeddings = filled(tmp_path)
+    names = list(INPUTS)[::-7]
+    parts = list(embeddings.parts(names))
+    assert max(map(len, parts)) <= cache.PART_ROWS
+    found, expected = np.concatenate(parts), embeddings.rows(names)
+    assert np.array_equal(np.sort(found, axis=0), np.sort(expected, axis=0))
 
 
-def test_a_slow_model_loses_no_more_than_a_batch(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(cache, "PART_SECONDS", -1)
-    model = Model(bad=(70,))
-    kept = EmbeddingCache(tmp_path, "frame", ABOUT)
-    with raises_user_error("non-finite-embedding", contains="scene-070/70"):
-        kept.complete(THINGS, model, 16)
-    again = Model()
-    kept.complete(THINGS, again, 16)
-    assert again.asked == list(range(64, 2500))
-
-
-def test_only_what_is_new_is_embedded(tmp_path) -> None:
+def test_only_new_inputs_are_embedded(tmp_path) -> None:
     filled(tmp_path)
     model = Model()
-    more = {"new/1": 9001, **THINGS, "new/2": 9002}
-    kept = EmbeddingCache(tmp_path, "frame", ABOUT)
-    kept.complete(more, model, 64)
-    assert model.asked == [9001, 9002]
-    assert np.array_equal(kept.rows(["new/2", "new/1", "new/2"]), Model()([9002, 9001, 9002]))
+    embeddings = EmbeddingCache(tmp_path, "frame", ABOUT)
+    embeddings.complete({"new/1": 9001, **INPUTS, "new/2": 9002}, model, 64)
+    assert model.inputs == [9001, 9002]
+    repeated = ["new/2", "new/1", "new/2"]
+    assert np.array_equal(embeddings.rows(repeated), Model()([9002, 9001, 9002]))
+
+
+def test_rows_of_several_lengths_are_padded_with_zeros(tmp_path) -> None:
+    embeddings = EmbeddingCache(tmp_path, "query", ABOUT)
+    embeddings.complete({"q1": 1, "q3": 3, "q2": 2}, lambda some: np.ones((1, some[0])), 1)
+    assert embeddings.rows(["q2", "q1"]).tolist() == [[1, 1, 0], [1, 0, 0]]
 
 
 @pytest.mark.parametrize("changed", [{"weights": "cd"}, {"image_size": 336}, {"precision": "fp32"}])
-def test_what_was_made_by_another_is_not_taken(tmp_path, changed) -> None:
+def test_embeddings_under_other_settings_are_not_reused(tmp_path, changed) -> None:
     filled(tmp_path)
     model = Model()
     EmbeddingCache(tmp_path, "frame", ABOUT | changed).complete({"scene-000/0": 0}, model, 64)
-    assert model.asked == [0]
+    assert model.inputs == [0]
 
 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-sys.path[:0] = {path!r}
-from test_cache import ABOUT, THINGS, Model
+from tests.evaluation.embedders.test_cache import ABOUT, INPUTS, Model
 from evaluation.embedders.cache import EmbeddingCache
 class Dying(Model):
     def __call__(self, some):
-        if len(self.asked) >= 1300:
+        if len(self.inputs) >= 1300:
             os.kill(os.getpid(), signal.SIGKILL)
         return super().__call__(some)
-EmbeddingCache(Path(sys.argv[1]), "frame", ABOUT).complete(THINGS, Dying(), 64)
+EmbeddingCache(Path(sys.argv[1]), "frame", ABOUT).complete(INPUTS, Dying(), 64)
 """
 
 
-def test_a_killed_embedding_goes_on(tmp_path) -> None:
-    path = [str(Path(__file__).parent), str(Path(cache.__file__).parents[2])]
-    command = [sys.executable, "-c", KILLED.format(path=path), str(tmp_path)]
-    ended = subprocess.run(command, capture_output=True, env={**os.environ, "PYTHONPATH": path[1]})
+def test_a_kill_costs_one_batch(tmp_path) -> None:
+    command = [sys.executable, "-c", KILLED, str(tmp_path)]
+    root = Path(cache.__file__).parents[2]
+    ended = subprocess.run(command, cwd=root, capture_output=True, timeout=120)
     assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
     model = Model()
-    kept = EmbeddingCache(tmp_path, "frame", ABOUT)
-    (torn := kept.folder / "00002.npy").write_bytes(b"half a part")
-    kept.complete(THINGS, model, 64)
-    assert model.asked == list(THINGS.values())[2 * cache.PART_ROWS :]
-    assert np.array_equal(kept.rows(list(THINGS)), Model()(list(THINGS.values())))
-    assert torn.stat().st_size > 1000
+    embeddings = EmbeddingCache(tmp_path, "frame", ABOUT)
+    embeddings.complete(INPUTS, model, 64)
+    assert model.inputs == list(INPUTS.values())[1344:]
+    assert np.array_equal(embeddings.rows(list(INPUTS)), Model()(list(INPUTS.values())))
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda part: part.write_bytes(part.read_bytes()[:-40]),
-        lambda part: part.write_bytes(part.read_bytes()[:-1] + b"\x01"),
-        lambda part: part.unlink(),
-        lambda part: part.with_suffix(".json").write_text('{"names": ['),
-        lambda part: part.with_suffix(".json").write_text("[]"),
-    ],
-)
-def test_a_damaged_part_is_told_and_made_again(tmp_path, damage, caplog) -> None:
-    kept = filled(tmp_path)
-    damage(kept.folder / "00001.npy")
-    model = Model()
-    with caplog.at_level(logging.WARNING):
-        kept.complete(THINGS, model, 64)
-    assert "00001.npy is damaged" in caplog.text
-    assert sorted(model.asked) == list(range(cache.PART_ROWS, 2 * cache.PART_ROWS))
-    assert np.array_equal(kept.rows(list(THINGS)), Model()(list(THINGS.values())))
+@pytest.mark.parametrize("damage", [lambda old: old[: len(old) // 2], lambda old: b"not a table"])
+def test_a_damaged_file_is_named(tmp_path, damage) -> None:
+    path = filled(tmp_path).path
+    path.write_bytes(damage(path.read_bytes()))
+    with raises_user_error("damaged-file", contains=path.name):
+        EmbeddingCache(tmp_path, "frame", ABOUT).complete({"new/1": 1}, Model(), 64)
 
 
-def test_an_embedding_that_is_not_finite_is_named_and_not_kept(tmp_path) -> None:
-    kept = EmbeddingCache(tmp_path, "frame", ABOUT)
-    with raises_user_error("non-finite-embedding", contains="frame scene-700/700"):
-        kept.complete(THINGS, Model(bad=(700,)), 64)
+def test_a_non_finite_embedding_is_named_and_not_stored(tmp_path) -> None:
     queries = EmbeddingCache(tmp_path, "query", ABOUT)
     with raises_user_error("non-finite-embedding", contains="query scene-003/3 and 1 more"):
-        queries.complete(THINGS, Model(bad=(3, 9)), 64)
+        queries.complete(INPUTS, Model(bad=(3, 9)), 64)
+    embeddings = EmbeddingCache(tmp_path, "frame", ABOUT)
+    with raises_user_error("non-finite-embedding", contains="frame scene-700/700"):
+        embeddings.complete(INPUTS, Model(bad=(700,)), 64)
     model = Model()
-    kept.complete(THINGS, model, 64)
-    assert model.asked == list(THINGS.values())[cache.PART_ROWS :]
+    embeddings.complete(INPUTS, model, 64)
+    assert model.inputs == list(INPUTS.values())[640:]
 
 
-def test_two_processes_do_not_fill_one_folder(tmp_path) -> None:
-    kept = filled(tmp_path)
-    with lock_folder(kept.folder, "unheard"):
-        kept.complete(THINGS, Model(), 64)
-        with raises_user_error("in-use"):
-            kept.complete({"new/1": 1}, Model(), 64)
+def test_two_processes_may_fill_one_file(tmp_path) -> None:
+    first, second = (EmbeddingCache(tmp_path, "frame", ABOUT) for _ in range(2))
+    model = Model()
+
+    def embed(some: list[int]) -> np.ndarray:
+        second.complete({"scene-000/0": 0, "other/1": 1}, model, 64)
+        return Model()(some)
+
+    first.complete(dict(list(INPUTS.items())[:10]), embed, 64)
+    assert model.inputs == [0, 1]
+    assert np.array_equal(first.rows(["other/1", "scene-000/0"]), Model()([1, 0]))

@@ -29,14 +29,13 @@ RECORD = Record(
 FULL = json.dumps(asdict(RECORD))
 
 
-def test_a_choice_is_read_from_whatever_else_a_record_holds():
+def test_the_choice_of_any_record_is_parsed():
     rng = random.Random(1)
     for _ in range(300):
         record = random_record(rng)
         raw = json.dumps(asdict(record), indent=rng.choice([None, 1, 4]))
         assert parse_choice(raw).letter == record.forced_choice
         assert read_record(raw) == record
-        # Dumped and read again it is the same, and so is the choice.
         assert read_record(json.dumps(asdict(read_record(raw)))) == record
         stop = rng.randrange(len(raw))
         assert parse_choice(raw[:stop]).letter in (record.forced_choice, None)
@@ -59,15 +58,15 @@ def random_record(rng: random.Random) -> Record:
     )
 
 
-def test_a_record_is_valid_as_its_schema_says():
-    """Held against what the schema says of every record with one thing changed."""
+def test_a_record_is_valid_exactly_if_its_schema_accepts_it():
+    """For all records that differ from a valid one in one field."""
     validator = Draft202012Validator(schema(bound=False))
     Draft202012Validator.check_schema(schema())
     values = [None, True, -0.1, 1.1, 0, 1, "", "A", "e", "none", "N", {}, [], {"A": 1}, "0.5"]
-    whole = asdict(RECORD)
-    changed = [{**whole, name: value} for name in whole for value in values]
-    changed += [{k: v for k, v in whole.items() if k != name} for name in whole]
-    changed += [{**whole, "note": ""}, {**whole, "distribution": {"A": 1, "B": 0, "C": 0}}]
+    record = asdict(RECORD)
+    changed = [{**record, name: value} for name in record for value in values]
+    changed += [{k: v for k, v in record.items() if k != name} for name in record]
+    changed += [{**record, "note": ""}, {**record, "distribution": {"A": 1, "B": 0, "C": 0}}]
     valid = 0
     for value in changed:
         raw = json.dumps(value)
@@ -91,11 +90,11 @@ def test_a_record_is_valid_as_its_schema_says():
         '{"forced_choice": "C", "confidence": ' + "[" * 100_000,
     ],
 )
-def test_no_record_is_valid_that_is_not_one_record_of_json(raw):
+def test_a_response_without_exactly_one_json_record_is_invalid(raw):
     assert read_record(raw) is None
 
 
-def test_the_prompt_the_schema_and_the_record_have_one_order():
+def test_prompt_and_schema_have_the_fields_of_the_record_in_its_order():
     names = [f.name for f in fields(Record)]
     assert list(FIELDS) == list(schema()["properties"]) == schema()["required"] == names
     at = [instruction().index(f'"{name}"') for name in names]

@@ -1,5 +1,5 @@
-"""Tiny models of every kind that is measured as released: the real architectures, with random
-weights, and their tokenizers and processors, saved as their authors' folders are."""
+"""Tiny models of every kind of released embedder: the real architectures with random weights,
+tokenizers and processors, in folders like those of their authors."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def siglip2(folder: Path) -> Path:
 
 
 def languagebind(videos: Path, images: Path) -> tuple[Path, Path]:
-    """Its settings name a type of their own, and no processor stands beside the weights."""
+    """The config files have a model type of their own, and there is no processor file."""
     torch.manual_seed(0)
     tokenizer = clip_tokenizer()
     config = clip_config(tokenizer, add_time_attn=True, num_frames=TIMES)
@@ -89,13 +89,13 @@ def languagebind(videos: Path, images: Path) -> tuple[Path, Path]:
     ):
         model.save_pretrained(folder)
         tokenizer.save_pretrained(folder)
-        told = json.loads((folder / "config.json").read_text())
-        (folder / "config.json").write_text(json.dumps(told | {"model_type": kind}))
+        saved = json.loads((folder / "config.json").read_text())
+        (folder / "config.json").write_text(json.dumps(saved | {"model_type": kind}))
     return videos, images
 
 
 def vlm2vec(base: Path, adapters: Path) -> Path:
-    """Adapters over a Qwen2-VL; the processor stands beside them."""
+    """Adapters over a Qwen2-VL, saved with the processor."""
     torch.manual_seed(0)
     tokenizer = Tokenizer(models.BPE())
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
@@ -131,8 +131,8 @@ def vlm2vec(base: Path, adapters: Path) -> Path:
     )
     peft.get_peft_model(model, low_rank).save_pretrained(adapters)
     settings = adapters / "adapter_config.json"
-    told = json.loads(settings.read_text()) | {"base_model_name_or_path": str(base)}
-    settings.write_text(json.dumps(told))
+    saved = json.loads(settings.read_text()) | {"base_model_name_or_path": str(base)}
+    settings.write_text(json.dumps(saved))
     Qwen2VLProcessor(
         Qwen2VLImageProcessor(), fast, Qwen2VLVideoProcessor(), chat_template=CHAT_TEMPLATE
     ).save_pretrained(adapters)

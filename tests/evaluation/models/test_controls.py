@@ -1,4 +1,4 @@
-"""A control is told beside the same items as they are, by the real command and a real server."""
+"""Controls are compared with the unchanged items, by the real command and a real server."""
 
 from __future__ import annotations
 
@@ -24,77 +24,74 @@ STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500,
 
 @pytest.fixture
 def command(micro, micro_store):
-    def asked(server, **changes) -> SelectCommand:
+    def settings(server, **changes) -> SelectCommand:
         served = ServerConfig(
             url=[server.url], model="served", unreachable_timeout=5.0, timeout=10.0
         )
-        store = str(micro_store.folder.parent)
-        settings = {"modes": ["answer"], **changes}
-        return SelectCommand(
-            benchmark=micro, student=STUDENT, server=served, store=store, **settings
-        )
+        shared = {"benchmark": micro, "student": STUDENT, "modes": ["answer"], "server": served}
+        return SelectCommand(store=str(micro_store.folder.parent), **{**shared, **changes})
 
-    return asked
+    return settings
 
 
 def parts_of(request) -> list[dict]:
     return request["messages"][0]["content"]
 
 
-def test_a_prefix_is_worth_what_its_items_lose_without_it(
-    command, micro_store, talking, tmp_path
+def test_candidate_only_is_compared_with_the_unchanged_items(
+    command, micro_store, start_server, tmp_path
 ) -> None:
-    def says(request) -> str:
+    def reply(request) -> str:
         return "Answer: C" if any(p["type"] == "video_url" for p in parts_of(request)) else "B"
 
-    server = talking(says)
+    server = start_server(reply)
     cfg = command(server, control="candidate_only", limit=12)
     metrics = select.main.__wrapped__(cfg, Run("x", tmp_path))
     items = select.select_items(micro_store, None, 12, 0)
     plain, control = (sum(i.letter == x for i in items) for x in "CB")
-    told = json.loads((tmp_path / "report.json").read_text())
+    report = json.loads((tmp_path / "report.json").read_text())
     name = micro_store.name
-    rows = from_json(list[SelectionResult], told["rows"])
+    rows = from_json(list[SelectionResult], report["rows"])
     assert [(r.benchmark, r.control, r.mode) for r in rows] == [
         (name, None, "answer"), (name, "candidate_only", "answer"),
     ]  # fmt: skip
     assert metrics["answer_micro"] == rows[1].micro.value == control / 12
-    whole = next(p for p in told["controls"] if p["of"] == "all")
-    assert (whole["mode"], whole["left"], whole["right"]) == (
+    overall = next(p for p in report["controls"] if p["of"] == "all")
+    assert (overall["mode"], overall["left"], overall["right"]) == (
         "answer", "unchanged", "candidate_only",
     )  # fmt: skip
-    assert (whole["only_left"], whole["only_right"], whole["n"]) == (plain, control, 12)
-    assert whole["difference"] == pytest.approx((plain - control) / 12)
+    assert (overall["only_left"], overall["only_right"], overall["n"]) == (plain, control, 12)
+    assert overall["difference"] == pytest.approx((plain - control) / 12)
     text = (tmp_path / "report.txt").read_text()
     assert "answer: unchanged (left) less candidate_only (right)" in text
     assert "any base (answer, candidate_only)" in text
 
-    # All is answered, either way: the same command asks nothing and says the same.
-    server.asked.clear()
+    # The same command requests nothing and has the same results.
+    server.requests.clear()
     assert select.main.__wrapped__(cfg, Run("x", tmp_path)) == metrics
-    assert not server.asked
-    assert json.loads((tmp_path / "report.json").read_text()) == told
+    assert not server.requests
+    assert json.loads((tmp_path / "report.json").read_text()) == report
 
 
-def test_what_another_run_has_asked_is_not_asked_again(
-    command, micro_store, talking, tmp_path
-) -> None:
-    server = talking(lambda _: "Answer: C")
+def test_responses_of_other_runs_are_reused(command, micro_store, start_server, tmp_path) -> None:
+    server = start_server(lambda _: "Answer: C")
     cfg = command(server, limit=12, checkpoints=str(tmp_path))
     select.main.__wrapped__(cfg, Run("x", folder(tmp_path, "x")))
-    server.asked.clear()
-    held = replace(cfg, control="candidate_only")
-    metrics = select.main.__wrapped__(held, Run("y", folder(tmp_path, "y")))
-    assert len(server.asked) == 12
-    assert not any(p["type"] == "video_url" for asked in server.asked for p in parts_of(asked))
-    # It has them from then on, and another question has another answer.
+    server.requests.clear()
+    control = replace(cfg, control="candidate_only")
+    metrics = select.main.__wrapped__(control, Run("y", folder(tmp_path, "y")))
+    assert len(server.requests) == 12
+    assert not any(
+        p["type"] == "video_url" for request in server.requests for p in parts_of(request)
+    )
+    # From then on they are in its own log. Other settings need other responses.
     shutil.rmtree(tmp_path / "select" / "x")
-    server.asked.clear()
-    assert select.main.__wrapped__(held, Run("y", folder(tmp_path, "y"))) == metrics
-    assert not server.asked
-    other = replace(held, student=replace(STUDENT, max_new_tokens=30), modes=["record"])
+    server.requests.clear()
+    assert select.main.__wrapped__(control, Run("y", folder(tmp_path, "y"))) == metrics
+    assert not server.requests
+    other = replace(control, student=replace(STUDENT, max_new_tokens=30), modes=["record"])
     select.main.__wrapped__(other, Run("z", folder(tmp_path, "z")))
-    assert len(server.asked) == 24
+    assert len(server.requests) == 24
 
 
 def folder(root: Path, name: str) -> Path:
@@ -102,26 +99,26 @@ def folder(root: Path, name: str) -> Path:
     return made
 
 
-def test_the_questions_of_a_pair_are_held_against_each_other(benchmark_store, tmp_path) -> None:
+def test_the_questions_of_a_matched_pair_are_compared(benchmark_store, tmp_path) -> None:
     items = benchmark_store.selection(suite=MATCHED_ANCHOR)
-    said = {"event": "Answer: A", "time": "Answer: B"}
-    answers = [score_response(i, "answer", GeneratedText(said[i.family], False)) for i in items]
+    texts = {"event": "Answer: A", "time": "Answer: B"}
+    answers = [score_response(i, "answer", GeneratedText(texts[i.family])) for i in items]
     choices = [
         Choices.from_answers("one", "answer", control, answers)
         for control in (None, "candidate_only")
     ]
     _, result = write_report(choices, items, "any", 0, tmp_path, MATCHED_ANCHOR)
-    told = json.loads((tmp_path / "report.json").read_text())["controls"]
+    controls = json.loads((tmp_path / "report.json").read_text())["controls"]
     truth = [by_event.letter for by_event, _ in pair_items(items)]
-    matched = [p for p in told if p["left"] == "event"]
+    matched = [p for p in controls if p["left"] == "event"]
     assert [p["mode"] for p in matched] == ["answer", "answer, candidate_only"]
     for p in matched:
         assert (p["right"], p["of"], p["n"]) == ("time", "all", len(truth))
         assert (p["only_left"], p["only_right"]) == (truth.count("A"), truth.count("B"))
         assert p["left_accuracy"] == result.families["event"].value
         assert p["right_accuracy"] == result.families["time"].value
-    # What is said alike either way is apart by nothing.
-    assert {p["difference"] for p in told if p["left"] != "event"} == {0}
+    # Equal responses have no difference.
+    assert {p["difference"] for p in controls if p["left"] != "event"} == {0}
 
 
 def test_a_limit_keeps_pairs_whole(benchmark_store) -> None:
@@ -133,7 +130,7 @@ def test_a_limit_keeps_pairs_whole(benchmark_store) -> None:
     assert sorted(select.limit_items(items, len(items), 0), key=items.index) == items
 
 
-def test_a_limit_that_leaves_no_pair_is_told() -> None:
+def test_a_limit_below_a_pair_is_refused() -> None:
     cfg = SelectCommand(
         benchmark=BenchmarkConfig(name="any"), student=STUDENT, suite=MATCHED_ANCHOR, limit=1
     )
@@ -144,6 +141,6 @@ def test_a_limit_that_leaves_no_pair_is_told() -> None:
 @pytest.mark.parametrize(
     ("suite", "hint"), [("physion", "physion"), (MATCHED_ANCHOR, "selection.matched.test")]
 )
-def test_a_suite_that_a_benchmark_lacks_is_told(micro_store, suite, hint) -> None:
+def test_a_suite_that_a_benchmark_lacks_is_refused(micro_store, suite, hint) -> None:
     with raises_user_error("no-items", contains=(suite, hint)):
         select.select_items(micro_store, suite, None, 0)

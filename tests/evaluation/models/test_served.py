@@ -1,8 +1,7 @@
-"""A served model is asked with the frames and the times that a model here is shown."""
+"""A served model gets the frames and the times that a local model gets."""
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import io
 import json
@@ -18,12 +17,7 @@ from conf.schema import SelectCommand, ServerConfig, StudentConfig
 from data.render.frame_cache import FrameReader
 from evaluation import select
 from evaluation.generators.base import item_sample, response_settings
-from evaluation.generators.openai_server import (
-    ServedModel,
-    generate_responses,
-    restore_thought,
-    served_origin,
-)
+from evaluation.generators.openai_server import ServedModel, restore_thought, served_origin
 from evaluation.generators.response_log import ResponseLog, collect_responses, score_response
 from evaluation.generators.response_schema import instruction, schema
 from teacher.servers.responses import TRUNCATED, Response
@@ -49,80 +43,74 @@ def at(*servers, **changes) -> ServerConfig:
     return ServerConfig(url=[s.url for s in servers], model="served", **settings)
 
 
-def opened(tmp_path, items, **known) -> ResponseLog:
-    return ResponseLog(tmp_path / "answers.jsonl", {"record": known, "answer": known}, items)
+def open_log(tmp_path, items) -> ResponseLog:
+    return ResponseLog(tmp_path / "answers.jsonl", {"record": {}, "answer": {}}, items)
 
 
-def asker(server, frames, cfg=STUDENT, mode="record", control=None, seed=0):
-    sample_of = partial(item_sample, "cot", frames, cfg, control, mode)
-    return lambda things, keep: asyncio.run(
-        generate_responses(server, cfg, seed, mode, sample_of, things, keep)
-    )
+def responder(server, frames, cfg=STUDENT, mode="record", control=None, seed=0):
+    """The function that generates responses in a mode."""
+    model = ServedModel(SelectCommand(student=cfg, server=server, seed=seed), None, cfg)
+    return partial(model.respond, mode, partial(item_sample, "cot", frames, cfg, control, mode))
 
 
-def test_the_same_frames_and_times_are_sent(items, frames, talking, tmp_path) -> None:
-    server = talking(lambda _: FULL)
-    log = opened(tmp_path, items)
-    given = collect_responses(items, "record", asker(at(server, concurrency=1), frames), log)
-    assert [a.letter for a in given] == ["C"] * 8
-    assert [a.right for a in given] == [i.letter == "C" for i in items]
-    assert {a.valid for a in given} == {True}
-    for item, asked in zip(items, server.asked, strict=True):
+def test_requests_hold_the_frames_and_times_of_a_sample(
+    items, frames, start_server, tmp_path
+) -> None:
+    server = start_server(lambda _: FULL)
+    log = open_log(tmp_path, items)
+    answers = collect_responses(items, "record", responder(at(server, concurrency=1), frames), log)
+    assert [a.letter for a in answers] == ["C"] * 8
+    assert [a.right for a in answers] == [i.letter == "C" for i in items]
+    assert {a.valid for a in answers} == {True}
+    for item, request in zip(items, server.requests, strict=True):
         sample = item_sample("cot", frames, STUDENT, None, "record", item)
-        parts = asked["messages"][0]["content"]
+        parts = request["messages"][0]["content"]
         video = parts[0]["video_url"]["url"].removeprefix("data:video/jpeg;base64,")
         assert np.array_equal(np.stack([*map(pixels, video.split(","))]), sample.clip.pixels)
         images = [p["image_url"]["url"].partition(",")[2] for p in parts if "image_url" in p]
-        for told, image in zip(images, sample.images, strict=True):
-            assert np.array_equal(pixels(told), image)
+        for png, image in zip(images, sample.images, strict=True):
+            assert np.array_equal(pixels(png), image)
         texts = [p["text"] for p in parts if p["type"] == "text"]
         assert texts[0].startswith(item.question)
         assert texts[-1] == f"\n{instruction()}"
-        clip = asked["media_io_kwargs"]["video"]
+        clip = request["media_io_kwargs"]["video"]
         assert clip["frames_indices"] == sample.clip.indices
         assert (clip["fps"], clip["total_num_frames"], clip["num_frames"]) == (25.0, 128, -1)
-        assert asked["mm_processor_kwargs"]["videos_kwargs"]["do_sample_frames"] is False
-        assert (asked["temperature"], asked["max_tokens"]) == (0, 40)
-        assert "seed" not in asked
-        assert "response_format" not in asked
+        assert request["mm_processor_kwargs"]["videos_kwargs"]["do_sample_frames"] is False
+        assert (request["temperature"], request["max_tokens"]) == (0, 40)
+        assert "seed" not in request
+        assert "response_format" not in request
 
 
 def pixels(png: str) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(png))))
 
 
-def test_a_model_is_held_to_the_schema_and_draws_by_seeds(items, frames, talking) -> None:
-    server = talking(lambda _: FULL)
-    said = []
+def test_constrained_requests_have_the_schema_and_a_seed_per_item(
+    items, frames, start_server
+) -> None:
+    server = start_server(lambda _: FULL)
+    responses = []
     for seed in (0, 0, 1):
-        held = asker(at(server), frames, THINKING, "constrained", seed=seed)
-        held(items[:2], said.extend)
-    answers = [score_response(item, "constrained", found) for item, found in said]
+        respond = responder(at(server), frames, THINKING, "constrained", seed=seed)
+        respond(items[:2], responses.extend)
+    answers = [score_response(item, "constrained", text) for item, text in responses]
     assert [(a.letter, a.valid) for a in answers] == [("C", True)] * 6
-    format_ = server.asked[0]["response_format"]
+    format_ = server.requests[0]["response_format"]
     assert format_["json_schema"]["schema"] == schema()
-    sampling = {key: server.asked[0][key] for key in ("temperature", "top_p", "top_k")}
+    sampling = {key: server.requests[0][key] for key in ("temperature", "top_p", "top_k")}
     assert sampling == {"temperature": 0.6, "top_p": 0.95, "top_k": 20}
-    assert server.asked[0]["chat_template_kwargs"] == {"enable_thinking": True}
-    seeds = [sorted(a["seed"] for a in server.asked[k : k + 2]) for k in (0, 2, 4)]
+    assert server.requests[0]["chat_template_kwargs"] == {"enable_thinking": True}
+    seeds = [sorted(r["seed"] for r in server.requests[k : k + 2]) for k in (0, 2, 4)]
     assert seeds[0] == seeds[1] != seeds[2]
     assert len(set(seeds[0])) == 2
 
 
-def test_no_bound_is_asked_for_as_such(items, frames, talking) -> None:
-    server = talking(lambda _: "B")
-    unbound = replace(STUDENT, temperature=0.7, top_p=1.0, top_k=0)
-    asker(at(server), frames, unbound)(items[:1], lambda _: None)
-    assert (server.asked[0]["top_p"], server.asked[0]["top_k"]) == (1.0, -1)
-
-
-def test_a_control_hides_the_clip(items, frames, talking) -> None:
-    server = talking(lambda _: "B")
-    asker(at(server), frames, control="candidate_only")(items[:1], lambda _: None)
-    kinds = [p["type"] for p in server.asked[0]["messages"][0]["content"]]
-    assert "video_url" not in kinds
-    assert kinds.count("image_url") == 4
-    assert "media_io_kwargs" not in server.asked[0]
+def test_unlimited_sampling_is_requested_explicitly(items, frames, start_server) -> None:
+    server = start_server(lambda _: "B")
+    unlimited = replace(STUDENT, temperature=0.7, top_p=1.0, top_k=0)
+    responder(at(server), frames, unlimited)(items[:1], lambda _: None)
+    assert (server.requests[0]["top_p"], server.requests[0]["top_k"]) == (1.0, -1)
 
 
 @pytest.mark.parametrize(
@@ -136,15 +124,15 @@ def test_a_control_hides_the_clip(items, frames, talking) -> None:
         (Response("", TRUNCATED, reasoning="Answer: B"), True, "<think>Answer: B"),
     ],
 )
-def test_a_thought_is_no_answer(reply, thinking, text, items) -> None:
-    found = restore_thought(reply, thinking)
-    assert found.text == text
-    assert found.cut == (reply.flaw == TRUNCATED)
-    letter = score_response(items[0], "answer", found).letter
+def test_a_thought_is_not_parsed_as_the_answer(reply, thinking, text, items) -> None:
+    generated = restore_thought(reply, thinking)
+    assert generated.text == text
+    assert generated.cut == (reply.flaw == TRUNCATED)
+    letter = score_response(items[0], "answer", generated).letter
     assert letter == (None if "</think>" not in text and thinking else text[-1])
 
 
-def test_hostile_answers_are_kept_and_read(items, frames, talking, tmp_path) -> None:
+def test_malformed_responses_are_stored_and_scored(items, frames, start_server, tmp_path) -> None:
     hostile = iter(
         [
             "x" * 1_000_000,
@@ -157,28 +145,28 @@ def test_hostile_answers_are_kept_and_read(items, frames, talking, tmp_path) -> 
             FULL,
         ]
     )
-    server = talking(lambda _: next(hostile))
-    log = opened(tmp_path, items)
-    given = collect_responses(items, "record", asker(at(server, concurrency=1), frames), log)
-    assert [a.letter for a in given] == [None, None, "B", None, None, None, None, "C"]
-    assert given[4].reason == "cut off"
-    again = opened(tmp_path, items).answers
-    assert [again[a.item_id, "record"] for a in given] == given
+    server = start_server(lambda _: next(hostile))
+    log = open_log(tmp_path, items)
+    answers = collect_responses(items, "record", responder(at(server, concurrency=1), frames), log)
+    assert [a.letter for a in answers] == [None, None, "B", None, None, None, None, "C"]
+    assert answers[4].reason == "cut off"
+    stored = open_log(tmp_path, items).responses
+    assert [stored[a.item_id, "record"] for a in answers] == answers
 
 
-def test_a_server_that_dies_costs_no_answer(items, frames, talking, tmp_path) -> None:
-    first = talking(lambda _: FULL if len(first.asked) < 4 else 500)
-    log = opened(tmp_path, items)
-    dying = asker(at(first, unreachable_timeout=0.2, concurrency=1), frames)
+def test_responses_survive_a_server_that_dies(items, frames, start_server, tmp_path) -> None:
+    first = start_server(lambda _: FULL if len(first.requests) < 4 else 500)
+    log = open_log(tmp_path, items)
+    dying = responder(at(first, unreachable_timeout=0.2, concurrency=1), frames)
     with raises_user_error("no-server", contains="server.url"):
         collect_responses(items, "record", dying, log)
-    kept = (tmp_path / "answers.jsonl").read_text()
-    assert len(log.answers) == 3
-    second = talking(lambda _: FULL)
-    log = opened(tmp_path, items)
-    assert len(collect_responses(items, "record", asker(at(second), frames), log)) == 8
-    assert len(second.asked) == 5
-    assert (tmp_path / "answers.jsonl").read_text().startswith(kept)
+    before = (tmp_path / "answers.jsonl").read_text()
+    assert len(log.responses) == 3
+    second = start_server(lambda _: FULL)
+    log = open_log(tmp_path, items)
+    assert len(collect_responses(items, "record", responder(at(second), frames), log)) == 8
+    assert len(second.requests) == 5
+    assert (tmp_path / "answers.jsonl").read_text().startswith(before)
 
 
 @pytest.mark.parametrize(
@@ -189,29 +177,29 @@ def test_a_server_that_dies_costs_no_answer(items, frames, talking, tmp_path) ->
         "Per-request media_io_kwargs are disabled by default",
     ],
 )
-def test_a_model_that_takes_no_clip_is_told(words, items, frames, talking) -> None:
+def test_a_server_that_refuses_clips_is_named(words, items, frames, start_server) -> None:
     def refuse(request):
         clip = any(p["type"] == "video_url" for p in request["messages"][0]["content"])
         return {"status": 400, "message": words} if clip else "Hello."
 
-    server = talking(refuse)
+    server = start_server(refuse)
     with raises_user_error("server-refuses", contains=(server.url, words)):
-        asker(at(server), frames)(items, lambda _: None)
+        responder(at(server), frames)(items, lambda _: None)
 
 
-def test_an_item_that_alone_has_no_answer_is_told(items, frames, talking) -> None:
+def test_an_item_that_a_server_refuses_is_named(items, frames, start_server) -> None:
     # A blank canary is much shorter than any item.
     def refuse(request):
         long = len(json.dumps(request)) > 10_000
         return {"status": 400, "message": "prompt is too long"} if long else "Hello."
 
-    server = talking(refuse)
+    server = start_server(refuse)
     with raises_user_error("no-response", contains="prompt is too long"):
-        asker(at(server, concurrency=1), frames)(items, lambda _: None)
+        responder(at(server, concurrency=1), frames)(items, lambda _: None)
 
 
-def test_what_is_served_is_told_apart(talking) -> None:
-    server = talking(lambda _: FULL)
+def test_the_origin_of_a_served_model(start_server) -> None:
+    server = start_server(lambda _: FULL)
     assert served_origin(at(server)) == {"root": "weights", "parent": None}
     adapter = replace(at(server), model="adapter")
     assert served_origin(adapter) == {"root": "lora", "parent": "weights"}
@@ -222,99 +210,87 @@ def test_what_is_served_is_told_apart(talking) -> None:
         served_origin(at(server))
 
 
-def test_what_a_server_cannot_tell_of_its_weights_the_user_can(talking, caplog) -> None:
+def test_a_revision_identifies_weights_that_a_server_does_not_describe(
+    start_server, caplog
+) -> None:
     caplog.set_level("INFO")
-    cfg = SelectCommand(student=STUDENT, server=at(talking(lambda _: FULL)))
-    plain, committed = (
+    cfg = SelectCommand(student=STUDENT, server=at(start_server(lambda _: FULL)))
+    unpinned, pinned = (
         ServedModel(cfg, None, replace(STUDENT, revision=rev)).revision for rev in (None, "c0ffee")
     )
-    assert plain != committed
+    assert unpinned != pinned
     assert "student.revision=COMMIT" in caplog.text
 
 
-def test_a_server_is_given_its_key(items, frames, talking, tmp_path, monkeypatch) -> None:
-    server = talking(lambda _: FULL)
+def test_requests_carry_the_api_key(items, frames, start_server, tmp_path, monkeypatch) -> None:
+    server = start_server(lambda _: FULL)
     server.key = "secret"
-    log = opened(tmp_path, items)
+    log = open_log(tmp_path, items)
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
-    for ask in (
+    for request in (
         lambda: served_origin(at(server)),
-        lambda: collect_responses(items, "record", asker(at(server), frames), log),
+        lambda: collect_responses(items, "record", responder(at(server), frames), log),
     ):
         with raises_user_error("invalid-api-key", contains=(server.url, "OPENAI_API_KEY")):
-            ask()
+            request()
     monkeypatch.setenv("OPENAI_API_KEY", "secret")
     assert served_origin(at(server))["root"] == "weights"
-    given = collect_responses(items, "record", asker(at(server), frames), log)
-    assert [a.letter for a in given] == ["C"] * 8
+    answers = collect_responses(items, "record", responder(at(server), frames), log)
+    assert [a.letter for a in answers] == ["C"] * 8
 
 
-def test_a_student_is_not_measured_by_its_base(talking, tmp_path) -> None:
-    server = talking(lambda _: FULL)
+def test_a_student_and_its_base_are_not_confused(start_server, tmp_path) -> None:
+    server = start_server(lambda _: FULL)
     cfg = SelectCommand(server=replace(at(server), model=None), student=STUDENT)
     with raises_user_error("missing-server-model", contains="server.model=NAME"):
         ServedModel(cfg, tmp_path, STUDENT)
-    # Nor is what it answers taken for a base's.
     adapter = replace(cfg, server=replace(at(server), model="adapter"))
     with raises_user_error("adapter-without-run", contains="model=RUN"):
         ServedModel(adapter, None, STUDENT)
 
 
-def test_adapters_over_another_rounding_are_told(talking, tmp_path, caplog) -> None:
-    cfg = SelectCommand(server=replace(at(talking(lambda _: FULL)), model="adapter"))
+def test_adapters_over_an_unquantised_base_are_warned_of(start_server, tmp_path, caplog) -> None:
+    cfg = SelectCommand(server=replace(at(start_server(lambda _: FULL)), model="adapter"))
     ServedModel(cfg, tmp_path, replace(STUDENT, quantization="none"))
     assert not caplog.text
     ServedModel(cfg, tmp_path, STUDENT)
     assert "NF4" in caplog.text
 
 
-def test_answers_to_other_questions_stay_and_do_not_count(items, tmp_path) -> None:
-    path, [item, *_] = tmp_path / "answers.jsonl", items
-    first = ResponseLog(path, {"record": {"seed": 0}}, items)
-    first.append([score_response(item, "record", restore_thought(Response(FULL), False))])
-    assert ResponseLog(path, {"record": {"seed": 0}}, items).answers == first.answers
-    assert not ResponseLog(path, {"record": {"seed": 1}}, items).answers
-    assert not ResponseLog(path, {"answer": {"seed": 0}}, items).answers
-    # A line that was torn ends there, the others stay.
-    path.write_text(path.read_text() + '{"item_id": "')
-    assert ResponseLog(path, {"record": {"seed": 0}}, items).answers == first.answers
-    assert path.read_text().endswith('{"item_id": "\n')
-
-
-def test_servers_of_two_models_by_one_name_are_told(talking) -> None:
-    one, same, other = (talking(lambda _: FULL) for _ in range(3))
-    given = replace(at(one), url=[one.url, same.url])
-    assert served_origin(given) == served_origin(at(one))
+def test_servers_of_two_models_with_one_name_are_refused(start_server) -> None:
+    one, same, other = (start_server(lambda _: FULL) for _ in range(3))
+    server = replace(at(one), url=[one.url, same.url])
+    assert served_origin(server) == served_origin(at(one))
     other.root = "others"
-    with raises_user_error("different-models", contains=("is weights at", "others at")):
-        served_origin(replace(given, url=[one.url, same.url, other.url]))
+    with raises_user_error("different-models", contains=(one.url, other.url)):
+        served_origin(replace(server, url=[one.url, same.url, other.url]))
 
 
-def test_what_an_answer_depends_on_is_its_key() -> None:
-    def known(
+def test_the_key_of_a_response_depends_on_all_of_its_inputs() -> None:
+    def settings(
         mode="record", regime="cot", cfg=STUDENT, seed=0, rev="a", benchmark="b", control=None
     ):
         return response_settings(mode, regime, cfg, seed, {"weights": rev}, benchmark, control)
 
-    assert known() == known(seed=1)
+    assert settings() == settings(seed=1)
     other = [
-        known("constrained"),
-        known("reasoning"),
-        known(cfg=THINKING),
-        known(cfg=THINKING, seed=1),
-        known(cfg=replace(STUDENT, max_new_tokens=41)),
-        known(cfg=replace(STUDENT, image_size=64)),
-        known(rev="c"),
-        known(benchmark="c"),
-        known(control="candidate_only"),
+        settings("constrained"),
+        settings("reasoning"),
+        settings(cfg=THINKING),
+        settings(cfg=THINKING, seed=1),
+        settings(cfg=replace(STUDENT, max_new_tokens=41)),
+        settings(cfg=replace(STUDENT, image_size=64)),
+        settings(rev="c"),
+        settings(benchmark="c"),
+        settings(control="candidate_only"),
     ]
-    texts = {json.dumps(k, sort_keys=True) for k in [known(), *other]}
+    texts = {json.dumps(k, sort_keys=True) for k in [settings(), *other]}
     assert len(texts) == 1 + len(other)
 
 
 @pytest.mark.slow
-def test_the_command_measures_a_served_model(micro, micro_store, talking, tmp_path) -> None:
-    server = talking(lambda r: FULL if "response_format" in r else "I cannot tell.")
+def test_the_command_measures_a_served_model(micro, micro_store, start_server, tmp_path) -> None:
+    server = start_server(lambda r: FULL if "response_format" in r else "I cannot tell.")
     cfg = SelectCommand(
         benchmark=micro, student=STUDENT, server=at(server), store=str(micro_store.folder.parent),
         limit=6,
@@ -329,7 +305,7 @@ def test_the_command_measures_a_served_model(micro, micro_store, talking, tmp_pa
     }  # fmt: skip
     assert report["calibration"]["constrained"]["n"] == 6
     assert report["positions"]["constrained"]["chosen"]["C"] == 6
-    # All is answered: the same command asks nothing.
-    server.asked.clear()
+    # The same command requests nothing that is in the log.
+    server.requests.clear()
     assert select.main.__wrapped__(cfg, Run("x", tmp_path)) == metrics
-    assert not server.asked
+    assert not server.requests

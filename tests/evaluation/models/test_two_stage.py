@@ -1,8 +1,7 @@
-"""Two-stage retrieval: what is written, what is drawn, and how a frozen encoder matches it."""
+"""Two-stage retrieval: the texts that are written, and how a frozen encoder matches them."""
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 from collections.abc import Callable
@@ -12,49 +11,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
-from PIL import Image
 from transformers import CLIPVisionModel
 
-from conf.entry import Run
 from conf.schema import (
-    ArchitectureConfig,
-    ImageServerConfig,
+    ContrastiveTrainConfig,
     LateConfig,
-    LoraConfig,
     MatcherConfig,
     RetrieverConfig,
     ServerConfig,
-    SftCommand,
     StudentConfig,
-    TeacherConfig,
     TwoStageCommand,
 )
-from data.render.frame_cache import FrameReader
 from data.store import Store, open_store
 from evaluation import two_stage
-from evaluation.embedders.base import embed_queries, open_embedders, untrained_embedder
-from evaluation.embedders.joint_encoder import released_encoder
+from evaluation.embedders.base import Embedder, open_embedders
+from evaluation.embedders.joint_encoder import load_encoder
 from evaluation.metrics.ranking import query_metrics
 from evaluation.metrics.results import retrieval_results
-from evaluation.retrieval import text_matching
-from evaluation.retrieval.predicted_texts import ROUTES, future_text
+from evaluation.retrieval.exact_search import Ranks
 from evaluation.retrieval.standard_test import load_standard_test, rank_targets
-from models import loading
+from evaluation.retrieval.text_matching import ROUTES, future_text, rank_by_text
 from tests.evaluation.metrics.reference import matrix_metrics
 from tests.evaluation.models import released
+from tests.evaluation.models.conftest import STUDENT, WHOLE, new_run
 from tests.user_errors import raises_user_error
-from train.student import dataset
 
-SMALL = ArchitectureConfig(
-    hidden=64, layers=1, heads=2, kv_heads=2, feed_forward=64,
-    vision_hidden=64, vision_layers=1, vision_heads=2, vision_feed_forward=64,
-)  # fmt: skip
-WHOLE = {"quantization": "none", "lora": LoraConfig(rank=0)}
-# It is random, and so are its words.
-STUDENT = StudentConfig(
-    name="small", architecture=SMALL, image_size=96, max_length=1500, max_new_tokens=12,
-    temperature=1.0, top_k=50, **WHOLE,
-)  # fmt: skip
 SERVED = StudentConfig(name="any", model="any", image_size=96, max_new_tokens=40)
 RATIONALE = (
     "Scene parse: A cube.\nMotion analysis: It moves.\nPrediction: The cube will be near the top.\n"
@@ -74,23 +55,28 @@ def clip(tmp_path_factory) -> RetrieverConfig:
 
 @pytest.fixture
 def store(tmp_path, micro_store) -> Store:
-    """A copy, which what is written may be kept in."""
+    """A copy, which the command may write to."""
     return open_store(shutil.copytree(micro_store.folder, tmp_path / "store" / "micro"))
 
 
 @pytest.fixture
-def ranks(store, clip, tmp_path) -> Callable[..., text_matching.Ranks]:
-    """Ranks of the standard test by texts of its queries, and of frames."""
-    queries, database = load_standard_test(store)
-    matcher = untrained_embedder(clip, "fp32", tmp_path)
+def matcher(clip, store, tmp_path) -> Embedder:
+    train = ContrastiveTrainConfig(precision="fp32")
+    [embedder] = open_embedders(
+        None, MatcherConfig(retriever=clip, train=train), store, tmp_path, 16
+    )
+    return embedder
 
-    def rank(route: str, said: list[str], captions: list[str] = (), **images):
-        texts = {ROUTES[route].mode: dict(zip((q.name for q in queries), said, strict=True))}
+
+@pytest.fixture
+def rank(store, matcher) -> Callable[..., Ranks]:
+    """Ranks the standard test by texts of its queries and captions of its frames."""
+    queries, database = load_standard_test(store)
+
+    def rank(route: str, of_queries: list[str], captions: list[str] = ()) -> Ranks:
+        texts = {ROUTES[route].mode: dict(zip((q.name for q in queries), of_queries, strict=True))}
         texts["caption"] = dict(zip((f.name for f in database), captions, strict=False))
-        cfg = TwoStageCommand(images=ImageServerConfig(model="painter", **images))
-        return text_matching.rank_by_text(
-            cfg, ROUTES[route], matcher, texts, queries, database, store
-        )
+        return rank_by_text(ROUTES[route], matcher, texts, queries, database)
 
     return rank
 
@@ -105,48 +91,47 @@ def ranks(store, clip, tmp_path) -> Callable[..., text_matching.Ranks]:
         ("  The cube is near the top.\n", "The cube is near the top."),
         ("Scene parse: A cube.", "Scene parse: A cube."),
         ("<think>The cube will", ""),
+        ("\ud800 rests", "? rests"),
         (" \n", ""),
     ],
 )
-def test_the_foreseen_state_is_matched(text, state) -> None:
+def test_the_predicted_state_of_a_response_is_matched(text, state) -> None:
     assert future_text(text) == state
 
 
-def test_texts_rank_by_their_scores_and_a_missing_one_is_a_miss(ranks, store, clip) -> None:
+def test_texts_rank_by_their_scores_and_a_missing_text_is_a_miss(rank, store, matcher) -> None:
     queries, database = load_standard_test(store)
-    said = [f"The scene after {q.question} {k}" for k, q in enumerate(queries)]
-    found = ranks("predict_image", said)
-    encoder = released_encoder(clip, "fp32", Path("unused"))
-    scores = encoder.texts(said) @ encoder.frames(database, FrameReader(store, clip.image_size)).T
-    gold = np.array([database.index(q.target) for q in queries])
-    plain = matrix_metrics(scores, gold, [10])
+    texts = [f"The scene after {q.question} {k}" for k, q in enumerate(queries)]
+    found = rank("predict_image", texts)
+    encoder = matcher.encoder
+    scores = encoder.texts(texts) @ encoder.frames(database, matcher.frames).T
+    targets = np.array([database.index(q.target) for q in queries])
+    expected = matrix_metrics(scores, targets, [10])
     row = retrieval_results("micro", "x", found, queries, 0)[0]
-    assert row.mrr.value == pytest.approx(plain["mrr"], rel=0.01)
-    assert row.median_rank.value == pytest.approx(plain["median_rank"], abs=1)
+    assert row.mrr.value == pytest.approx(expected["mrr"], rel=0.01)
+    assert row.median_rank.value == pytest.approx(expected["median_rank"], abs=1)
 
-    missing = ranks("predict_image", ["", *said[1:-1], ""])
-    assert missing.found.tolist() == [[False, *[True] * (len(said) - 2), False]] * 2
+    missing = rank("predict_image", ["", *texts[1:-1], ""])
+    assert missing.found.tolist() == [[False, *[True] * (len(texts) - 2), False]] * 2
     assert (missing.greater[:, 1:-1] == found.greater[:, 1:-1]).all()
-    less = retrieval_results("micro", "x", missing, queries, 0)[0]
-    assert (less.queries, less.frames) == (len(queries), len(database))
-    lost = query_metrics(found.greater[0], found.tied[0], found.found[0], len(database), [1])
-    assert less.mrr.value == pytest.approx(lost["mrr"][1:-1].sum() / len(queries))
+    row = retrieval_results("micro", "x", missing, queries, 0)[0]
+    assert (row.queries, row.frames) == (len(queries), len(database))
+    measures = query_metrics(found.greater[0], found.tied[0], found.found[0], len(database), [1])
+    assert row.mrr.value == pytest.approx(measures["mrr"][1:-1].sum() / len(queries))
     with raises_user_error("no-texts", contains="predict -> image"):
-        ranks("predict_image", [""] * len(queries))
+        rank("predict_image", [""] * len(queries))
 
 
-def test_repeating_the_question_ranks_as_seeing_no_prefix(ranks, store, clip, tmp_path) -> None:
+def test_repeating_the_question_ranks_as_an_unseen_prefix(rank, store, matcher) -> None:
     queries, database = load_standard_test(store)
-    frames, names = FrameReader(store, clip.image_size), [f.name for f in database]
-    [embedder] = open_embedders(None, clip, "fp32", store, tmp_path)
-    encoder = embedder.load()
-    encoder.embed_clips = lambda clips: np.zeros((len(clips), 24), np.float32)
-    blind = replace(embedder, weights="blind")
-    asked = embed_queries(blind, queries, store, frames, 16).rows([q.name for q in queries])
-    shown = encoder.frames(database, frames)
-    targets = shown[[names.index(q.target.name) for q in queries]]
-    direct = rank_targets(clip, asked, targets, [shown])
-    found = ranks("predict_image", [q.question for q in queries])
+    names = [f.name for f in database]
+    blind = replace(matcher, weights="blind")
+    blind.encoder.embed_clips = lambda clips: np.zeros((len(clips), 24), np.float32)
+    query_rows = blind.embed_queries(queries).rows([q.name for q in queries])
+    frame_rows = matcher.encoder.frames(database, matcher.frames)
+    target_rows = frame_rows[[names.index(q.target.name) for q in queries]]
+    direct = rank_targets(matcher.preset, query_rows, target_rows, [frame_rows])
+    found = rank("predict_image", [q.question for q in queries])
     for a, b in zip(
         retrieval_results("micro", "x", found, queries, 0),
         retrieval_results("micro", "x", direct, queries, 0),
@@ -156,89 +141,36 @@ def test_repeating_the_question_ranks_as_seeing_no_prefix(ranks, store, clip, tm
         assert a.mrr.value == pytest.approx(b.mrr.value, rel=0.01)
 
 
-def test_captions_match_by_their_words(ranks, store) -> None:
+def test_captions_match_by_their_words(rank, store) -> None:
     queries, database = load_standard_test(store)
     captions = [f"Frame {f.name}." for f in database]
-    said = [f"Frame {q.target.name}." for q in queries]
-    found = ranks("predict_caption", said, captions)
+    texts = [f"Frame {q.target.name}." for q in queries]
+    found = rank("predict_caption", texts, captions)
     assert not found.greater.any()
     assert not found.tied.any()
-    # Frames of one caption cannot be told apart.
-    same = ranks("predict_caption", said, ["A frame."] * len(captions))
+    # Frames with the same caption tie.
+    same = rank("predict_caption", texts, ["A frame."] * len(captions))
     assert (same.tied == len(database) - 1).all()
-    # A target without a caption is not found; another frame without one stands in nobody's way.
-    first = captions.index(said[0])
-    bare = ranks("predict_caption", said, ["" if k == first else c for k, c in enumerate(captions)])
-    assert bare.found[0].tolist() == [s != said[0] for s in said]
-    assert bare.frames == len(database)
+    # A target without a caption is a miss; another frame without one changes nothing.
+    first = captions.index(texts[0])
+    captions[first] = ""
+    missing = rank("predict_caption", texts, captions)
+    assert missing.found[0].tolist() == [text != texts[0] for text in texts]
+    assert missing.frames == len(database)
 
 
-def test_a_drawn_target_is_found_first_and_drawn_once(ranks, store, talking) -> None:
-    queries, _ = load_standard_test(store)
-    pixels = FrameReader(store)
-
-    def paint(request) -> bytes:
-        scene, frame = request["prompt"].split("/")
-        assert (request["model"], request["size"], request["seed"]) == ("painter", "192x128", 3)
-        buffer = io.BytesIO()
-        pixels.image(scene, int(frame)).save(buffer, "PNG")
-        return buffer.getvalue()
-
-    server = talking(paint)
-    drawn = {"url": server.url, "size": "192x128", "seed": 3, "concurrency": 1}
-    said = [q.target.name for q in queries]
-    found = ranks("predict_generated_image", said, **drawn)
-    assert not found.greater.any()
-    assert len(server.asked) == len(set(said))
-    server.asked.clear()
-    assert np.array_equal(ranks("predict_generated_image", said, **drawn).tied, found.tied)
-    assert not server.asked
-    # A damaged file is drawn again, and another seed draws all.
-    damaged = min((store.folder / "generated_images").rglob("*.png"))
-    damaged.write_bytes(damaged.read_bytes()[:-40])
-    ranks("predict_generated_image", said, **drawn)
-    assert len(server.asked) == 1
-
-
-def test_what_is_drawn_is_kept_when_the_server_fails(ranks, store, talking) -> None:
-    queries, _ = load_standard_test(store)
-    said = [f"Frame {q.name}" for q in queries]
-    buffer = io.BytesIO()
-    Image.new("RGB", (8, 8), "gray").save(buffer, "PNG")
-    image = buffer.getvalue()
-    bad = sorted(said)[3]
-
-    server = talking(lambda r: b"no image" if r["prompt"] == bad else image)
-    drawn = {"concurrency": 1, "unreachable_timeout": 0.2, "timeout": 10.0}
-    with raises_user_error("no-response", contains=("painter", bad)):
-        ranks("predict_generated_image", said, url=server.url, **drawn)
-    assert len([*(store.folder / "generated_images").rglob("*.png")]) == 3
-    dying = talking(lambda _: image if len(dying.asked) < 3 else 500)
-    with raises_user_error("no-server", contains="images.url"):
-        ranks("predict_generated_image", said, url=dying.url, **drawn)
-    assert len([*(store.folder / "generated_images").rglob("*.png")]) == 5
-    whole = talking(lambda _: image)
-    assert ranks("predict_generated_image", said, url=whole.url, **drawn).found.all()
-    assert len(whole.asked) == len(said) - 5
-    chatting = talking(lambda _: 404)
-    with raises_user_error("unknown-model", contains="images.model=painter"):
-        ranks("predict_generated_image", said, url=chatting.url, seed=1, **drawn)
-
-
-def test_a_matcher_without_a_text_tower_is_refused(ranks, clip, store, tmp_path) -> None:
+def test_a_matcher_without_a_text_tower_is_refused(clip, tmp_path) -> None:
     CLIPVisionModel.from_pretrained(clip.model).save_pretrained(tmp_path / "vision")
-    blind = replace(clip, model=str(tmp_path / "vision"))
     with raises_user_error("wrong-model-type", contains="clip_vision_model"):
-        released_encoder(blind, "fp32", tmp_path)
+        load_encoder(replace(clip, model=str(tmp_path / "vision")), "fp32", None)
 
 
 @pytest.fixture
 def world(tmp_path, micro, store, clip) -> Callable[..., tuple[dict, dict]]:
-    """Runs the command; its metrics and its report, without the times."""
+    """Runs the command; returns its metrics and its report, without the times."""
 
-    def measure(name: str = "one", **settings) -> tuple[dict, dict]:
-        run = Run(name, tmp_path / name)
-        run.folder.mkdir(exist_ok=True)
+    def measure(name: str = "one", *overrides: str, **settings) -> tuple[dict, dict]:
+        run = new_run(tmp_path / name, *overrides)
         cfg = TwoStageCommand(
             benchmark=micro, student=SERVED, store=str(store.folder.parent),
             matcher=MatcherConfig(retriever=clip, batch=16),
@@ -257,23 +189,21 @@ def log_of(store: Store) -> Path:
 
 
 @pytest.mark.slow
-def test_a_student_writes_once_for_every_matcher(world, store, micro, clip, tmp_path) -> None:
-    folder = tmp_path / "sft"
-    model, processor = loading.load_student(
-        STUDENT, "bf16", lambda: dataset.tokenizer_corpus(store, [])
-    )
-    loading.save_student(model, processor, folder / "student", "bf16")
-    settings = SftCommand(benchmark=micro, teacher=TeacherConfig(name="template"), student=STUDENT)
-    OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
-    (folder / "metrics.json").write_text("{}")
+def test_a_students_texts_serve_every_matcher(
+    world, store, trained_student, clip, tmp_path
+) -> None:
+    folder = Path(shutil.copytree(trained_student, tmp_path / "sft"))
     routes = ["cot_text", "predict_caption", "predict_image"]
-    asked = {"model": str(folder), "routes": routes}
-    metrics, report = world(**asked)
-    queries, database = load_standard_test(store)
-    assert set(metrics) == {
-        f"{r}_{m}" for r in routes for m in ("recall@1", "recall@10", "recall@50", "mrr",
-                                             "median_rank")
+    # Greedy responses of a random model are all alike.
+    overrides = ("student.temperature=1.0", "student.top_k=50")
+    settings = {
+        "model": str(folder), "routes": routes,
+        "student": replace(STUDENT, temperature=1.0, top_k=50),
     }  # fmt: skip
+    metrics, report = world("one", *overrides, **settings)
+    queries, database = load_standard_test(store)
+    measures = ("recall@1", "recall@10", "recall@50", "mrr", "median_rank")
+    assert set(metrics) == {f"{route}_{measure}" for route in routes for measure in measures}
     names = dict.fromkeys(row["name"] for row in report["rows"])
     assert list(names) == [f"sft {ROUTES[r].title}, clip" for r in routes]
     assert {(r["queries"], r["frames"]) for r in report["rows"] if r["builder"] is None} == {
@@ -283,67 +213,67 @@ def test_a_student_writes_once_for_every_matcher(world, store, micro, clip, tmp_
     text = (tmp_path / "one" / "report.txt").read_text()
     assert "Qwen3-VL-2B predict -> caption" in text
     assert "Parsed responses" in text
-    matched = [json.loads(m) for m in (tmp_path / "one" / "matched.jsonl").read_text().splitlines()]
+    matched = (tmp_path / "one" / "matched.jsonl").read_text().splitlines()
     assert len(matched) == 3 * len(queries)
     assert (tmp_path / "one" / "retrieval.png").stat().st_size > 10_000
 
-    # Killed in the middle of a line it writes what was lost, in whatever batches.
+    # A killed run generates the missing texts again, in batches of any size.
     log = log_of(store)
-    whole = log.read_text()
-    torn = whole[: len(whole) // 2]
+    complete = log.read_text()
+    torn = complete[: len(complete) // 2]
     log.write_text(torn)
-    assert world("two", **asked, batch=5) == (metrics, report)
-    lines = [*whole.splitlines(), torn.rpartition("\n")[2]]
+    assert world("two", *overrides, **settings, batch=5) == (metrics, report)
+    lines = [*complete.splitlines(), torn.rpartition("\n")[2]]
     assert sorted(log.read_text().splitlines()) == sorted(lines)
 
-    # Another matcher needs no student: there is none any more that could be loaded.
+    # Another matcher loads no student: without its configuration none could be loaded.
     (folder / "student" / "config.json").unlink()
     other = MatcherConfig(retriever=replace(clip, name="narrow", widths=[12]))
-    again, _ = world("three", **asked, matcher=other)
+    again, _ = world("three", *overrides, **settings, matcher=other)
     assert set(again) == set(metrics)
 
 
 @pytest.mark.slow
-def test_texts_are_kept_when_the_server_dies(world, store, talking) -> None:
-    def say(request) -> str:
+def test_texts_survive_a_server_that_dies(world, store, start_server) -> None:
+    def reply(request) -> str:
         return f"Prediction: {len(json.dumps(request))} px.\nOutcome: So it is."
 
-    def at(server) -> ServerConfig:
-        return ServerConfig(
+    def settings(server) -> dict:
+        served = ServerConfig(
             url=server.url, model="served", concurrency=1, unreachable_timeout=0.2, timeout=10.0
         )
+        return {"server": served, "routes": ["cot_text", "predict_image"]}
 
-    dying = talking(lambda r: say(r) if len(dying.asked) < 6 else 500)
+    dying = start_server(lambda r: reply(r) if len(dying.requests) < 6 else 500)
     with raises_user_error("no-server", contains="server.url"):
-        world(server=at(dying), routes=["cot_text", "predict_image"])
-    kept = log_of(store).read_text()
-    server = talking(say)
-    _, report = world("two", server=at(server), routes=["cot_text", "predict_image"])
+        world(**settings(dying))
+    before = log_of(store).read_text()
+    server = start_server(reply)
+    _, report = world("two", **settings(server))
     queries, _ = load_standard_test(store)
-    assert len(server.asked) == 2 * len(queries) - 5
-    assert log_of(store).read_text().startswith(kept)
+    assert len(server.requests) == 2 * len(queries) - 5
+    assert log_of(store).read_text().startswith(before)
     assert report["texts"]["rationale"]["  prediction and outcome alone"] == len(queries)
-    # Nothing is asked for what is there; undisturbed, the same is written.
-    server.asked.clear()
-    assert world("three", server=at(server), routes=["predict_image"])[1]["rows"]
-    assert not server.asked
-    once = sorted(log_of(store).read_text().splitlines())
+    # Nothing is requested twice, and a run without interruption writes the same texts.
+    server.requests.clear()
+    assert world("three", **settings(server))[1]["rows"]
+    assert not server.requests
+    resumed = sorted(log_of(store).read_text().splitlines())
     shutil.rmtree(store.folder / "texts")
-    world("four", server=at(server), routes=["cot_text", "predict_image"])
-    assert sorted(log_of(store).read_text().splitlines()) == once
+    world("four", **settings(server))
+    assert sorted(log_of(store).read_text().splitlines()) == resumed
 
 
-def test_a_matcher_that_reads_no_text_is_refused(world) -> None:
+def test_a_late_interaction_matcher_is_refused(world) -> None:
     late = RetrieverConfig(name="late", model="unused", late=LateConfig(width=24))
     with raises_user_error("unsupported-matcher", contains="retriever.late"):
         world(matcher=MatcherConfig(retriever=late))
 
 
-def test_a_student_without_rationales_is_told(world, micro, tmp_path) -> None:
-    (tmp_path / "sft" / "student").mkdir(parents=True)
-    settings = SftCommand(benchmark=micro, teacher=TeacherConfig(name="template"), student=STUDENT)
-    settings.train.regime = "answer_only"
-    OmegaConf.save(OmegaConf.structured(settings), tmp_path / "sft" / "config.yaml")
-    (tmp_path / "sft" / "metrics.json").write_text("{}")
+def test_a_student_without_rationales_is_refused(world, trained_student, tmp_path) -> None:
+    shutil.copytree(trained_student, tmp_path / "sft")
+    config = OmegaConf.load(tmp_path / "sft" / "config.yaml")
+    config.train.regime = "answer_only"
+    OmegaConf.save(config, tmp_path / "sft" / "config.yaml")
     with raises_user_error("unsupported-route", contains="cot_text"):
         world(model=str(tmp_path / "sft"))

@@ -1,5 +1,4 @@
-"""A real vLLM server with a small Qwen3-VL is asked with frames, as the model is where it is loaded
-here."""
+"""A real vLLM server with a small Qwen3-VL gets the frames and ids that a local model gets."""
 
 from __future__ import annotations
 
@@ -39,8 +38,8 @@ STUDENT = StudentConfig(
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory, micro_store):
-    """A base on disk, whose processor has sizes of its own, as a released one's has, and sees
-    single images in other shades than clips, as the tiny base's does."""
+    """A base on disk. Its processor has sizes of its own, as a released one has, and normalises
+    images otherwise than clips, as the tiny base's does."""
     folder = tmp_path_factory.mktemp("base")
     model, processor = loading.load_base(
         STUDENT, "fp32", lambda: dataset.tokenizer_corpus(micro_store, [])
@@ -57,7 +56,7 @@ def cfg(base):
 
 @pytest.fixture(scope="module")
 def adapters(cfg, tmp_path_factory):
-    """A student over that base, as a run of the trainer leaves it, that answers in its own way."""
+    """The adapters of a student over that base, whose responses differ from the base's."""
     folder = tmp_path_factory.mktemp("student")
     torch.manual_seed(0)
     trained = replace(cfg, lora=LoraConfig(rank=4))
@@ -97,7 +96,7 @@ def server_of_merged(merged, tmp_path):
 
 
 @pytest.mark.parametrize("control", [None, "shuffled_prefix", "candidate_only"])
-def test_the_server_is_asked_with_the_ids_that_a_model_here_reads(
+def test_requests_become_the_token_ids_of_a_local_model(
     server, cfg, base, micro_store, control
 ) -> None:
     frames, processor = (
@@ -110,24 +109,26 @@ def test_the_server_is_asked_with_the_ids_that_a_model_here_reads(
         sample = item_sample("cot", frames, cfg, control, mode, item)
         request = request_fields(cfg, mode, sample.clip) | {"max_tokens": 1}
         request["extra_body"]["return_token_ids"] = True
-        told = client.chat.completions.create(
+        response = client.chat.completions.create(
             model="tiny", messages=build_messages(sample), **request
         )
-        assert told.model_extra["prompt_token_ids"] == encode(sample, processor, 1500).input_ids
+        ids = encode(sample, processor, 1500).input_ids
+        assert response.model_extra["prompt_token_ids"] == ids
 
 
-def test_a_served_model_is_measured_by_records(server, cfg, micro, micro_store, tmp_path) -> None:
-    asked = SelectCommand(
+def test_constrained_responses_of_a_served_model_are_records(
+    server, cfg, micro, micro_store, tmp_path
+) -> None:
+    settings = SelectCommand(
         benchmark=micro, student=cfg, store=str(micro_store.folder.parent), limit=4,
         modes=["answer", "constrained"], server=ServerConfig(url=server.url, model="tiny"),
     )  # fmt: skip
-    served = select.main.__wrapped__(asked, Run("served", tmp_path))
+    metrics = select.main.__wrapped__(settings, Run("served", tmp_path))
     rows = [json.loads(line) for line in (tmp_path / "answers.jsonl").read_text().splitlines()]
-    head, held = rows[0]["asked"], [r for r in rows if r.get("mode") == "constrained"][1:]
-    assert head["model"]["root"] == cfg.model
-    # A random model may fill the texts to their ends; what it chooses stands before.
-    assert served["constrained_parse_rate"] == 1
-    for row in held:
+    assert rows[0]["asked"]["model"]["root"] == cfg.model
+    # A random model may fill the texts up to the token limit; the choice precedes them.
+    assert metrics["constrained_parse_rate"] == 1
+    for row in [r for r in rows if r.get("mode") == "constrained"][1:]:
         found = parse_choice(row["text"])
         assert found.letter == row["letter"]
         assert row["valid"] or (row["cut"] and found.reason is Reason.CUT_OFF)
@@ -135,63 +136,65 @@ def test_a_served_model_is_measured_by_records(server, cfg, micro, micro_store, 
         assert names == sorted(names, key=row["text"].index)
 
 
-def test_answers_are_drawn_many_at_a_time_each_by_its_own_seed(
+def test_concurrent_sampled_responses_depend_on_their_own_seeds(
     server, cfg, micro, micro_store, tmp_path
 ) -> None:
-    drawn = replace(cfg, temperature=0.7, max_new_tokens=16)
-    asked = SelectCommand(
-        benchmark=micro, student=drawn, store=str(micro_store.folder.parent), modes=["answer"],
+    sampled = replace(cfg, temperature=0.7, max_new_tokens=16)
+    command = SelectCommand(
+        benchmark=micro, student=sampled, store=str(micro_store.folder.parent), modes=["answer"],
         server=ServerConfig(url=server.url, model="tiny", unreachable_timeout=5),
     )  # fmt: skip
 
     def answers(name: str, **settings: object) -> dict[str, str]:
         folder = tmp_path / name
         folder.mkdir()
-        select.main.__wrapped__(replace(asked, **settings), Run(name, folder))
+        select.main.__wrapped__(replace(command, **settings), Run(name, folder))
         rows = [json.loads(line) for line in (folder / "answers.jsonl").read_text().splitlines()]
         return {row["item_id"]: row["text"] for row in rows if "item_id" in row}
 
     texts = answers("first")
-    # As many as it is asked at once, whose prompts are longer together than one step reads.
-    assert len(texts) >= asked.server.concurrency
+    # The prompts of concurrent requests exceed the tokens of one step of the server.
+    assert len(texts) >= command.server.concurrency
     assert len(set(texts.values())) > len(texts) // 2
     assert answers("again") == texts
     assert answers("other", seed=1) != texts
 
 
-def test_a_server_answers_as_the_student_whose_adapters_it_has(
+def test_a_server_with_adapters_responds_as_the_student(
     server, cfg, base, merged, micro_store
 ) -> None:
-    asked = cfg, micro_store, micro_store.selection("test")[0]
-    tokens, served = likeliest_served(server, "adapter", *asked)
-    assert served == pytest.approx(scored_here(merged, *asked)[tokens], abs=1e-3)
-    # Without them it says another thing.
-    assert served != pytest.approx(scored_here(base, *asked)[tokens], abs=0.1)
+    inputs = cfg, micro_store, micro_store.selection("test")[0]
+    tokens, served = served_scores(server, "adapter", *inputs)
+    assert served == pytest.approx(local_scores(merged, *inputs)[tokens], abs=1e-3)
+    # Without the adapters the probabilities differ.
+    assert served != pytest.approx(local_scores(base, *inputs)[tokens], abs=0.1)
 
 
-def test_a_server_answers_as_the_student_that_was_merged(
+def test_a_server_of_a_merged_student_responds_as_the_student(
     server_of_merged, cfg, merged, micro_store
 ) -> None:
-    asked = cfg, micro_store, micro_store.selection("test")[0]
-    tokens, served = likeliest_served(server_of_merged, "tiny", *asked)
-    assert served == pytest.approx(scored_here(merged, *asked)[tokens], abs=1e-3)
+    inputs = cfg, micro_store, micro_store.selection("test")[0]
+    tokens, served = served_scores(server_of_merged, "tiny", *inputs)
+    assert served == pytest.approx(local_scores(merged, *inputs)[tokens], abs=1e-3)
 
 
-def likeliest_served(server, model, cfg, store, item) -> tuple[list[int], list[float]]:
-    """The likeliest first tokens of an answer, and their log-probabilities."""
+def served_scores(server, model, cfg, store, item) -> tuple[list[int], list[float]]:
+    """The most likely first tokens of an answer, and their log-probabilities."""
     sample = item_sample("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
     request = request_fields(cfg, "answer", sample.clip)
     request |= {"max_tokens": 1, "logprobs": True, "top_logprobs": 10}
     request["extra_body"]["return_tokens_as_token_ids"] = True
     client = openai.OpenAI(base_url=server.url, api_key="none")
-    reply = client.chat.completions.create(model=model, messages=build_messages(sample), **request)
-    likeliest = reply.choices[0].logprobs.content[0].top_logprobs
-    tokens = [int(top.token.removeprefix("token_id:")) for top in likeliest]
-    return tokens, [top.logprob for top in likeliest]
+    response = client.chat.completions.create(
+        model=model, messages=build_messages(sample), **request
+    )
+    top_tokens = response.choices[0].logprobs.content[0].top_logprobs
+    tokens = [int(top.token.removeprefix("token_id:")) for top in top_tokens]
+    return tokens, [top.logprob for top in top_tokens]
 
 
-def scored_here(folder, cfg, store, item) -> np.ndarray:
-    """The log-probability of every token there, by the standard classes."""
+def local_scores(folder, cfg, store, item) -> np.ndarray:
+    """The log-probability of every first token, by the classes of transformers."""
     sample = item_sample("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
     processor = AutoProcessor.from_pretrained(folder)
     loading.pin_sizes(processor, cfg.image_size, cfg.frames)

@@ -157,7 +157,7 @@ def retrieve_run(
         found[title] = ranks
         rows += retrieval_results(store.name, title, ranks, queries, 0)
         curves.append(recall_curve(title, ranks))
-    report = {"rows": rows, "build": store.identity, "curves": curves, "indexes": []}
+    report = {"rows": rows, "build": store.identity, "curves": curves}
     if kind == "retrieve":
         report["differences"] = compare_retrievers(found, queries, 0)
     settings = RetrieveCommand(

@@ -205,14 +205,3 @@ def test_a_dollar_sign_in_a_name_begins_no_formula(tmp_path):
         figures.confusion_figure({name: np.eye(4, 5)}, tmp_path / "confusion.svg")
     for path in tmp_path.iterdir():
         assert f">{name}<" in path.read_text()
-
-
-@pytest.mark.parametrize(("chosen", "wrong"), [("B", False), ("C", True), (None, True)])
-def test_item_figure_frames_the_target_green_and_a_wrong_choice_red(tmp_path, chosen, wrong):
-    images = [Image.new("RGB", (48, 32), "white")] * 12
-    path = tmp_path / "item.png"
-    figures.item_figure(images, images[:4], "ABCD", "B", chosen, "Which?", path)
-    with Image.open(path) as image:
-        pixels = np.asarray(image.convert("RGB")).reshape(-1, 3)
-    assert (pixels == [0x22, 0x88, 0x33]).all(1).any()
-    assert (pixels == [0xCC, 0x33, 0x11]).all(1).any() == wrong

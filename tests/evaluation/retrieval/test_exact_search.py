@@ -1,4 +1,4 @@
-"""Exact ranks are those of one plain table of scores, however the database is cut and ordered."""
+"""Exact ranks follow from a plain table of scores, in any order and blocks of the database."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from evaluation.retrieval.exact_search import (
     GridEmbeddings,
     block_scores,
     exact_ranks,
-    kth_scores,
     pair_scores,
     row_sums,
 )
@@ -20,18 +19,18 @@ WIDTHS = (96, 48, 20, 7)
 
 
 def embeddings(rows: int, seed: int = 0) -> np.ndarray:
-    """Rows of very different lengths, some with a first piece next to nothing."""
+    """Rows of very different lengths, some with a tiny first piece."""
     rng = np.random.default_rng(seed)
-    made = rng.standard_normal((rows, WIDTHS[0])) * 10.0 ** rng.uniform(-3, 3, (rows, 1))
-    made[::5, :7] *= 1e-6
-    return made.astype(np.float32)
+    values = rng.standard_normal((rows, WIDTHS[0])) * 10.0 ** rng.uniform(-3, 3, (rows, 1))
+    values[::5, :7] *= 1e-6
+    return values.astype(np.float32)
 
 
-def cosines(asked: np.ndarray, shown: np.ndarray, width: int) -> np.ndarray:
-    """In double precision, straight from the definition."""
+def cosines(queries: np.ndarray, database: np.ndarray, width: int) -> np.ndarray:
+    """Cosines by their definition, in double precision."""
     units = [
         a[:, :width].astype(float) / np.linalg.norm(a[:, :width].astype(float), axis=1)[:, None]
-        for a in (asked, shown)
+        for a in (queries, database)
     ]
     return units[0] @ units[1].T
 
@@ -49,21 +48,21 @@ def same(one: exact_search.Ranks, two: exact_search.Ranks) -> bool:
 
 
 def test_scores_are_cosines_to_fp32() -> None:
-    asked, shown = embeddings(30), embeddings(50, 1)
+    queries, database = embeddings(30), embeddings(50, 1)
     for k, scores in enumerate(
-        block_scores(GridEmbeddings(asked, WIDTHS), GridEmbeddings(shown, WIDTHS))
+        block_scores(GridEmbeddings(queries, WIDTHS), GridEmbeddings(database, WIDTHS))
     ):
         assert scores.dtype == np.float32
-        np.testing.assert_allclose(scores, cosines(asked, shown, WIDTHS[::-1][k]), atol=6e-8)
+        np.testing.assert_allclose(scores, cosines(queries, database, WIDTHS[::-1][k]), atol=6e-8)
 
 
-def test_ranks_are_those_of_a_plain_table() -> None:
-    asked, shown = embeddings(40), embeddings(300, 1)
-    gold = np.random.default_rng(2).integers(300, size=40)
-    found = exact_ranks(asked, shown[gold], [shown], WIDTHS)
+def test_ranks_follow_from_a_plain_table() -> None:
+    queries, database = embeddings(40), embeddings(300, 1)
+    targets = np.random.default_rng(2).integers(300, size=40)
+    found = exact_ranks(queries, database[targets], [database], WIDTHS)
     for k, width in enumerate(WIDTHS):
-        greater, tied = count_ranks(cosines(asked, shown, width), gold)
-        # fp32 cannot tell a few pairs apart that double precision can.
+        greater, tied = count_ranks(cosines(queries, database, width), targets)
+        # A few pairs tie in fp32 but not in double precision.
         assert np.abs(found.greater[k] - greater).max() <= 1
         assert (found.greater[k] + found.tied[k] >= greater).all()
         assert (found.tied[k] >= tied).all()
@@ -72,72 +71,79 @@ def test_ranks_are_those_of_a_plain_table() -> None:
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 64, 255, 299, 300])
 @pytest.mark.parametrize("block", [1, 5, 37, 1024])
-def test_no_cut_of_the_database_changes_a_rank(monkeypatch, size, block) -> None:
-    asked, shown = embeddings(23), embeddings(300, 1)
-    shown[::3] = shown[0]
-    gold = np.arange(23) * 11
-    whole = exact_ranks(asked, shown[gold], [shown], WIDTHS)
+def test_blocks_of_the_database_do_not_change_ranks(monkeypatch, size, block) -> None:
+    queries, database = embeddings(23), embeddings(300, 1)
+    database[::3] = database[0]
+    targets = np.arange(23) * 11
+    expected = exact_ranks(queries, database[targets], [database], WIDTHS)
     monkeypatch.setattr(exact_search, "FRAMES", block)
     monkeypatch.setattr(exact_search, "QUERIES", 1 + block % 9)
-    assert same(exact_ranks(asked, shown[gold], split(shown, size), WIDTHS), whole)
+    assert same(exact_ranks(queries, database[targets], split(database, size), WIDTHS), expected)
 
 
-def test_no_order_of_the_database_or_of_the_queries_changes_a_rank() -> None:
-    asked, shown = embeddings(40), embeddings(333, 1)
-    shown[100:200] = shown[:100]
-    gold = np.arange(40) * 8
-    whole = exact_ranks(asked, shown[gold], [shown], WIDTHS)
+def test_the_order_of_the_database_and_of_the_queries_does_not_change_ranks() -> None:
+    queries, database = embeddings(40), embeddings(333, 1)
+    database[100:200] = database[:100]
+    targets = np.arange(40) * 8
+    expected = exact_ranks(queries, database[targets], [database], WIDTHS)
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        frames, queries = rng.permutation(333), rng.permutation(40)
-        moved = exact_ranks(asked[queries], shown[gold[queries]], split(shown[frames], 101), WIDTHS)
-        assert np.array_equal(moved.greater, whole.greater[:, queries])
-        assert np.array_equal(moved.tied, whole.tied[:, queries])
+        order, moved_queries = rng.permutation(333), rng.permutation(40)
+        moved = exact_ranks(
+            queries[moved_queries],
+            database[targets[moved_queries]],
+            split(database[order], 101),
+            WIDTHS,
+        )
+        assert np.array_equal(moved.greater, expected.greater[:, moved_queries])
+        assert np.array_equal(moved.tied, expected.tied[:, moved_queries])
 
 
 @pytest.mark.parametrize("size", [1, 13, 64, 129])
-def test_equal_frames_tie_wherever_they_stand(size) -> None:
-    """Three copies of every frame, in other chunks and at other places of a chunk."""
-    asked, once = embeddings(64), embeddings(129, 1)
-    shown = np.concatenate([once, once[::-1], np.roll(once, 17, axis=0)])
-    gold = np.arange(64)
-    alone = exact_ranks(asked, once[gold], [once], WIDTHS)
-    assert not alone.tied.any()
-    found = exact_ranks(asked, shown[gold], split(shown, size), WIDTHS)
+def test_equal_frames_tie_at_any_position(size) -> None:
+    """Three copies of every frame, in other blocks and at other positions of a block."""
+    queries, once = embeddings(64), embeddings(129, 1)
+    database = np.concatenate([once, once[::-1], np.roll(once, 17, axis=0)])
+    targets = np.arange(64)
+    distinct = exact_ranks(queries, once[targets], [once], WIDTHS)
+    assert not distinct.tied.any()
+    found = exact_ranks(queries, database[targets], split(database, size), WIDTHS)
     assert (found.tied == 2).all()
-    assert np.array_equal(found.greater, 3 * alone.greater)
+    assert np.array_equal(found.greater, 3 * distinct.greater)
 
 
-def test_a_pairs_score_is_its_blocks_to_the_last_bit() -> None:
+def test_scores_of_pairs_and_of_blocks_are_bit_identical() -> None:
     rng = np.random.default_rng(0)
-    asked = rng.standard_normal((70, 1024), np.float32)
-    shown = rng.standard_normal((70, 1024), np.float32)
-    queries, frames = GridEmbeddings(asked, [1024, 256]), GridEmbeddings(shown, [1024, 256])
-    blocks = list(block_scores(queries, frames))
-    for pairs, block in zip(pair_scores(queries, frames), blocks, strict=True):
+    queries = rng.standard_normal((70, 1024), np.float32)
+    database = rng.standard_normal((70, 1024), np.float32)
+    query_grid, frame_grid = (
+        GridEmbeddings(queries, [1024, 256]),
+        GridEmbeddings(database, [1024, 256]),
+    )
+    blocks = list(block_scores(query_grid, frame_grid))
+    for pairs, block in zip(pair_scores(query_grid, frame_grid), blocks, strict=True):
         assert np.array_equal(pairs, np.diagonal(block))
     for rows in (slice(3, 4), slice(9, 22), np.array([5, 68, 2])):
-        for part, block in zip(block_scores(queries[rows], frames), blocks, strict=True):
+        for part, block in zip(block_scores(query_grid[rows], frame_grid), blocks, strict=True):
             assert np.array_equal(part, block[rows])
 
 
 def test_products_of_pieces_are_exact() -> None:
-    """The law that all others rest on, held against whole numbers without a bound, for vectors
-    whose products all add up in one direction too."""
+    """Compared with Python's integers, also for vectors whose products all have one sign."""
     rng = np.random.default_rng(0)
     rows = rng.standard_normal((4, 4096))
     rows[1], rows[2] = 1.0, np.abs(rows[2])
     rows[3, 1:] = 0
     (piece,) = GridEmbeddings(rows.astype(np.float32), [4096]).pieces
     products = piece @ piece.T
-    whole = [[int(x) for x in row] for row in piece.tolist()]
-    for i, a in enumerate(whole):
-        for j, b in enumerate(whole):
+    integers = [[int(x) for x in row] for row in piece.tolist()]
+    for i, a in enumerate(integers):
+        for j, b in enumerate(integers):
             assert int(products[i, j]) == sum(x * y for x, y in zip(a, b, strict=True))
 
 
 @pytest.mark.parametrize("width", [1, 2, 3, 7, 64, 100])
-def test_a_rows_sum_is_the_same_beside_any_others(width) -> None:
+def test_the_sum_of_a_row_is_independent_of_other_rows(width) -> None:
     values = np.random.default_rng(0).random((50, width))
     sums = row_sums(values.copy())
     np.testing.assert_allclose(sums, values.sum(1))
@@ -146,20 +152,9 @@ def test_a_rows_sum_is_the_same_beside_any_others(width) -> None:
         assert row_sums(np.asfortranarray(values)[k:].copy(order="F"))[0] == sums[k]
 
 
-def test_an_embedding_of_zeros_is_as_near_to_all() -> None:
-    shown = embeddings(10)
-    shown[4] = 0
-    found = exact_ranks(np.zeros((1, 96), np.float32), shown[:1], [shown], WIDTHS)
+def test_an_embedding_of_zeros_ties_with_all_frames() -> None:
+    database = embeddings(10)
+    database[4] = 0
+    found = exact_ranks(np.zeros((1, 96), np.float32), database[:1], [database], WIDTHS)
     assert (found.greater == 0).all()
     assert (found.tied == 9).all()
-
-
-def test_the_least_of_the_first_k_is_the_kth_highest(monkeypatch) -> None:
-    asked, shown = embeddings(9), embeddings(120, 1)
-    monkeypatch.setattr(exact_search, "FRAMES", 11)
-    least = kth_scores(asked, split(shown, 50), WIDTHS, (1, 10, 200))
-    for k, width in enumerate(WIDTHS):
-        falling = -np.sort(-cosines(asked, shown, width), axis=1)
-        np.testing.assert_allclose(least[k, 0], falling[:, 0], atol=6e-8)
-        np.testing.assert_allclose(least[k, 1], falling[:, 9], atol=6e-8)
-    assert np.isneginf(least[:, 2]).all()

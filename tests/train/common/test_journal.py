@@ -20,11 +20,11 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf import trackers
 from conf.entry import Run
-from conf.schema import SftCommand
-from evaluation.generators import local
+from conf.schema import SelectCommand, SftCommand
 from evaluation.generators.base import item_sample
+from evaluation.generators.local import LocalModel
 from evaluation.generators.response_log import ResponseLog, collect_responses
-from models import compat, loading
+from models import compat
 from models.student.prompts import conversation
 from tests.user_errors import raises_user_error
 from train import sft
@@ -77,8 +77,9 @@ def test_generated_answers_are_those_of_the_evaluation(
 ) -> None:
     folder, _ = trained
     rows = [r for r in read_lines(folder / "samples.jsonl") if r["step"] == 2]
-    model, processor = loading.load_trained(settings.student, "fp32", folder / "student")
-    compat.keep_differentiable(model)
+    cfg = SelectCommand(batch=2, student=settings.student)
+    student = LocalModel(cfg, folder, settings.student, "fp32")
+    compat.keep_differentiable(student.loaded[0])
     by_id = {item.item_id: item for item in micro_store.selection("train")}
     for mode in ("reasoning", "answer"):
         written = {r["sample"].removesuffix(f" ({mode})"): r for r in rows if r["mode"] == mode}
@@ -86,11 +87,8 @@ def test_generated_answers_are_those_of_the_evaluation(
         items = [by_id[item_id] for item_id in written]
         log = ResponseLog(tmp_path / f"{mode}.jsonl", {mode: {}}, items)
         sample_of = partial(item_sample, "cot", frames, settings.student, None, mode)
-        generate = partial(
-            local.generate_responses, model, processor, settings.student, "fp32", 2, 0, mode,
-            sample_of,
-        )  # fmt: skip
-        for answer in collect_responses(items, mode, generate, log):
+        respond = partial(student.respond, mode, sample_of)
+        for answer in collect_responses(items, mode, respond, log):
             row = written[answer.item_id]
             assert row["text"] == answer.text
             assert (row["letter"], row["reason"]) == (answer.letter, answer.reason)

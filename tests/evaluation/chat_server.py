@@ -1,0 +1,61 @@
+"""A small real server that speaks the chat protocol and sends the responses that a test gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from tests.local import JsonHandler, LocalServer
+
+Reply = str | int | dict[str, Any]
+"""A text; a status; or a response's `content`, `reasoning`, `finish_reason` or `message`."""
+
+
+class ChatServer(LocalServer):
+    """`reply` responds to each request, and `requests` records them. With a `key`, requests that
+    lack it are refused."""
+
+    def __init__(self, reply: Callable[[dict[str, Any]], Reply], port: int = 0) -> None:
+        self.reply = reply
+        self.key: str | None = None
+        self.root = "weights"
+        self.requests: list[dict[str, Any]] = []
+        super().__init__(Handler, port)
+
+
+class Handler(JsonHandler):
+    server: ChatServer
+
+    def get(self) -> None:
+        if self.refused():
+            return
+        model = {"id": "served", "object": "model", "root": self.server.root, "parent": None}
+        adapter = {"id": "adapter", "object": "model", "root": "lora", "parent": "served"}
+        self.respond(200, {"object": "list", "data": [model, adapter]})
+
+    def post(self, request: dict[str, Any]) -> None:
+        if self.refused():
+            return
+        self.server.requests.append(request)
+        reply = self.server.reply(request)
+        if isinstance(reply, int):
+            reply = {"status": reply}
+        elif isinstance(reply, str):
+            reply = {"content": reply}
+        if status := reply.get("status"):
+            self.respond(status, {"error": {"message": reply.get("message", "fault")}})
+            return
+        message = {"role": "assistant", "content": reply.get("content")}
+        if "reasoning" in reply:
+            message["reasoning"] = reply["reasoning"]
+        finish = reply.get("finish_reason", "stop")
+        choice = {"index": 0, "finish_reason": finish, "message": message}
+        body = {"id": "x", "object": "chat.completion", "created": 0, "model": "served"}
+        self.respond(200, {**body, "choices": [choice]})
+
+    def refused(self) -> bool:
+        """Refuse a request with another key."""
+        key = self.server.key
+        if wrong := key is not None and self.headers["Authorization"] != f"Bearer {key}":
+            self.respond(401, {"error": {"message": "no such key"}})
+        return wrong

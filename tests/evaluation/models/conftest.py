@@ -1,0 +1,84 @@
+"""Finished runs of small models, for the tests of the evaluation commands."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from conf.entry import Run
+from conf.schema import (
+    BenchmarkConfig,
+    ContrastiveCommand,
+    ContrastiveTrainConfig,
+    LoraConfig,
+    RetrieverConfig,
+    SftCommand,
+    StudentConfig,
+    TeacherConfig,
+)
+from data.store import Store
+from models import loading
+from models.retriever import embedder
+from tests.tiny_models import SMALL
+from train.student import dataset
+
+WHOLE = {"quantization": "none", "lora": LoraConfig(rank=0)}
+STUDENT = StudentConfig(
+    name="small", architecture=SMALL, image_size=96, max_length=1500, max_new_tokens=12, **WHOLE
+)
+RETRIEVER = RetrieverConfig(
+    name="small", architecture=SMALL, image_size=96, widths=[64, 32], **WHOLE
+)
+
+
+def finish(folder: Path, settings: object, metrics: dict | None = None) -> None:
+    """Write what a command's entry writes for a finished run."""
+    OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
+    (folder / "metrics.json").write_text(json.dumps(metrics or {}))
+    (folder / "run.json").write_text('{"started": "2026-01-01", "earlier_starts": []}')
+
+
+def new_run(folder: Path, *overrides: str) -> Run:
+    folder.mkdir(parents=True, exist_ok=True)
+    return Run(folder.name, folder, overrides)
+
+
+def save_retriever(
+    cfg: RetrieverConfig, folder: Path, micro: BenchmarkConfig, store: Store
+) -> Path:
+    """Write a finished run of train.contrastive."""
+    texts = embedder.tokenizer_texts(store.retrieval("train"), cfg)
+    model = embedder.load_retriever(cfg, "fp32", texts, folder / "untrained")
+    # The cosines of a new model differ by fp32's noise only.
+    noise = torch.Generator().manual_seed(0)
+    for weight in model.parameters():
+        weight.data += 0.1 * torch.randn(weight.shape, generator=noise)
+    model.save_pretrained(str(folder / "retriever"), create_model_card=False)
+    train = ContrastiveTrainConfig(precision="bf16")
+    finish(folder, ContrastiveCommand(benchmark=micro, retriever=cfg, train=train))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def trained_student(tmp_path_factory, micro, micro_store) -> Path:
+    """A finished run of train.sft."""
+    folder = tmp_path_factory.mktemp("sft") / "run"
+    model, processor = loading.load_student(
+        STUDENT, "bf16", lambda: dataset.tokenizer_corpus(micro_store, [])
+    )
+    loading.save_student(model, processor, folder / "student", "bf16")
+    settings = SftCommand(benchmark=micro, teacher=TeacherConfig(name="template"), student=STUDENT)
+    finish(folder, settings, {"answer_loss": 1.0, "answer_loss_at_start": 2.0})
+    return folder
+
+
+@pytest.fixture(scope="session")
+def trained_retriever(tmp_path_factory, micro, micro_store) -> Path:
+    """A finished run of train.contrastive."""
+    return save_retriever(
+        RETRIEVER, tmp_path_factory.mktemp("contrastive") / "run", micro, micro_store
+    )

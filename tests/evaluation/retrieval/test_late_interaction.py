@@ -1,0 +1,111 @@
+"""Ranks by late interaction follow the definition, and no order, block or padding changes them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sentence_transformers.util.similarity import maxsim
+
+from evaluation.embedders.cache import pad_rows
+from evaluation.metrics.ranking import count_ranks
+from evaluation.retrieval import late_interaction
+from evaluation.retrieval.late_interaction import late_ranks, pair_scores
+
+WIDTH = 24
+
+
+def random_vectors(rows: int, most: int, seed: int) -> list[np.ndarray]:
+    """Unit vectors, from one to `most` per row."""
+    rng = np.random.default_rng(seed)
+    vectors = [rng.standard_normal((rng.integers(1, most + 1), WIDTH)) for _ in range(rows)]
+    return [(v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32) for v in vectors]
+
+
+def rows_of(vectors: list[np.ndarray], more: int = 0) -> np.ndarray:
+    """Rows with padding for `more` vectors than the longest has."""
+    rows = pad_rows([v.ravel() for v in vectors])
+    return np.pad(rows, ((0, 0), (0, more * WIDTH)))
+
+
+@pytest.fixture(scope="module")
+def queries() -> list[np.ndarray]:
+    return random_vectors(20, 60, 0)
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[np.ndarray]:
+    """Every third frame equals the first."""
+    vectors = random_vectors(120, 9, 1)
+    return [vectors[0] if k % 3 == 0 else v for k, v in enumerate(vectors)]
+
+
+TARGETS = np.arange(20) * 5
+
+
+def ranks(queries, frames, targets=TARGETS, size=120, more=0):
+    rows = rows_of(frames, more)
+    parts = [rows[k : k + size] for k in range(0, len(rows), size)]
+    return late_ranks(rows_of(queries, more), rows[targets], parts, WIDTH)
+
+
+def same(one, two) -> bool:
+    return np.array_equal(one.greater, two.greater) and np.array_equal(one.tied, two.tied)
+
+
+def test_ranks_agree_with_the_librarys_scores(queries, frames) -> None:
+    scores = maxsim([*queries], [*frames]).numpy()
+    pairs = pair_scores(rows_of(queries), rows_of(frames)[TARGETS], WIDTH)
+    np.testing.assert_allclose(pairs, scores[np.arange(20), TARGETS], rtol=1e-6, atol=1e-5)
+    found = ranks(queries, frames)
+    greater, _ = count_ranks(scores, TARGETS)
+    # In fp32 the library's scores of equal frames may differ.
+    assert (found.greater[0] <= greater).all()
+    assert (found.greater[0] + found.tied[0] >= greater).all()
+    copies = TARGETS % 3 == 0
+    assert np.array_equal(found.tied[0][copies], np.full(copies.sum(), 39))
+    assert np.array_equal(found.greater[0][~copies], greater[~copies])
+    assert not found.tied[0][~copies].any()
+
+
+def test_padding_does_not_count_as_stored(queries, frames) -> None:
+    count = sum(len(v) for v in frames)
+    assert ranks(queries, frames, more=3).bytes == (count * WIDTH * 4,)
+
+
+@pytest.mark.parametrize(("size", "block", "cells"), [(1, 9, 1), (7, 64, 2**10), (50, 1, 2**23)])
+def test_blocks_do_not_change_ranks(monkeypatch, queries, frames, size, block, cells) -> None:
+    expected = ranks(queries, frames)
+    monkeypatch.setattr(late_interaction, "VECTORS", block)
+    monkeypatch.setattr(late_interaction, "CELLS", cells)
+    assert same(ranks(queries, frames, size=size), expected)
+
+
+def test_the_order_of_vectors_does_not_change_scores(queries, frames) -> None:
+    rng = np.random.default_rng(2)
+    moved = [[rng.permutation(v) for v in side] for side in (queries, frames)]
+    one = pair_scores(rows_of(queries), rows_of(frames)[TARGETS], WIDTH)
+    two = pair_scores(rows_of(moved[0]), rows_of(moved[1])[TARGETS], WIDTH)
+    assert np.array_equal(one, two)
+    assert same(ranks(*moved), ranks(queries, frames))
+
+
+def test_the_order_of_the_database_does_not_change_ranks(queries, frames) -> None:
+    places = np.random.default_rng(3).permutation(120)
+    moved = ranks(queries, [frames[k] for k in places], np.argsort(places)[TARGETS], size=13)
+    assert same(moved, ranks(queries, frames))
+
+
+def test_padding_does_not_change_ranks(queries, frames) -> None:
+    assert same(ranks(queries, frames, more=5), ranks(queries, frames))
+
+
+def test_sums_of_up_to_8000_vectors_are_exact() -> None:
+    """All vectors are equal, so that the sum is the largest possible."""
+    vector = np.full((1, WIDTH), WIDTH**-0.5, np.float32)
+    steps = np.rint(vector.astype(np.float64) * late_interaction.GRID).astype(object)
+    for count in (1, 7999, 8000):
+        query = np.repeat(vector, count, axis=0).reshape(1, -1)
+        (score,) = pair_scores(query, vector, WIDTH)
+        exact = count * int((steps * steps).sum())
+        assert exact < 2**53
+        assert score == np.float32(exact / 2**40)
