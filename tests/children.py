@@ -13,8 +13,10 @@ TIMEOUT = 500
 behind."""
 
 
-def run_child(command: Sequence[object], **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end and capture its output.
+def run_child(
+    command: Sequence[object], check: bool = False, **options: Any
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end and capture its output; with `check`, it must succeed.
 
     If it takes longer than `TIMEOUT`, or the test is interrupted, it is killed together with its
     own children, such as ranks that wait for each other.
@@ -27,4 +29,5 @@ def run_child(command: Sequence[object], **options: Any) -> subprocess.Completed
         except BaseException:
             os.killpg(child.pid, signal.SIGKILL)
             raise
+    assert not check or child.returncode == 0, errors
     return subprocess.CompletedProcess(command, child.returncode, output, errors)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import shlex
-import subprocess
 from pathlib import Path
 
 import pytest
 
+from tests.children import run_child
 from tests.conf.test_presets import settings
 
 ROOT = Path(__file__).parent.parent
@@ -19,11 +19,11 @@ def lines(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     releases = tmp_path_factory.mktemp("releases")
     for suite in ("movi_a", "physion"):
         (releases / suite).mkdir()
-    done = subprocess.run(
+    done = run_child(
         # -o keeps make from creating the environment.
         ["make", "-s", "-o", ".venv/.ready", request.param, "PY=echo python -m",
          f"RELEASES={releases}"],
-        cwd=ROOT, capture_output=True, text=True, check=True,
+        cwd=ROOT, check=True,
     )  # fmt: skip
     return [line for line in done.stdout.splitlines() if "benchmarks.speed.hours" not in line]
 
@@ -57,9 +57,9 @@ def test_every_experiment_runs_and_the_report_is_last(lines: list[str]) -> None:
 
 
 def test_missing_releases_stop_the_target(tmp_path: Path) -> None:
-    done = subprocess.run(
+    done = run_child(
         ["make", "-s", "-o", ".venv/.ready", "paper", "PY=echo python -m", f"RELEASES={tmp_path}"],
-        cwd=ROOT, capture_output=True, text=True,
+        cwd=ROOT,
     )  # fmt: skip
     assert done.returncode != 0
     assert done.stdout.splitlines() == [

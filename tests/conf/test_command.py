@@ -2,12 +2,12 @@
 
 import json
 import shutil
-import subprocess
 import sys
 
 import pytest
 
 from conf.failures import report_failures
+from tests.children import run_child
 from tests.conf.toy_process import run_toy
 
 RESUME = "fix this and run the same command again to resume  [write-failed]\n"
@@ -80,9 +80,7 @@ def test_help_describes_the_settings_and_imports_nothing_heavy(folder):
         "heavy = {'torch', 'transformers', 'pybullet', 'matplotlib', 'pandas'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=folder, capture_output=True, text=True, check=True
-    )
+    done = run_child([sys.executable, "-c", script], check=True, cwd=folder)
     assert "A toy that squares x." in done.stdout
     assert "teacher: qwen3_32b, template" in done.stdout
     lines = [line.split() for line in done.stdout.splitlines()]
@@ -92,7 +90,5 @@ def test_help_describes_the_settings_and_imports_nothing_heavy(folder):
 
 def test_help_can_be_piped_to_head(folder):
     command = "set -o pipefail; python -m toy --help | true"
-    done = subprocess.run(
-        ["bash", "-c", command.replace("python", sys.executable)], cwd=folder, capture_output=True
-    )
-    assert (done.returncode, done.stderr) == (0, b"")
+    done = run_child(["bash", "-c", command.replace("python", sys.executable)], cwd=folder)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from data.records import FPS
 from models.loading import pin_sizes
 from models.student.collator import Encoded, encode
 from models.student.prompts import Sample, selection_sample
+from tests.children import run_child
 from tests.teacher.vllm_server import ENVIRONMENT
 
 LENGTH = 1500
@@ -79,11 +79,6 @@ def test_vllm_builds_the_ids_that_are_trained_on(sample, saved_base, tmp_path) -
         images=np.stack(sample.images),
     )
     script = Path(__file__).with_name("vllm_prompt.py")
-    told = subprocess.run(
-        [ENVIRONMENT / "bin" / "python", script, served, tmp_path / "asked.npz"],
-        capture_output=True,
-        text=True,
-    )
-    assert told.returncode == 0, told.stderr[-2000:]
-    ids = json.loads(told.stdout.splitlines()[-1])
+    command = [ENVIRONMENT / "bin" / "python", script, served, tmp_path / "asked.npz"]
+    ids = json.loads(run_child(command, check=True).stdout.splitlines()[-1])
     assert prompt_ids(encode(sample, processor, LENGTH)) == ids

@@ -1,7 +1,6 @@
 """The built-in narrator passes the validator, and the validator rejects broken rationales."""
 
 import re
-import subprocess
 import sys
 
 import numpy as np
@@ -12,6 +11,7 @@ from teacher.narrator import write_description, write_rationale
 from teacher.numbers.detection import find_numbers
 from teacher.predicates import extract_predicates
 from teacher.validation.validator import WORD, count_words, validate_rationale
+from tests.children import run_child
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import cases
 
@@ -60,9 +60,7 @@ def test_text_is_the_same_in_another_process():
         "print(write_rationale(predicates, item, 5))"
     )
     item, predicates = next(cases(9))
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
+    result = run_child([sys.executable, "-c", code], check=True)
     assert result.stdout.strip() == write_rationale(predicates, item, 5)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from data.render.bullet import BulletRenderer
 from data.render.floor import Floor
 from data.world.camera import STANDARD_VIEW
 from data.world.sampling import simulate_scene
+from tests.children import run_child
 from tests.user_errors import raises_user_error
 
 LIMITS = BenchmarkConfig(name="renderers")
@@ -35,7 +35,7 @@ def test_versions_need_no_renderer_package() -> None:
         "print(*(renderer.version for renderer in RENDERERS.values()), sep='\\n')\n"
         "assert not {'pybullet', 'bpy'} & set(sys.modules)"
     )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    run = run_child([sys.executable, "-c", code], check=True)
     bullet, blender_version = run.stdout.splitlines()
     assert bullet == "bullet-1"
     assert blender.BPY in blender_version

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import subprocess
 import sys
 
 import numpy as np
@@ -13,6 +12,7 @@ from conf.schema import BenchmarkConfig
 from data.records import FPS, Scene, SceneObject
 from data.world.physics import STANDARD_PHYSICS, Body, _has_repeated, shared_simulator
 from data.world.sampling import record_scene, sample_bodies, simulate_scene, simulate_without
+from tests.children import run_child
 
 LIMITS = BenchmarkConfig(name="laws")
 CUBE = SceneObject("cube", "rubber", "red")
@@ -29,9 +29,7 @@ def test_scenes_are_bit_identical_in_another_process_and_order() -> None:
         "from tests.data.world.test_physics import *\n"
         "for k in (0, 1, 2): print(fingerprint(simulate_scene(3, k, 'train', LIMITS)))"
     )
-    second = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout.split()
+    second = run_child([sys.executable, "-c", code], check=True).stdout.split()
     assert [first[1], first[2], first[0]] == second[-3:]
 
 

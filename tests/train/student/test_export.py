@@ -164,8 +164,7 @@ def test_transformers_alone_computes_the_same_logits(
     torch.save(data, tmp_path / "inputs.pt")
     arguments = [forms["fp32"][1], tmp_path / "inputs.pt", tmp_path / "outputs.pt"]
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    ended = run_child([sys.executable, "-c", SCRIPT, *arguments], cwd=tmp_path, env=environment)
-    assert ended.returncode == 0, ended.stderr
+    run_child([sys.executable, "-c", SCRIPT, *arguments], check=True, cwd=tmp_path, env=environment)
     ids, logits = torch.load(tmp_path / "outputs.pt")
     student = runs / "sft" / "run" / "student"
     model, processor = loading.load_trained(settings.student, "fp32", student)
