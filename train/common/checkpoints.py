@@ -53,7 +53,7 @@ def newest_checkpoint(folder: Path) -> Path | None:
     return None
 
 
-def check_best(checkpoint: Path, best_step: int | None) -> None:
+def check_best_checkpoint(checkpoint: Path, best_step: int | None) -> None:
     """Raise UserError if the best checkpoint of a run that resumes from `checkpoint` is missing or
     incomplete. The library would silently keep the last weights instead, or fail at the end."""
     best = checkpoint.with_name(f"checkpoint-{best_step}")

@@ -21,7 +21,7 @@ from models.distributed import is_sharded
 from models.memory import explain_out_of_memory
 from train.common.arguments import PROJECT
 from train.common.callbacks import BestCheckpointCallback, JournalCallback, MetricsBar
-from train.common.checkpoints import STATE, check_best
+from train.common.checkpoints import STATE, check_best_checkpoint
 
 log = logging.getLogger(__name__)
 
@@ -80,7 +80,7 @@ def fit(trainer: Trainer, checkpoint: Path | None) -> None:
     if checkpoint is not None:
         log.info("resuming from %s", checkpoint)
         state = TrainerState.load_from_json(str(checkpoint / STATE))
-        check_best(checkpoint, state.best_global_step)
+        check_best_checkpoint(checkpoint, state.best_global_step)
         if state.global_step >= state.max_steps:
             # The trainer would take another step.
             trainer.state = state

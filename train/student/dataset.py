@@ -28,7 +28,7 @@ from train.tiny_base import questions
 
 
 @dataclass(frozen=True)
-class Supervised:
+class SupervisedItem:
     """A selection item in one mode, with its rationale and match lines (empty in answer mode)."""
 
     item: SelectionItem
@@ -55,7 +55,7 @@ class Supervised:
         one = self if seed is None else self.permuted(seed, epoch)
         return selection_sample(one.item, one.mode, one.regime, frames, frame_count, one.response)
 
-    def permuted(self, seed: int, epoch: int) -> Supervised:
+    def permuted(self, seed: int, epoch: int) -> SupervisedItem:
         """Permute the candidates, and the letters in the texts with them, by seed and epoch."""
         order = seeded_rng(seed, epoch, self.item.item_id).permutation(len(LETTERS)).tolist()
         return replace(
@@ -69,12 +69,12 @@ class Supervised:
 
 def supervised_items(
     store: Store, items: list[SelectionItem], rationales: dict[str, Rationale], regime: str
-) -> dict[str, list[Supervised]]:
+) -> dict[str, list[SupervisedItem]]:
     """Return each item in answer mode and, if it has a rationale, in reasoning mode.
 
     A CoT student learns both modes, so that it can be prompted in either.
     """
-    by_mode: dict[str, list[Supervised]] = {mode: [] for mode in MODES}
+    by_mode: dict[str, list[SupervisedItem]] = {mode: [] for mode in MODES}
     for item in items:
         if rationale := rationales.get(item.item_id):
             lines: tuple[str, ...] = ()
@@ -83,9 +83,9 @@ def supervised_items(
                 predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
                 lines = write_match_lines(predicates, item)
             by_mode["reasoning"].append(
-                Supervised(item, "reasoning", regime, rationale.text, lines)
+                SupervisedItem(item, "reasoning", regime, rationale.text, lines)
             )
-        by_mode["answer"].append(Supervised(item, "answer", regime))
+        by_mode["answer"].append(SupervisedItem(item, "answer", regime))
     return by_mode
 
 

@@ -39,7 +39,7 @@ def enable_fsdp_on_cpus() -> None:
     AcceleratorState.__init__ = patched
 
 
-def five_samples(*arguments: Any) -> dict[str, list[dataset.Supervised]]:
+def five_samples(*arguments: Any) -> dict[str, list[dataset.SupervisedItem]]:
     """Five training samples of two modes: a step of four, and one that all ranks cannot share."""
     items = build(*arguments)
     if len(arguments[1]) <= VALIDATION_ITEMS:

@@ -85,16 +85,16 @@ def exported(settings: SftCommand, runs: Path, format: str, into: Path) -> tuple
 
 
 @pytest.fixture(scope="module")
-def forms(settings, runs, tmp_path_factory) -> dict[str, tuple[dict, Path]]:
+def exports(settings, runs, tmp_path_factory) -> dict[str, tuple[dict, Path]]:
     """The metrics and the folder of each format."""
     root = tmp_path_factory.mktemp("exports")
     return {f: exported(settings, runs, f, root / f) for f in ("bf16", "fp32", "adapter")}
 
 
 def test_a_merged_weight_is_the_dequantised_one_and_its_adapters_product(
-    settings, runs, forms
+    settings, runs, exports
 ) -> None:
-    merged = load_file(forms["fp32"][1] / "model.safetensors")
+    merged = load_file(exports["fp32"][1] / "model.safetensors")
     adapters = load_file(runs / "sft" / "run" / "student" / "adapter_model.safetensors")
     scale = settings.student.lora.alpha / settings.student.lora.rank
     base = load_file(Path(settings.student.model) / "model.safetensors")
@@ -114,9 +114,9 @@ def test_a_merged_weight_is_the_dequantised_one_and_its_adapters_product(
     assert changed == 2 * 7
 
 
-def test_the_measured_difference_is_recorded_and_small(forms) -> None:
+def test_the_measured_difference_is_recorded_and_small(exports) -> None:
     for format, most in (("fp32", 1e-5), ("bf16", 0.05)):
-        measured, folder = forms[format]
+        measured, folder = exports[format]
         assert json.loads((folder / "export.json").read_text())["measured"] == measured
         for mode in ("reasoning", "answer"):
             assert 0 < measured[f"{mode}_logit_difference"] < most
@@ -124,8 +124,8 @@ def test_the_measured_difference_is_recorded_and_small(forms) -> None:
         weights = load_file(folder / "model.safetensors").values()
         assert {w.dtype for w in weights} == {loading.DTYPES[format]}
         assert "quantization" not in (folder / "config.json").read_text()
-    assert forms["fp32"][0]["answer_letter_agreement"] == 1
-    assert forms["adapter"][0] == {}
+    assert exports["fp32"][0]["answer_letter_agreement"] == 1
+    assert exports["adapter"][0] == {}
 
 
 SCRIPT = """
@@ -154,7 +154,7 @@ torch.save((batch["input_ids"], logits), outputs)
 
 @pytest.mark.slow
 def test_transformers_alone_computes_the_same_logits(
-    settings, runs, forms, micro_store, frames, tmp_path
+    settings, runs, exports, micro_store, frames, tmp_path
 ) -> None:
     """As the trained student, the adapters over their 4-bit base."""
     item = micro_store.selection("test")[0]
@@ -162,7 +162,7 @@ def test_transformers_alone_computes_the_same_logits(
     data = {"content": sample.content, "images": sample.images}
     data |= {"video": sample.clip.pixels, "metadata": sample.clip.metadata}
     torch.save(data, tmp_path / "inputs.pt")
-    arguments = [forms["fp32"][1], tmp_path / "inputs.pt", tmp_path / "outputs.pt"]
+    arguments = [exports["fp32"][1], tmp_path / "inputs.pt", tmp_path / "outputs.pt"]
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     run_child([sys.executable, "-c", SCRIPT, *arguments], check=True, cwd=tmp_path, env=environment)
     ids, logits = torch.load(tmp_path / "outputs.pt")
@@ -174,15 +174,15 @@ def test_transformers_alone_computes_the_same_logits(
     assert ids[0].tolist() == encoded.input_ids
     types = torch.tensor([encoded.mm_token_type_ids])
     with torch.no_grad():
-        wanted = model(input_ids=ids, mm_token_type_ids=types, **encoded.media).logits
-    torch.testing.assert_close(logits, wanted, atol=1e-4, rtol=1e-4)
+        expected = model(input_ids=ids, mm_token_type_ids=types, **encoded.media).logits
+    torch.testing.assert_close(logits, expected, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.slow
-def test_every_format_evaluates_like_the_run(settings, runs, forms, tmp_path) -> None:
+def test_every_format_evaluates_like_the_run(settings, runs, exports, tmp_path) -> None:
     unused = StudentConfig(name="unused", model="unused")
     responses = {}
-    models = {f: forms[f][1] for f in ("fp32", "adapter")} | {"run": runs / "sft" / "run"}
+    models = {f: exports[f][1] for f in ("fp32", "adapter")} | {"run": runs / "sft" / "run"}
     for name, model in models.items():
         cfg = SelectCommand(
             benchmark=settings.benchmark, student=unused, store=settings.store, model=str(model),
@@ -199,9 +199,9 @@ def test_every_format_evaluates_like_the_run(settings, runs, forms, tmp_path) ->
     assert run_title(models["fp32"]) == "run fp32"
 
 
-def test_an_export_is_written_once_for_its_weights(settings, runs, forms, tmp_path) -> None:
+def test_an_export_is_written_once_for_its_weights(settings, runs, exports, tmp_path) -> None:
     shutil.copytree(runs, tmp_path / "runs")
-    measured, folder = forms["fp32"]
+    measured, folder = exports["fp32"]
     before = (folder / "model.safetensors").stat()
     again, _ = exported(settings, tmp_path / "runs", "fp32", folder.parent)
     assert again == measured
@@ -229,21 +229,21 @@ def test_missing_rationales_are_not_narrated(settings, tmp_path, micro_store) ->
         StudentMerge(settings, tmp_path).held_out(tmp_path, 1)
 
 
-def test_leftovers_of_a_killed_export_are_deleted(settings, runs, forms, tmp_path) -> None:
+def test_leftovers_of_a_killed_export_are_deleted(settings, runs, exports, tmp_path) -> None:
     (tmp_path / ".student.partial").mkdir()
     (tmp_path / ".student.partial" / "model.safetensors").write_bytes(b"half")
     _, folder = exported(settings, runs, "adapter", tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["student"]
     names = {p.name for p in folder.iterdir()}
     assert "model.safetensors" not in names
-    assert names == {p.name for p in forms["adapter"][1].iterdir()}
+    assert names == {p.name for p in exports["adapter"][1].iterdir()}
     for name in ("adapter_model.safetensors", "adapter_config.json", "processor_config.json"):
         trained = runs / "sft" / "run" / "student" / name
         assert (folder / name).read_bytes() == trained.read_bytes()
 
 
-def test_the_card_describes_the_run(settings, runs, forms) -> None:
-    card = ModelCard.load(forms["adapter"][1] / "README.md")
+def test_the_card_describes_the_run(settings, runs, exports) -> None:
+    card = ModelCard.load(exports["adapter"][1] / "README.md")
     assert card.data.library_name == "peft"
     assert card.data.tags == ["dynapix", "cot"]
     for row in (
@@ -308,8 +308,8 @@ def test_a_run_that_cannot_be_exported_is_refused(settings, runs, tmp_path, dama
     assert list((tmp_path / "into").iterdir()) == []
 
 
-def test_a_damaged_export_is_refused(settings, forms, tmp_path) -> None:
-    shutil.copytree(forms["bf16"][1], tmp_path / "export")
+def test_a_damaged_export_is_refused(settings, exports, tmp_path) -> None:
+    shutil.copytree(exports["bf16"][1], tmp_path / "export")
     weights = tmp_path / "export" / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:5000])
     trained = trained_settings(tmp_path / "export", SftCommand, "student")

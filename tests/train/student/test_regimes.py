@@ -15,14 +15,14 @@ from teacher.predicates import extract_predicates
 from teacher.sections import SECTIONS, split_sections
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
-from train.student.dataset import Supervised, supervised_items
+from train.student.dataset import SupervisedItem, supervised_items
 from train.student.lazy_samples import StudentDataset
 
 TEACHER = TeacherConfig(name="template")
 COT = [r for r in REGIMES if r not in WITHOUT_RATIONALES]
 
 
-def items_of(store: Store, regime: str) -> dict[str, list[Supervised]]:
+def items_of(store: Store, regime: str) -> dict[str, list[SupervisedItem]]:
     rationales = {r.item_id: r for r in ensure_rationales(store, TEACHER)}
     return supervised_items(store, store.selection("train"), rationales, regime)
 
@@ -88,7 +88,7 @@ def test_permuted_responses_are_correct(micro_store) -> None:
 def test_an_order_depends_on_seed_epoch_and_item(micro_store, frames, student_cfg) -> None:
     supervised = items_of(micro_store, "answer_only")["answer"]
 
-    def orders(s: Supervised, seed: int = 0) -> list[list[int]]:
+    def orders(s: SupervisedItem, seed: int = 0) -> list[list[int]]:
         permuted = [s.permuted(seed, epoch).item.candidates for epoch in range(8)]
         return [[s.item.candidates.index(c) for c in candidates] for candidates in permuted]
 
