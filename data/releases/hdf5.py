@@ -66,6 +66,14 @@ def _get(parent: h5py.Group, keys: tuple[str, ...], attribute: str) -> Any:
 def read_array(
     parent: h5py.Group, key: str, shape: tuple[int, ...], dtype: type = np.float32
 ) -> np.ndarray:
-    """Return a dataset as an array of `shape`, in which -1 is any length."""
+    """Return a dataset as an array of `shape`, in which -1 is any length.
+
+    Raises:
+        RecordError: The dataset is missing, or has as many axes as `shape` and other lengths.
+    """
     dataset = get_dataset(parent, key)
+    lengths = list(zip(dataset.shape, shape, strict=False))
+    # A matrix may be stored flat, and an empty list of contacts has one axis.
+    if dataset.ndim == len(shape) and any(-1 != wanted != found for found, wanted in lengths):
+        raise RecordError(f"{locate(dataset)}: shape {dataset.shape}, expected {shape}")
     return finite_array(dataset[()], shape, locate(dataset), dtype)
