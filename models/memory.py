@@ -11,18 +11,8 @@ import torch
 
 from conf.errors import UserError
 
-CGROUPS = (
-    ("/sys/fs/cgroup", "memory.max", "memory.current", "inactive_file"),
-    (
-        "/sys/fs/cgroup/memory",
-        "memory.limit_in_bytes",
-        "memory.usage_in_bytes",
-        "total_inactive_file",
-    ),
-)
-"""Files with a container's limit and use, and the name of its file cache in memory.stat, in both
-versions of the kernel's interface."""
-
+CGROUP = Path("/sys/fs/cgroup")
+"""Files of the container (version 2 of the kernel's interface)."""
 OUT_OF_MEMORY = ("can't allocate memory", "CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED")
 """Messages of torch for errors that have no class of their own."""
 
@@ -30,13 +20,11 @@ OUT_OF_MEMORY = ("can't allocate memory", "CUDA error: out of memory", "CUBLAS_S
 def available_cpu_bytes() -> int:
     """Return the free bytes of the machine, or of the container that limits this process."""
     free = psutil.virtual_memory().available
-    for folder, limit, used, cache in CGROUPS:
-        # Without a limit, the file is missing or holds a word.
-        with suppress(OSError, ValueError, KeyError):
-            most, taken = (int(Path(folder, name).read_text()) for name in (limit, used))
-            lines = Path(folder, "memory.stat").read_text().splitlines()
-            stat = dict(line.split() for line in lines)
-            free = min(free, most - taken + int(stat[cache]))
+    # Without a limit, the file is missing or holds a word.
+    with suppress(OSError, ValueError):
+        limit, used = (int((CGROUP / f"memory.{name}").read_text()) for name in ("max", "current"))
+        stat = dict(line.split() for line in (CGROUP / "memory.stat").read_text().splitlines())
+        free = min(free, limit - used + int(stat["inactive_file"]))
     return free
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 
+import pandas as pd
 from torch import nn
 
 from conf.errors import UserError
@@ -80,8 +81,6 @@ def check_towers(towers: dict[str, Tower], preset: str, quantization: str, rank:
 
 
 def format_towers(towers: dict[str, Tower]) -> str:
-    columns = [f.name for f in fields(Tower)]
-    lines = [f"{'':<22}" + "".join(f"{c.replace('four_bit', '4-bit'):>14}" for c in columns)]
-    for name, tower in towers.items():
-        lines.append(f"{name:<22}" + "".join(f"{getattr(tower, c):>14,}" for c in columns))
-    return "\n".join(lines)
+    """Return a table with a row for each tower."""
+    table = pd.DataFrame.from_dict({name: asdict(t) for name, t in towers.items()}, orient="index")
+    return table.rename(columns={"four_bit": "4-bit"}).map("{:,}".format).to_string()

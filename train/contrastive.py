@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from conf.entry import command
+from conf.errors import UserError
 from conf.gpus import restrict_to_one_gpu
 from conf.runs import Run, finished_metrics, rank
 from conf.schema import ContrastiveCommand
@@ -27,7 +28,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
 
     from data.build import ensure_benchmark
     from models.compat import keep_freed_memory
-    from models.distributed import check_unsharded, main_first, per_rank_batch
+    from models.distributed import is_sharded, main_first, split_batch
     from models.lora_kernels import fuse
     from models.resolved import data_digest, resolve_run
     from models.retriever.embedder import load_retriever, tokenizer_texts
@@ -38,8 +39,13 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from train.retriever.run import build_trainer
 
     keep_freed_memory()
-    check_unsharded()
-    rank_batch = per_rank_batch(cfg.train.batch)
+    if is_sharded():
+        raise UserError(
+            "FSDP does not shard a retriever: sentence-transformers reads each checkpoint as a "
+            "whole model; start without --use_fsdp (and with --multi_gpu, on CPUs too)",
+            code="unsupported-with-fsdp",
+        )
+    rank_batch = split_batch(cfg.train.batch)
     checkpoint = newest_checkpoint(run.folder)
 
     # The main rank builds what is missing; then every rank reads it from the disk.

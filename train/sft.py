@@ -41,7 +41,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
 
     compat.keep_freed_memory()
     # Before the benchmark is built, which may take long.
-    distributed.accumulation_steps(cfg.train.batch, cfg.train.micro_batch)
+    distributed.split_batch(cfg.train.batch, cfg.train.micro_batch)
     checkpoint = newest_checkpoint(run.folder)
 
     # The main rank builds and narrates what is missing; then every rank reads it from the disk.

@@ -24,6 +24,7 @@ from sentence_transformers.sentence_transformer.modules import Normalize, Poolin
 from tqdm import tqdm
 from transformers import AutoConfig
 
+from conf.errors import UserError
 from conf.runs import world_size
 from conf.schema import LoraConfig, RetrieverConfig
 from data.records import FrameRef, RetrievalQuery, sample_prefix_frames
@@ -42,7 +43,6 @@ from models.loading import (
     no_targets_error,
     pin_sizes,
 )
-from models.nonfinite_guard import check_finite
 from models.retriever.checks import check_family, check_modules, check_pooling, is_retriever
 from models.retriever.multi_vector import keep_head_fp32, load_multi_vector, multi_vector_modules
 from models.student.prompts import load_clip
@@ -328,8 +328,18 @@ def embed(
             batch_size=batch,
             show_progress_bar=False,
         )
-        for item, row in zip(part, embedded, strict=True):
-            row = torch.as_tensor(row).float().cpu()
-            check_finite(row[None], lambda item=item: [item_name(item)])
-            rows.append(row)
+        vectors = [torch.as_tensor(row).float().cpu() for row in embedded]
+        check_finite(vectors, part)
+        rows += vectors
     return rows
+
+
+def check_finite(vectors: Sequence[torch.Tensor], items: Sequence[Item]) -> None:
+    """Raise UserError if the embedding of an item has a NaN or an Inf."""
+    for item, embedded in zip(items, vectors, strict=True):
+        if not embedded.isfinite().all():
+            raise UserError(
+                f"non-finite embedding (NaN or Inf) for {item_name(item)}: lower train.lr or set "
+                "train.precision=fp32; the checkpoints written so far are kept",
+                code="non-finite-embedding",
+            )

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
-import torch
 from sentence_transformers.base.sampler import DefaultBatchSampler
 
 from conf.errors import UserError
@@ -102,11 +100,10 @@ class QueryBatchSampler(DefaultBatchSampler):
         return batch + postponed[:missing], postponed[missing:]
 
 
-def batch_columns(queries: Sequence[RetrievalQuery], negatives: int) -> list[dict[str, Any]]:
-    """The columns of a batch as the losses of `train.retriever.loss` read them: the queries, their
-    targets, then a column for each hard negative. `items` names what to embed; the library reads
-    the number of rows from `attention_mask`."""
+def batch_columns(
+    queries: Sequence[RetrievalQuery], negatives: int
+) -> list[list[RetrievalQuery | FrameRef]]:
+    """Return the columns of a batch as `train.retriever.loss` takes them: the queries, their
+    targets, then a column for each hard negative."""
     documents = [[q.target, *q.hard_negatives[:negatives]] for q in queries]
-    columns = [list(queries), *map(list, zip(*documents, strict=True))]
-    rows = torch.ones(len(queries), 1)
-    return [{"items": column, "attention_mask": rows} for column in columns]
+    return [list(queries), *map(list, zip(*documents, strict=True))]

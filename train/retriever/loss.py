@@ -1,159 +1,171 @@
-"""The retriever's losses: the library's cached ranking losses over batches that hold names.
+"""The retriever's loss: multiple-negatives ranking at several widths, with cached gradients.
 
-The library embeds a batch twice, first to cache the gradients of the embeddings, then to propagate
-them, and cuts mini-batches from inputs that are all in memory. Here the inputs of a mini-batch are
-loaded when a pass reaches it. A frame that is some query's target is never a negative of that
-query.
+As in GradCache (Gao et al., 2021), a batch is embedded twice, a mini-batch at a time: first without
+gradients, for the loss and its gradients with respect to the embeddings, and then to propagate
+these. Inputs are loaded when a pass reaches them. Memory is thus independent of the batch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from itertools import chain
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
 from accelerate.utils import gather_object
 from sentence_transformers.base.losses.gradcache import RandContext
-from sentence_transformers.multi_vector_encoder.losses import (
-    CachedMultiVectorMultipleNegativesRankingLoss,
-)
-from sentence_transformers.multi_vector_encoder.scoring import colbert_scores
-from sentence_transformers.sentence_transformer.losses import CachedMultipleNegativesRankingLoss
-from sentence_transformers.util import cos_sim
+from sentence_transformers.util import all_gather_padded, cat_padded_token_embeddings
+from sentence_transformers.util.similarity import maxsim
+from torch import nn
+from torch.nn.functional import cross_entropy, normalize
 
 from conf.runs import rank, world_size
 from data.records import FrameRef
-from models.nonfinite_guard import check_finite
-from models.retriever.embedder import Retriever, item_name
+from models.retriever.embedder import Item, Retriever, check_finite
 from train.retriever.inputs import RetrieverInputs
 
 In = TypeVar("In")
 Out = TypeVar("Out")
 
 
-class LazyBatchLoss:
-    """Mixin for the library's cached losses: features name `items`, as `batch_columns` makes them.
+class RankingLoss(nn.Module):
+    """The cross entropy of each query's target among the documents of all ranks, summed over
+    widths. A document that is the same frame as a query's target is not a negative of that query.
 
     Args:
         model: The retriever.
         inputs: Loads the inputs of a mini-batch.
+        widths: How many leading entries of the vectors are scored.
+        weights: Of the widths' losses; None weighs each by 1.
         scale: Inverse temperature of the scores.
         mini_batch: Queries or frames in a mini-batch; the gradients are independent of it.
         prefetch: Mini-batches that a thread loads ahead.
     """
-
-    similarity: Callable[..., torch.Tensor]
-    query_major = False
-    """Whether scores order documents by their query; otherwise by column."""
 
     def __init__(
         self,
         model: Retriever,
         inputs: RetrieverInputs,
         *,
+        widths: Sequence[int],
+        weights: Sequence[float] | None = None,
         scale: float,
         mini_batch: int,
         prefetch: int = 0,
     ) -> None:
-        super().__init__(
-            model,
-            scale=scale,
-            similarity_fct=self._scores,
-            mini_batch_size=mini_batch,
-            gather_across_devices=world_size() > 1,
-        )
+        super().__init__()
+        # The trainer replaces it by its wrapper for several ranks.
+        self.model = model
         self._inputs = inputs
-        self._prefetch = prefetch
+        self._widths, self._weights = widths, weights or [1.0] * len(widths)
+        self._scale, self._mini_batch, self._prefetch = scale, mini_batch, prefetch
 
-    def forward(
-        self, sentence_features: Iterable[dict[str, Any]], labels: torch.Tensor | None = None
-    ) -> torch.Tensor:
-        features = list(sentence_features)
-        documents = [column["items"] for column in features[1:]]
-        parts = gather_object([documents]) if world_size() > 1 else [documents]
-        columns = [list(chain(*column)) for column in zip(*parts, strict=True)]
-        rows = len(documents[0])
-        own = range(rank() * rows, (rank() + 1) * rows)
-        self._identical = identical_frames(columns, own, self.query_major)
-        self._next_row = 0
-        return super().forward(features, labels)
+    def forward(self, columns: Sequence[Sequence[Item]], labels: None = None) -> torch.Tensor:
+        """Return the loss of a batch, whose `backward` propagates the cached gradients.
 
-    def embed_minibatch_iter(
-        self,
-        sentence_feature: dict[str, Any],
-        with_grad: bool,
-        copy_random_state: bool,
-        random_states: list[RandContext] | None = None,
-        ranges: Sequence[tuple[int, int]] = (),
-    ) -> Iterator[tuple[Any, ...]]:
-        """Embed the items of each range, as the library does of inputs in memory.
+        Args:
+            columns: The queries, their targets, then a column for each hard negative.
 
         Raises:
-            UserError: An embedding is not finite.
+            UserError: an embedding is not finite.
         """
-        parts = [sentence_feature["items"][first:last] for first, last in ranges]
-        task = {name: sentence_feature[name] for name in ("task",) if name in sentence_feature}
-        for k, loaded in enumerate(prefetched(self._inputs.load, parts, self._prefetch)):
-            inputs = self._inputs.prepare(parts[k], loaded, first_pass=not with_grad)
-            state = None if random_states is None else random_states[k]
-            embedded = self.embed_minibatch(
-                inputs | task, 0, len(parts[k]), with_grad, copy_random_state, state
-            )
-            if not with_grad:
-                check_finite(embedded[0], lambda k=k: [item_name(item) for item in parts[k]])
-            yield embedded
+        size = self._mini_batch
+        parts = [c[start : start + size] for c in columns for start in range(0, len(c), size)]
+        states, vectors, masks = [], [], []
+        for part, inputs in self._load(parts, first_pass=True):
+            states.append(RandContext(*inputs.values()))
+            with torch.no_grad():
+                embedded, mask = self._embed(part, inputs)
+            check_finite(embedded, part)
+            vectors.append(embedded.requires_grad_())
+            masks.append(mask)
+        loss = self._score(columns, vectors, masks)
+        loss.backward()
+        gradients = [part.grad for part in vectors]
+        loss = loss.detach().requires_grad_()
+        loss.register_hook(partial(self._propagate, parts, states, gradients))
+        return loss
 
-    def _scores(self, queries: torch.Tensor, documents: torch.Tensor, **masks: Any) -> torch.Tensor:
-        """Similarities of the next rows of queries with all documents. The library asks for all
-        rows in their order, once for each width."""
-        scores = type(self).similarity(queries, documents, **masks)
-        rows = slice(self._next_row, self._next_row + len(queries))
-        self._next_row = rows.stop % len(self._identical)
-        return scores.masked_fill(self._identical[rows].to(scores.device), -torch.inf)
+    def _load(
+        self, parts: Sequence[Sequence[Item]], first_pass: bool
+    ) -> Iterator[tuple[Sequence[Item], dict[str, Any]]]:
+        loaded = prefetched(self._inputs.load, parts, self._prefetch)
+        for part, inputs in zip(parts, loaded, strict=True):
+            yield part, self._inputs.prepare(part, inputs, first_pass)
+
+    def _embed(
+        self, part: Sequence[Item], inputs: dict[str, Any]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (items, vectors, width), and (items, vectors) whether a vector is scored."""
+        task = "document" if isinstance(part[0], FrameRef) else "query"
+        outputs = self.model(inputs, task=task)
+        if (single := outputs.get("sentence_embedding")) is not None:
+            return single[:, None], single.new_ones(len(single), 1, dtype=torch.bool)
+        return outputs["token_embeddings"], outputs["attention_mask"].bool()
+
+    def _score(
+        self,
+        columns: Sequence[Sequence[Item]],
+        vectors: Sequence[torch.Tensor],
+        masks: Sequence[torch.Tensor],
+    ) -> torch.Tensor:
+        """Return the loss of embeddings by mini-batches."""
+        split = math.ceil(len(columns[0]) / self._mini_batch)
+        queries, query_mask = cat_padded_token_embeddings(vectors[:split], masks[:split])
+        documents, document_mask = cat_padded_token_embeddings(vectors[split:], masks[split:])
+        frames = [frame for column in columns[1:] for frame in column]
+        targets = torch.arange(len(queries), device=queries.device) + rank() * len(frames)
+        if world_size() > 1:
+            documents, document_mask = all_gather_padded(documents, document_mask, with_grad=True)
+            frames = gather_object(frames)
+        identical = identical_frames(frames, targets)
+        loss = torch.zeros((), device=queries.device)
+        for width, weight in zip(self._widths, self._weights, strict=True):
+            ours, theirs = (normalize(v[..., :width], dim=-1) for v in (queries, documents))
+            scores = self._scale * maxsim(ours, theirs, query_mask, document_mask)
+            loss += weight * cross_entropy(scores.masked_fill(identical, -torch.inf), targets)
+        return loss
+
+    def _propagate(
+        self,
+        parts: Sequence[Sequence[Item]],
+        states: Sequence[RandContext],
+        gradients: Sequence[torch.Tensor],
+        factor: torch.Tensor,
+    ) -> None:
+        """Embed again with the same dropout, and propagate `factor` times the gradients."""
+        for k, (part, inputs) in enumerate(self._load(parts, first_pass=False)):
+            # Ranks average their gradients once, after the last mini-batch.
+            waits = k < len(parts) - 1 and world_size() > 1
+            with self.model.no_sync() if waits else nullcontext(), torch.enable_grad(), states[k]:
+                embedded, _ = self._embed(part, inputs)
+                (factor * (embedded.float() * gradients[k].float()).sum()).backward()
 
 
-class RankingLoss(LazyBatchLoss, CachedMultipleNegativesRankingLoss):
-    """For a retriever with one vector."""
-
-    similarity = staticmethod(cos_sim)
-
-
-class MultiVectorRankingLoss(LazyBatchLoss, CachedMultiVectorMultipleNegativesRankingLoss):
-    """For a retriever with many vectors, by late interaction."""
-
-    similarity = staticmethod(colbert_scores)
-    query_major = True
-
-
-def identical_frames(
-    columns: Sequence[Sequence[FrameRef]], own: range, query_major: bool
-) -> torch.Tensor:
-    """(own, documents) where a document is the frame of a query's target but not its target.
+def identical_frames(frames: Sequence[FrameRef], targets: torch.Tensor) -> torch.Tensor:
+    """Return (targets, frames): whether a frame equals the target frame at another position.
 
     Args:
-        columns: The targets of all ranks' queries, then their hard negatives by column.
-        own: Positions of the queries of this rank.
-        query_major: Whether documents are ordered by their query; otherwise by column.
+        targets: Positions of targets among `frames`.
     """
-    codes: dict[FrameRef, int] = {}
-    table = torch.tensor([[codes.setdefault(f, len(codes)) for f in column] for column in columns])
-    identical = table[0, list(own), None, None] == table
-    identical[range(len(own)), 0, list(own)] = False
-    return (identical.transpose(1, 2) if query_major else identical).flatten(1)
+    numbers = {frame: k for k, frame in enumerate(frames)}
+    codes = torch.tensor([numbers[frame] for frame in frames], device=targets.device)
+    identical = codes[targets, None] == codes
+    return identical.scatter(1, targets[:, None], False)
 
 
 def prefetched(load: Callable[[In], Out], items: Sequence[In], ahead: int) -> Iterator[Out]:
-    """`load(item)` of each item in order, up to `ahead` before they are consumed. A single thread
-    loads them: several must not share a tokenizer."""
-    if not ahead:
-        yield from map(load, items)
-        return
+    """Yield `load(item)` of each item in order, up to `ahead` of them loaded in advance by a single
+    thread: several must not share a tokenizer."""
     with ThreadPoolExecutor(1) as pool:
-        waiting = [pool.submit(load, item) for item in items[: ahead + 1]]
-        for k in range(len(items)):
-            loaded = waiting.pop(0).result()
-            if k + ahead + 1 < len(items):
-                waiting.append(pool.submit(load, items[k + ahead + 1]))
-            yield loaded
+        waiting: deque[Future[Out]] = deque()
+        for item in items:
+            waiting.append(pool.submit(load, item))
+            if len(waiting) > ahead:
+                yield waiting.popleft().result()
+        for future in waiting:
+            yield future.result()

@@ -11,8 +11,6 @@ from sentence_transformers import (
     MultiVectorEncoderTrainingArguments,
     SentenceTransformerTrainingArguments,
 )
-from sentence_transformers.sentence_transformer.losses import MatryoshkaLoss
-from torch import nn
 
 from conf.runs import Run, world_size
 from conf.schema import ContrastiveCommand, ContrastiveTrainConfig, RetrieverConfig
@@ -30,7 +28,7 @@ from train.retriever.evaluator import (
     build_database,
 )
 from train.retriever.inputs import RetrieverInputs
-from train.retriever.loss import MultiVectorRankingLoss, RankingLoss
+from train.retriever.loss import RankingLoss
 from train.retriever.mining import HardNegativeMiner
 from train.retriever.trainer import (
     IndexCollator,
@@ -105,16 +103,15 @@ def build_loss(
     retriever: RetrieverConfig,
     model: Retriever,
     frames: FrameReader,
-) -> nn.Module:
-    """The ranking loss, over all widths if the retriever has one vector."""
+) -> RankingLoss:
+    """Return the ranking loss; a retriever with many vectors has a single width."""
     bf16 = train.precision == "bf16"
-    options = {
-        "inputs": RetrieverInputs(model, frames, retriever, bf16, train.reuse_features),
-        "scale": train.scale,
-        "mini_batch": train.mini_batch,
-        "prefetch": train.workers,
-    }
-    if retriever.late is not None:
-        return MultiVectorRankingLoss(model, **options)
-    ranking = RankingLoss(model, **options)
-    return MatryoshkaLoss(model, ranking, list(retriever.widths), train.width_weights)
+    return RankingLoss(
+        model,
+        RetrieverInputs(model, frames, retriever, bf16, train.reuse_features),
+        widths=retriever.widths if retriever.late is None else [retriever.late.width],
+        weights=train.width_weights,
+        scale=train.scale,
+        mini_batch=train.mini_batch,
+        prefetch=train.workers,
+    )

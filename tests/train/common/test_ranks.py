@@ -315,10 +315,10 @@ def render(item, frames, cfg, text, epoch):
 
 
 def test_a_step_is_split_over_micro_batches_and_ranks(monkeypatch) -> None:
-    assert distributed.accumulation_steps(16, 2) == 8
+    assert distributed.split_batch(16, 2) == 8
     monkeypatch.setenv("LOCAL_RANK", "1")
     monkeypatch.setenv("RANK", "1")
     monkeypatch.setenv("WORLD_SIZE", "4")
-    assert distributed.accumulation_steps(16, 2) == 2
+    assert distributed.split_batch(16, 2) == 2
     with raises_user_error("uneven-batch", contains=("train.batch=16", "32")):
-        distributed.accumulation_steps(16, 8)
+        distributed.split_batch(16, 8)

@@ -53,8 +53,7 @@ def test_incompatible_queries_fill_the_last_batches(queries) -> None:
 
 
 def test_columns_are_queries_targets_and_negatives(queries) -> None:
-    items = [column["items"] for column in batch_columns(queries, 2)]
+    items = batch_columns(queries, 2)
     assert items[0] == queries
     assert items[1] == [q.target for q in queries]
     assert items[2:] == [[q.hard_negatives[k] for q in queries] for k in range(2)]
-    assert {len(c["attention_mask"]) for c in batch_columns(queries, 2)} == {len(queries)}

@@ -31,7 +31,7 @@ from models.retriever.embedder import (
 from tests.user_errors import raises_user_error
 from train.retriever.batches import batch_columns
 from train.retriever.inputs import RetrieverInputs
-from train.retriever.loss import MultiVectorRankingLoss, RankingLoss, prefetched
+from train.retriever.loss import RankingLoss, prefetched
 
 NEGATIVES = 2
 WEIGHTS = [1.0, 0.5]
@@ -94,41 +94,41 @@ def scale(cfg: RetrieverConfig) -> float:
     return 20.0 if cfg.late is None else 0.5
 
 
-def over_widths(model, ranking, cfg: RetrieverConfig):
-    return ranking if cfg.late else MatryoshkaLoss(model, ranking, cfg.widths, WEIGHTS)
+def ranking_loss(model, inputs: RetrieverInputs, cfg: RetrieverConfig, **options) -> RankingLoss:
+    widths = (
+        {"widths": [cfg.late.width]} if cfg.late else {"widths": cfg.widths, "weights": WEIGHTS}
+    )
+    return RankingLoss(model, inputs, **widths, **{"scale": scale(cfg), "mini_batch": 3, **options})
 
 
 @pytest.fixture(scope="module")
 def library(trained, distinct, frames) -> Gradients:
     """The library's loss and gradients, on inputs that are all in memory."""
     model, cfg = trained
-    items = [column["items"] for column in batch_columns(distinct, NEGATIVES)]
     features = [
         model.preprocess(
             [item_input(item, frames, cfg) for item in column],
             prompt=instruction_of(column[0], cfg),
         )
-        for column in items
+        for column in batch_columns(distinct, NEGATIVES)
     ]
-    kind = (
-        CachedMultiVectorMultipleNegativesRankingLoss
-        if cfg.late
-        else CachedMultipleNegativesRankingLoss
-    )
-    ranking = kind(model, scale=scale(cfg), mini_batch_size=3)
-    return gradients(model, over_widths(model, ranking, cfg), features)
+    options = {"scale": scale(cfg), "mini_batch_size": 3}
+    if cfg.late:
+        loss = CachedMultiVectorMultipleNegativesRankingLoss(model, **options)
+    else:
+        ranking = CachedMultipleNegativesRankingLoss(model, **options)
+        loss = MatryoshkaLoss(model, ranking, cfg.widths, WEIGHTS)
+    return gradients(model, loss, features)
 
 
 def own(trained, queries, frames, reuse_features=False, **options) -> Gradients:
     """The loss of `train.contrastive`, with its LoRA kernels."""
     model, cfg = trained
     inputs = RetrieverInputs(model, frames, cfg, bf16=False, reuse_features=reuse_features)
-    kind = MultiVectorRankingLoss if cfg.late else RankingLoss
-    ranking = kind(model, inputs, **{"scale": scale(cfg), "mini_batch": 3, **options})
+    loss = ranking_loss(model, inputs, cfg, **options)
     fuse(model)
     try:
-        features = batch_columns(queries, NEGATIVES)
-        return gradients(model, over_widths(model, ranking, cfg), features)
+        return gradients(model, loss, batch_columns(queries, NEGATIVES))
     finally:
         unfuse(model)
 
@@ -196,7 +196,7 @@ def test_bf16_changes_gradients_by_rounding_only(
         bf16 = precision == "bf16"
         model = load(cfg, precision, micro_store, tmp_path)
         inputs = RetrieverInputs(model, frames, cfg, bf16, reuse_features=True)
-        loss = over_widths(model, RankingLoss(model, inputs, scale=20.0, mini_batch=5), cfg)
+        loss = ranking_loss(model, inputs, cfg, mini_batch=5)
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
             losses[precision], computed = gradients(model, loss, batch_columns(queries, NEGATIVES))
         assert {gradient.dtype for gradient in computed.values()} == {torch.float32}
