@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import re
+import string
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ from data.records import LETTERS
 
 class Reason(StrEnum):
     """Why a response has no letter. Beside a letter, `CUT_OFF` and `MALFORMED` mean that the record
-    is invalid JSON although its choice is complete."""
+    is invalid JSON although its choice is complete; without one, that the choice is unreadable."""
 
     NO_ANSWER = "no answer"
     CUT_OFF = "cut off"
@@ -51,11 +52,17 @@ _THOUGHT_END = re.compile(r"[<◁]/think(?:ing)?[>▷]", re.IGNORECASE)
 
 _RECORD_START = re.compile(r"""\{\s*["']""")
 _STRING = r""""(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*'"""
-# The length of an unquoted value is bounded, so that a long response is read in linear time.
+_JUNK = r"""[^a-z0-9"']{0,4}"""
+_CHOICE = rf"(?:{_JUNK.join('forced')}{_JUNK})?{_JUNK.join('choice')}"
+_KEY = rf"""["']{_JUNK}{_CHOICE}{_JUNK}["'][^a-z0-9"':]{{0,4}}:\s*"""
+# A string, a list, or unquoted text, whose length is bounded: a long response is read in linear
+# time. A string that text follows at once, or on a new line, has lost a quote or a comma.
+_VALUE = (
+    rf"""(?:{_STRING})(?=\s*(?:[,}}\]"']|$))|\[[^\[\]{{}}]*\]|(?!,|(?:{_STRING})(?:\w|\s*[\n:]))"""
+    rf"""(?:[^\n{{}}"'\[\]]|{_STRING}){{1,200}}?(?=,\s*["'}}]|[\n}}])"""
+)
 _TOKEN = re.compile(
-    rf"""["'][\W_]{{0,4}}(?:forced[\W_]{{0,4}})?choice[\W_]{{0,4}}["']\s*:\s*(?:(?P<nested>(?={{))"""
-    rf"""|(?P<value>(?:{_STRING})(?=\s*(?:[,}}\]"']|$))|\[[^\[\]{{}}]*\]"""
-    rf"""|(?!\s)(?:[^\n{{}}"'\[]|{_STRING}){{1,200}}?(?=,\s*["'}}]|[\n}}])))"""
+    rf"""(?P<choice>{_KEY}(?:(?P<nested>(?={{))|(?P<value>{_VALUE}))?)"""
     rf"""|(?P<string>{_STRING})|(?P<open>[{{\[])|(?P<close>[}}\]])|(?P<unclosed>["'])""",
     re.IGNORECASE | re.DOTALL,
 )
@@ -78,6 +85,11 @@ _STATEMENT = re.compile(
 _NAMED_LETTER = re.compile(
     r"(?<![\w'])[A-HJ-Za-d](?![\w'])(?!(?<=[Aa])\s+(?!(?:or|and|vs|to)\b)[a-z])"
 )
+_ANY_LETTER = re.compile(r"(?<![^\W_])[a-z](?![^\W_])", re.IGNORECASE)
+_ONLY_LETTERS = re.compile(
+    r"(?:\b(?:[a-z]|or|and|vs|to|either|both|but|maybe|possibly|perhaps|option)\b|[\W_])*",
+    re.IGNORECASE,
+)
 _REFUSAL = re.compile(
     r"^(?:none|null|n/?a|nil|no|neither|unknown|unsure|abstain|refused?|declined?|pass)$"
     r"|(?:can\s?not|can'?t|unable to|impossible to|hard to|not able to|do(?: not|n'?t)|could not)"
@@ -93,7 +105,7 @@ _WITHDRAWAL = re.compile(
     r"\bwait\b|\b(?:that|this|it)(?:['’]s| is) (?:wrong|incorrect|not right)"
     r"|^\W*(?:(?:which|that|this|it)\s+)?(?:(?:is|was|seems|looks|would be)\s+)?"
     r"(?:no|nope|not|wrong|incorrect|false|impossible|rejected|excluded|eliminated|ruled out|"
-    r"not (?:it|right|correct|possible|valid|the answer))\s*(?:$|[.,;:!?])",
+    r"not (?:it|right|correct|possible|valid|the answer))(?:\W*$|\s*[.,;:!?])",
     re.IGNORECASE,
 )
 _SECOND_THOUGHT = re.compile(
@@ -120,9 +132,18 @@ def parse_choice(raw: str, letters: str = LETTERS, cut: bool = False) -> ParsedA
         return ParsedAnswer(None, Reason.CUT_OFF)
     choices, records, flag, prose = _read_records(text)
     if choices:
-        answer = _agreed([_read_statement(choice, letters) for choice in choices])
+        answer = _agreed(
+            [
+                ParsedAnswer(None, Reason.MALFORMED)
+                if choice is None
+                else _read_statement(choice, letters)
+                for choice in choices
+            ]
+        )
         record = records[0] if len(records) == 1 and flag is None else None
-        return ParsedAnswer(answer.letter, answer.reason or flag, record)
+        if answer.reason in (None, Reason.MALFORMED):
+            return ParsedAnswer(answer.letter, flag or answer.reason, record)
+        return answer
     if flag is Reason.CUT_OFF:
         return ParsedAnswer(None, flag)
     # With "xx" at its end an incomplete last word is no letter.
@@ -138,7 +159,7 @@ def strip_thought(text: str) -> str | None:
     return None if _THOUGHT_START.search(response) else response
 
 
-def _read_records(text: str) -> tuple[list[str], list[str], Reason | None, str]:
+def _read_records(text: str) -> tuple[list[str | None], list[str], Reason | None, str]:
     """Return the choices of all records, the records with a choice, what is wrong with the records,
     and the text outside them."""
     choices, records, prose, flag, position = [], [], [], None, 0
@@ -155,19 +176,21 @@ def _read_records(text: str) -> tuple[list[str], list[str], Reason | None, str]:
     return choices, records, flag, "\n".join([*prose, text[position:]])
 
 
-def _read_record(text: str, start: int) -> tuple[list[str], int | None]:
-    """Return the choices of the record that opens at `start`, and its end (None if it is cut off).
+def _read_record(text: str, start: int) -> tuple[list[str | None], int | None]:
+    """Return the choices of the record that opens at `start` (None for one that cannot be read),
+    and its end (None if it is cut off).
 
     The choice stands at the record's outermost level. Deeper ones only contradict it: a new record
     may follow one that was broken off.
     """
-    choices: list[tuple[int, str]] = []
+    choices: list[tuple[int, str | None]] = []
     depth, end = 0, None
     for token in _TOKEN.finditer(text, start):
         if token["unclosed"]:
             break
-        if token["value"] is not None or token["nested"] is not None:
-            choices.append((depth, _unquote(token["value"] or "")))
+        if token["choice"]:
+            unreadable = token["value"] is None and token["nested"] is None
+            choices.append((depth, None if unreadable else _unquote(token["value"] or "")))
         depth += bool(token["open"]) - bool(token["close"])
         if depth == 0:
             end = token.end()
@@ -207,7 +230,9 @@ def _apply_second_thought(answer: ParsedAnswer, line: str, letters: str) -> Pars
     """Drop a letter that the line after it withdraws, alone or for another letter."""
     opening = _SECOND_THOUGHT.match(line)
     rest = line[opening.end() :] if opening else line
-    if (opening and not rest.strip()) or _WITHDRAWAL.fullmatch(rest.strip()):
+    if (opening and not rest.strip()) or _WITHDRAWAL.fullmatch(
+        rest.strip(f"{string.punctuation} ")
+    ):
         return ParsedAnswer(None, Reason.REFUSAL)
     corrected = _read_statement(rest, letters).letter if opening else None
     return answer if corrected in (None, answer.letter) else ParsedAnswer(None, Reason.SEVERAL)
@@ -238,7 +263,8 @@ def _read_statement(value: str, letters: str) -> ParsedAnswer:
 
 
 def _named_letters(value: str, match: re.Match[str] | None) -> set[str]:
-    named = {letter.upper() for letter in _NAMED_LETTER.findall(value)}
+    pattern = _ANY_LETTER if _ONLY_LETTERS.fullmatch(value) else _NAMED_LETTER
+    named = {letter.upper() for letter in pattern.findall(value)}
     return named | {match["letter"].upper()} if match else named
 
 
