@@ -12,7 +12,9 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.nn import Module
+from torch.nn.functional import dropout
 from transformers import AttentionInterface, AttentionMaskInterface, PreTrainedModel
 from transformers.integrations.sdpa_attention import repeat_kv, sdpa_attention_forward
 from transformers.masking_utils import eager_mask
@@ -51,15 +53,8 @@ def flash_attention(precision: str) -> str | None:
 
 
 def attend_by_products(
-    module: Module,
-    query: torch.Tensor,
-    key: torch.Tensor,
-    value: torch.Tensor,
-    attention_mask: torch.Tensor | None,
-    scaling: float,
-    dropout: float = 0.0,
-    **_: Any,
-) -> tuple[torch.Tensor, None]:
+    module: Module, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, **settings: Any
+) -> tuple[Tensor, None]:
     """Attend from (B, H, Q, D) queries to (B, G, K, D) keys and values; return (B, Q, H, D).
 
     Unlike transformers' eager attention, only the softmax of the scores is kept, in the precision
@@ -67,49 +62,37 @@ def attend_by_products(
     """
     groups = query.shape[1] // key.shape[1]
     key, value = repeat_kv(key, groups), repeat_kv(value, groups)
-    scores = torch.matmul(query * scaling, key.transpose(2, 3))
-    if attention_mask is not None:
-        scores.add_(attention_mask)
-    weights = torch.nn.functional.dropout(scores.softmax(dim=-1), dropout)
+    scores = torch.matmul(query * settings["scaling"], key.transpose(2, 3))
+    if mask is not None:
+        scores.add_(mask)
+    weights = dropout(scores.softmax(dim=-1), settings.get("dropout", 0.0))
     return torch.matmul(weights, value).transpose(1, 2).contiguous(), None
 
 
-def products_mask(*args: Any, dtype: torch.dtype, **settings: Any) -> torch.Tensor | None:
+def products_mask(*args: Any, dtype: torch.dtype, **settings: Any) -> Tensor | None:
     """Return the mask to add to the scores, in bf16 even if the embeddings are fp32: the smallest
     fp32 number is infinite in bf16, and the softmax of rows of padding would be NaN."""
     return eager_mask(*args, dtype=torch.bfloat16, **settings)
 
 
 def attend_by_frame(
-    module: Module,
-    query: torch.Tensor,
-    key: torch.Tensor,
-    value: torch.Tensor,
-    attention_mask: torch.Tensor | None,
-    scaling: float,
-    cu_seq_lens_q: torch.Tensor,
-    max_length_q: int,
-    dropout: float = 0.0,
-    **_: Any,
-) -> tuple[torch.Tensor, None]:
+    module: Module, query: Tensor, key: Tensor, value: Tensor, mask: None, **settings: Any
+) -> tuple[Tensor, None]:
     """Attend among the (1, H, N, D) patches of several frames, each within its frame; return
-    (1, N, H, D).
-
-    Args:
-        cu_seq_lens_q: Bounds of the frames among the N patches.
-        max_length_q: Patches of the largest frame.
-    """
+    (1, N, H, D). Of the settings, `cu_seq_lens_q` has the bounds of the frames among the patches,
+    and `max_length_q` the patches of the largest one."""
+    bounds, largest = settings["cu_seq_lens_q"], settings["max_length_q"]
     reduced = torch.is_autocast_enabled(query.device.type) or query.dtype != torch.float32
     attend = attend_by_products if reduced and not query.is_cuda else sdpa_attention_forward
-    settings = {"scaling": scaling, "dropout": dropout, "is_causal": False}
+    settings = {name: settings.get(name, 0.0) for name in ("scaling", "dropout")}
+    settings["is_causal"] = False
     parts = (query, key, value)
-    frames = len(cu_seq_lens_q) - 1
-    if frames * max_length_q == query.shape[2]:
-        folded = (p[0].unflatten(1, (frames, max_length_q)).transpose(0, 1) for p in parts)
+    frames = len(bounds) - 1
+    if frames * largest == query.shape[2]:
+        folded = (p[0].unflatten(1, (frames, largest)).transpose(0, 1) for p in parts)
         attended, _weights = attend(module, *folded, None, **settings)
         return attended.flatten(0, 1)[None], None
-    lengths = (cu_seq_lens_q[1:] - cu_seq_lens_q[:-1]).tolist()
-    split = zip(*(p.split(lengths, dim=2) for p in parts), strict=True)
+    split = zip(*(p.split(bounds.diff().tolist(), dim=2) for p in parts), strict=True)
     return torch.cat([attend(module, *one, None, **settings)[0] for one in split], dim=1), None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +16,22 @@ if TYPE_CHECKING:
 
 PEFT = "base_model.model."
 """Prefix that peft adds to the names of the modules that it adapts."""
+PROCESSOR_FIELDS = {
+    "image_processor.patch_size": "vision_config.patch_size",
+    "image_processor.merge_size": "vision_config.spatial_merge_size",
+    "video_processor.patch_size": "vision_config.patch_size",
+    "video_processor.merge_size": "vision_config.spatial_merge_size",
+    "image_token_id": "image_token_id",
+    "video_token_id": "video_token_id",
+}
+"""Fields of a processor, and what they equal in the configuration of its model."""
 
 
-def check_tower(group: str, model: str, config: PreTrainedConfig) -> None:
-    """Raise UserError if a base has no vision tower."""
+def check_tower(model: str, config: PreTrainedConfig) -> None:
+    """Raise UserError if a student's base has no vision tower."""
     if getattr(config, "vision_config", None) is None:
         raise UserError(
-            f"{group}.model={model} ({config.model_type}) has no vision tower: give a "
+            f"student.model={model} ({config.model_type}) has no vision tower: give a "
             "vision-language model, such as Qwen3-VL",
             code="unsupported-model",
         )
@@ -45,22 +55,16 @@ def check_processor(
 
 def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:
     """Return how a processor differs from what a model needs, or None."""
-    for name in ("tokenizer", "image_processor", "video_processor"):
-        if not hasattr(processor, name):
-            return f"it has no {name.replace('_', ' ')}"
-    tokens, known = len(processor.tokenizer), config.get_text_config().vocab_size
-    if tokens > known:
-        return f"its tokenizer has {tokens} tokens, the model {known}"
-    for part in (processor.image_processor, processor.video_processor):
-        for name, own in (("patch_size", "patch_size"), ("merge_size", "spatial_merge_size")):
-            actual, expected = getattr(part, name, None), getattr(config.vision_config, own, None)
+    try:
+        tokens, known = len(processor.tokenizer), config.get_text_config().vocab_size
+        if tokens > known:
+            return f"its tokenizer has {tokens} tokens, the model {known}"
+        for field, own in PROCESSOR_FIELDS.items():
+            actual, expected = attrgetter(field)(processor), attrgetter(own)(config)
             if actual != expected:
-                what = name.replace("_", " ")
-                return f"its {what} is {actual}, that of the vision tower {expected}"
-    for name in ("image_token_id", "video_token_id"):
-        actual, expected = getattr(processor, name, None), getattr(config, name, None)
-        if actual != expected:
-            return f"its {name} is {actual}, the model's {expected}"
+                return f"its {field} is {actual}, the model's {expected}"
+    except AttributeError as error:
+        return f"it has no {error.name}"
     return None
 
 

@@ -5,17 +5,16 @@ accelerate 1.12 to 1.15, sentence-transformers 6.0 to 6.2 and bitsandbytes 0.49 
 its docstring says otherwise. `pyproject.toml` excludes later versions; before it is raised,
 tests/models/test_compat.py, which has one test per hook, must pass with them.
 
-Hooks that are used through subclasses, outside of this file:
+Hooks that are used through subclasses or inputs, outside of this file:
 
-- `models.lora_kernels` swaps the class of peft's `Linear` and `Linear4bit` layers and registers a
-  `LoraVariant` in their `lora_variant`.
+- `models.lora_kernels` swaps the class of peft's `Linear` and `Linear4bit` layers, registers a
+  `LoraVariant` in their `lora_variant`, and overrides `_cast_input_dtype`.
 - `models.attention` registers a function whose name contains "flash": Qwen3-VL's vision tower
-  passes all frames at once, with `cu_seq_lens_q`, only to those.
-- `train.student.vision_cache` passes `mm_encoder_outputs` to Qwen3-VL's `forward`.
-- `train.retriever.inputs` does so in a forward pre-hook of the retriever's backbone.
-- `train.retriever.loss` overrides `embed_minibatch_iter` of sentence-transformers' cached losses,
-  and `train.retriever.trainer` overrides `_load_from_checkpoint` and `_load_best_model`.
-- `models.retriever.multi_vector` loads by `MultiVectorEncoder._load_with_module_classes`.
+  passes all frames at once, with `cu_seq_lens_q` and `max_length_q`, only to those.
+- `train.retriever.trainer` overrides `_load_from_checkpoint`, `_load_best_model`,
+  `get_batch_sampler` and `collect_features`.
+- `train.retriever.inputs` adds a model's input in a forward pre-hook, which
+  sentence-transformers' `Transformer` passes on to the backbone.
 - `train.student.trainer` overrides `_get_train_sampler` of transformers' Trainer.
 """
 
@@ -23,12 +22,18 @@ from __future__ import annotations
 
 import ctypes
 import sys
+from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import nn
-from transformers import Trainer, TrainingArguments
+from transformers import PreTrainedModel, Trainer, TrainingArguments
+
+if TYPE_CHECKING:
+    from sentence_transformers import MultiVectorEncoder
+    from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
 
 
 def checkpointing_arguments(enabled: bool) -> dict[str, Any]:
@@ -41,6 +46,40 @@ def checkpointing_arguments(enabled: bool) -> dict[str, Any]:
     renamed = "activation_checkpointing" in {field.name for field in fields(TrainingArguments)}
     name = "activation_checkpointing" if renamed else "gradient_checkpointing"
     return {name: True, f"{name}_kwargs": {"use_reentrant": False}}
+
+
+def encode_images(
+    model: PreTrainedModel, pixels: torch.Tensor, grid: torch.Tensor, bf16: bool
+) -> list[torch.Tensor]:
+    """Return (layers, tokens, hidden) for each image: the merged output of Qwen3-VL's vision tower,
+    then those of the deepstack. The tower encodes a clip as the images of its pairs of frames.
+
+    Args:
+        bf16: Whether the tower computes in bf16.
+    """
+    with torch.no_grad(), torch.autocast(pixels.device.type, torch.bfloat16, enabled=bf16):
+        outputs = model.get_image_features(pixels, grid)
+    layers = zip(outputs.pooler_output, *outputs.deepstack_features, strict=True)
+    return [torch.stack(image) for image in layers]
+
+
+def encoder_outputs(layers: Iterable[torch.Tensor]) -> BaseModelOutputWithDeepstackFeatures:
+    """Return the vision tower's outputs for a kind of media as Qwen3-VL's `forward` takes them in
+    `mm_encoder_outputs`."""
+    from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
+
+    merged, *deepstack = layers
+    return BaseModelOutputWithDeepstackFeatures(
+        pooler_output=(merged,), deepstack_features=[(layer,) for layer in deepstack]
+    )
+
+
+def load_multi_vector(folder: str, classes: dict[str, type], **options: Any) -> MultiVectorEncoder:
+    """Load a saved multi-vector retriever by the private `_load_with_module_classes`: modules that
+    its folder names are those of `classes`, and code in the folder is not executed."""
+    from sentence_transformers import MultiVectorEncoder
+
+    return MultiVectorEncoder._load_with_module_classes(folder, classes, **options)
 
 
 def load_checkpoint(trainer: Trainer, checkpoint: Path) -> None:

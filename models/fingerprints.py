@@ -99,24 +99,30 @@ def pin_revisions(cfg: Preset) -> Preset:
     for model, revision in (("model", "revision"), ("image_model", "image_revision")):
         if is_hub_model(name := getattr(cfg, model, None)):
             requested = getattr(cfg, revision)
-            commits[revision] = _commit(name, requested) or requested
+            try:
+                commits[revision] = find_commit(name, requested)
+            except Exception:
+                # The hub's client raises the errors of whichever HTTP library is installed.
+                commits[revision] = requested
     return replace(cfg, **commits)
 
 
-def _commit(model: str, revision: str | None) -> str | None:
+def find_commit(model: str, revision: str | None = None) -> str:
+    """Return the commit of a hub model, in the local cache or else on the hub, with one request
+    (the libraries would retry for minutes).
+
+    Raises:
+        Exception: the model is in neither, or the hub cannot be reached.
+    """
     from huggingface_hub import model_info, try_to_load_from_cache
 
-    try:
-        # A repository of adapters has no config.json.
-        for file in ("config.json", "adapter_config.json"):
-            cached = try_to_load_from_cache(model, file, revision=revision)
-            if isinstance(cached, str):
-                # The cache stores files in a folder named after the commit.
-                return Path(cached).parent.name
-        return model_info(model, revision=revision, timeout=10).sha
-    except Exception:
-        # The hub's client raises the errors of whichever HTTP library is installed.
-        return None
+    # A repository of adapters has no config.json.
+    for file in ("config.json", "adapter_config.json"):
+        cached = try_to_load_from_cache(model, file, revision=revision)
+        if isinstance(cached, str):
+            # The cache stores files in a folder named after the commit.
+            return Path(cached).parent.name
+    return model_info(model, revision=revision, timeout=10).sha
 
 
 def is_hub_model(model: str | None) -> bool:
@@ -135,5 +141,4 @@ def image_model_id(cfg: RetrieverConfig) -> str | None:
 
 
 def _id(model: str | None, revision: str | None) -> str | None:
-    commit = f"@{revision}" if is_hub_model(model) and revision else ""
-    return model and f"{model}{commit}"
+    return f"{model}@{revision}" if is_hub_model(model) and revision else model

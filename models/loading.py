@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -22,10 +24,11 @@ from transformers import (
 from transformers.utils import logging as transformers_logging
 
 from conf.errors import UserError
-from conf.schema import LoraConfig, StudentConfig
+from conf.schema import LoraConfig, RetrieverConfig, StudentConfig
 from models.attention import choose_attention
 from models.checks import check_adapters, check_processor, check_tower
 from models.compat import keep_differentiable
+from models.fingerprints import find_commit
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
 
@@ -61,30 +64,33 @@ def load_base(
         model = build_model(cfg.architecture, len(processor.tokenizer))
         choose_attention(model, precision, cfg.max_length)
         return model, processor
-    check_reachable("student", cfg.model)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
-    # Weights that are trained are fp32; autocast computes in lower precision.
-    whole = cfg.quantization == "none" and cfg.lora.rank == 0
-    dtype = torch.float32 if whole else DTYPES[precision]
-    quantization = nf4_config(dtype) if cfg.quantization == "nf4" else None
-    try:
+    with explain_unloadable("student", cfg.model):
         config = AutoConfig.from_pretrained(cfg.model, **origin)
-        check_tower("student", cfg.model, config)
+        check_tower(cfg.model, config)
         processor = AutoProcessor.from_pretrained(cfg.model, **origin)
         check_processor("student", cfg.model, config, processor)
         model = AutoModelForImageTextToText.from_pretrained(
-            cfg.model,
-            dtype=dtype,
-            quantization_config=quantization,
-            use_safetensors=True,
-            **origin,
+            cfg.model, **weight_options(cfg, precision), **origin
         )
-    except UNREADABLE as error:
-        raise load_error("student", cfg.model, error) from error
     choose_attention(model, precision, cfg.max_length)
     pin_sizes(processor, cfg.image_size, cfg.frames)
     processor.tokenizer.padding_side = "left"
     return model, processor
+
+
+def weight_options(cfg: StudentConfig | RetrieverConfig, precision: str) -> dict[str, Any]:
+    """Return the arguments of `from_pretrained` for the weights of a preset.
+
+    Weights are fp32 if all of them are trained: autocast computes in lower precision. Otherwise
+    they have the given precision, or 4 bits if the preset quantises the base.
+    """
+    trains_all = cfg.quantization == "none" and cfg.lora.rank == 0
+    dtype = torch.float32 if trains_all else DTYPES[precision]
+    options: dict[str, Any] = {"dtype": dtype, "use_safetensors": True}
+    if cfg.quantization == "nf4":
+        options["quantization_config"] = nf4_config(dtype)
+    return options
 
 
 def nf4_config(compute: torch.dtype) -> BitsAndBytesConfig:
@@ -106,13 +112,10 @@ def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
     """
     step = processor.image_processor.patch_size * processor.image_processor.merge_size
     edge = round(image_size / step) * step
-    smallest = step * step
-    processor.image_processor.size = {"shortest_edge": smallest, "longest_edge": edge * edge}
     # Twice the pixels of the frames: the budget then shrinks no video with an odd number of them.
-    processor.video_processor.size = {
-        "shortest_edge": smallest,
-        "longest_edge": 2 * frames * edge * edge,
-    }
+    budgets = ((processor.image_processor, 1), (processor.video_processor, 2 * frames))
+    for part, images in budgets:
+        part.size = {"shortest_edge": step * step, "longest_edge": images * edge * edge}
     processor.video_processor.do_sample_frames = False
     processor.video_processor.cap_pixels_per_frame = False
 
@@ -139,17 +142,34 @@ def add_adapters(model: PreTrainedModel, lora: LoraConfig) -> nn.Module:
     import peft
 
     model.requires_grad_(False)
-    config = peft.LoraConfig(
-        r=lora.rank,
-        lora_alpha=lora.alpha,
-        lora_dropout=lora.dropout,
-        target_modules=lora.targets,
-        task_type="CAUSAL_LM",
-    )
-    try:
+    with lora_config("student", lora, task_type="CAUSAL_LM") as config:
         return peft.get_peft_model(model, config)
+
+
+@contextmanager
+def lora_config(group: str, lora: LoraConfig, task_type: str | None = None) -> Iterator[Any]:
+    """Yield peft's settings of adapters.
+
+    Raises:
+        UserError: in the block, peft finds the pattern invalid, or no module that it can adapt.
+    """
+    import peft
+
+    try:
+        yield peft.LoraConfig(
+            r=lora.rank,
+            lora_alpha=lora.alpha,
+            lora_dropout=lora.dropout,
+            target_modules=lora.targets,
+            task_type=task_type,
+        )
     except (ValueError, re.error) as error:
-        raise no_targets_error("student", lora) from error
+        raise UserError(
+            f"{group}.lora.targets={lora.targets} adapts nothing in this model: give a pattern "
+            "that matches whole names of linear layers, such as "
+            "model.language_model.layers.0.self_attn.q_proj",
+            code="no-lora-targets",
+        ) from error
 
 
 def load_trained(
@@ -168,11 +188,9 @@ def load_trained(
         if not (weights := folder / "adapter_model.safetensors").exists():
             raise UserError(f"{folder} holds no student: {weights} is missing", code="missing-run")
         base, processor = load_base(cfg, precision, list)
-        try:
+        with explain_damage(folder):
             check_adapters(folder, base, cfg.lora.rank, cfg.model)
             return for_inference(peft.PeftModel.from_pretrained(base, folder)), processor
-        except UNREADABLE as error:
-            raise damaged_error(folder, error) from error
     if (folder / EXPORT).exists():
         return load_merged(folder)
     whole = replace(
@@ -189,13 +207,11 @@ def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
     Raises:
         UserError: the folder is damaged.
     """
-    try:
+    with explain_damage(folder):
         processor = AutoProcessor.from_pretrained(folder)
         model = AutoModelForImageTextToText.from_pretrained(
             folder, dtype="auto", use_safetensors=True
         )
-    except UNREADABLE as error:
-        raise damaged_error(folder, error, "delete it and export again") from error
     processor.tokenizer.padding_side = "left"
     return for_inference(model), processor
 
@@ -265,63 +281,59 @@ def write_model(
     processor.save_pretrained(folder)
 
 
-def check_reachable(group: str, model: str, key: str = "model") -> None:
-    """Check once that a model is available; the libraries would retry for minutes.
+@contextmanager
+def explain_unloadable(group: str, model: str, key: str = "model") -> Iterator[None]:
+    """Load the model that GROUP.KEY names in the block.
 
     Raises:
-        UserError: it is no local folder, not in the hub's cache, and cannot be downloaded.
+        UserError: the model is no local folder, is not in the hub's cache and cannot be downloaded;
+            or its files cannot be read.
     """
-    from huggingface_hub import model_info, try_to_load_from_cache
-
-    if Path(model).is_dir():
-        return
     try:
-        # A repository of adapters has no config.json.
-        files = ("config.json", "adapter_config.json")
-        if not any(isinstance(try_to_load_from_cache(model, file), str) for file in files):
-            model_info(model, timeout=10)
+        if not Path(model).is_dir():
+            find_commit(model)
     except Exception as error:
         # The hub's client raises the errors of whichever HTTP library is installed.
-        raise load_error(group, model, error, key) from error
+        raise _unloadable_error(f"{group}.{key}", model, error) from error
+    try:
+        yield
+    except UNREADABLE as error:
+        raise _unloadable_error(f"{group}.{key}", model, error) from error
 
 
-def load_error(group: str, model: str, error: Exception, key: str = "model") -> UserError:
-    """Return the error for a model that did not load."""
-    cause = _first_line(error)
+def _unloadable_error(key: str, model: str, error: Exception) -> UserError:
     if Path(model).is_dir():
         return UserError(
-            f"{group}.{key}={model} cannot be loaded from that folder: {cause}",
+            f"{key}={model} cannot be loaded from that folder: {_first_line(error)}",
             code="unloadable-model",
         )
     if Path(model).is_absolute() or model.startswith("."):
-        return UserError(f"{group}.{key}={model}: this folder does not exist", code="missing-model")
+        return UserError(f"{key}={model}: this folder does not exist", code="missing-model")
     return UserError(
-        f"{group}.{key}={model} is neither a local folder nor in the hub's cache, and cannot be "
-        f"downloaded ({cause}). Give a local copy with {group}.{key}=FOLDER (config.json, "
-        "*.safetensors, tokenizer and processor files), or download it on a machine with network "
-        f"access: hf download {model}",
+        f"{key}={model} is neither a local folder nor in the hub's cache, and cannot be downloaded "
+        f"({_first_line(error)}). Give a local copy with {key}=FOLDER (config.json, *.safetensors, "
+        "tokenizer and processor files), or download it on a machine with network access: hf "
+        f"download {model}",
         code="missing-model",
     )
 
 
-def damaged_error(
-    folder: Path, error: Exception, advice: str = "delete the run's folder and train again"
-) -> UserError:
-    """Return the error for a trained model that cannot be read."""
-    return UserError(
-        f"{folder} is damaged and cannot be read ({_first_line(error)}): {advice}",
-        code="damaged-file",
-    )
+@contextmanager
+def explain_damage(folder: Path) -> Iterator[None]:
+    """Load a trained or exported model in the block.
 
-
-def no_targets_error(group: str, lora: LoraConfig) -> UserError:
-    """Return the error for a pattern that matches no module that can be adapted."""
-    return UserError(
-        f"{group}.lora.targets={lora.targets} adapts nothing in this model: give a pattern that "
-        "matches whole names of linear layers, such as "
-        "model.language_model.layers.0.self_attn.q_proj",
-        code="no-lora-targets",
-    )
+    Raises:
+        UserError: the model cannot be read.
+    """
+    try:
+        yield
+    except UNREADABLE as error:
+        exported = (folder / EXPORT).exists()
+        raise UserError(
+            f"{folder} is damaged and cannot be read ({_first_line(error)}): "
+            f"{'delete it and export' if exported else 'delete the run and train'} again",
+            code="damaged-file",
+        ) from error
 
 
 def unwritable_error(folder: Path, why: str) -> UserError:

@@ -22,26 +22,21 @@ def fuse(model: nn.Module) -> None:
     """Switch a Qwen3-VL, with or without adapters, to these operations in place. Parameters, their
     names and saved files do not change."""
     for module in list(model.modules()):
-        # The name of the patch embedding in every Qwen-VL since the second.
-        embeds = getattr(module, "patch_embed", None)
-        if isinstance(getattr(embeds, "proj", None), nn.Conv3d):
-            embeds.proj.__class__ = PatchProduct
-        if type(module) in ROWS:
-            module.__class__ = ROWS[type(module)]
-            for name in set(module.lora_A) - set(module.lora_variant):
-                module.lora_variant[name] = AddedInPlace()
+        if fused := FUSED.get(type(module)):
+            module.__class__ = fused
+            if isinstance(module, LoraLayer):
+                for name in set(module.lora_A) - set(module.lora_variant):
+                    module.lora_variant[name] = AddedInPlace()
 
 
 def unfuse(model: nn.Module) -> None:
     """Undo `fuse` in place."""
     for module in list(model.modules()):
-        if isinstance(module, PatchProduct):
-            module.__class__ = nn.Conv3d
-        if type(module) in ROWS.values():
-            for name, variant in list(module.lora_variant.items()):
+        if type(module) in FUSED.values():
+            module.__class__ = type(module).__base__
+            for name, variant in list(getattr(module, "lora_variant", {}).items()):
                 if isinstance(variant, AddedInPlace):
                     del module.lora_variant[name]
-            module.__class__ = type(module).__base__
 
 
 class PatchProduct(nn.Conv3d):
@@ -49,8 +44,8 @@ class PatchProduct(nn.Conv3d):
     (N, channels, 1, 1, 1)."""
 
     def forward(self, patches: torch.Tensor) -> torch.Tensor:
-        # Another model may pass whole clips.
-        if patches.shape[2:] != self.kernel_size:
+        # A convolution of another model may take whole clips.
+        if patches.shape[2:] != self.kernel_size or any(self.padding) or self.groups > 1:
             return super().forward(patches)
         embedded = linear(patches.flatten(1), self.weight.flatten(1), self.bias)
         return embedded[..., None, None, None]
@@ -92,4 +87,4 @@ class RowsLinear4bit(Linear4bit):
         return x if enabled else super()._cast_input_dtype(x, dtype)
 
 
-ROWS = {Linear: RowsLinear, Linear4bit: RowsLinear4bit}
+FUSED = {nn.Conv3d: PatchProduct, Linear: RowsLinear, Linear4bit: RowsLinear4bit}

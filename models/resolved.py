@@ -46,23 +46,20 @@ def resolve_run(folder: Path, precision: str, preset: Preset, data: str) -> tupl
     """
     preset = pin_revisions(pin_base(folder, preset))
     check_base(folder, preset)
-    resolved = read_resolved(folder)
-    if resolved and resolved["data"] != data:
-        raise UserError(
-            f"{folder} was started on other data: the benchmark, its rationales or the prompts "
-            "have changed since. Restore them, or train in another folder (run=NAME)",
-            code="other-data",
-        )
-    if not resolved:
-        resolved = {
-            "precision": resolve_precision(precision),
-            "base": base_identity(preset),
-            "data": data,
-        }
-        # A hub's base without a commit cannot be loaded, which loading it reports.
-        if not is_hub_model(preset.model) or preset.revision:
-            write_text(folder / RESOLVED, yaml.safe_dump(resolved, sort_keys=False))
-    return resolved["precision"], preset
+    if resolved := read_resolved(folder):
+        if resolved["data"] != data:
+            raise UserError(
+                f"{folder} was started on other data: the benchmark, its rationales or the prompts "
+                "have changed since. Restore them, or train in another folder (run=NAME)",
+                code="other-data",
+            )
+        return resolved["precision"], preset
+    precision = resolve_precision(precision)
+    # A hub's base without a commit cannot be loaded, which loading it reports.
+    if not is_hub_model(preset.model) or preset.revision:
+        resolved = {"precision": precision, "base": base_identity(preset), "data": data}
+        write_text(folder / RESOLVED, yaml.safe_dump(resolved, sort_keys=False))
+    return precision, preset
 
 
 def read_resolved(folder: Path) -> dict[str, str]:

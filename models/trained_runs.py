@@ -84,7 +84,8 @@ def trained_settings(
             raise UserError(
                 f"{key}={folder} is not a run that trained a {product}", code="missing-run"
             )
-        if not (folder / EXPORT).exists() and not _finished(folder, product):
+        finished = (folder / "metrics.json").exists() and (folder / product).is_dir()
+        if not finished and not (folder / EXPORT).exists():
             raise UserError(
                 f"{key}={folder} is not finished: run its command again to resume it",
                 code="unfinished-run",
@@ -138,21 +139,20 @@ def resolve_model(
 def _apply_overrides(
     settings: Any, cfg: Any, product: str, overrides: Sequence[str], key: str
 ) -> None:
-    above = key.removesuffix("model")
+    prefix = key.removesuffix("model")
+    options = [f"{prefix}{group}.{k}" for group in (product, "train") for k in MEASURED_BY[group]]
     for override in overrides:
         typed = override.lstrip("+~").partition("=")[0]
-        group, _, setting = typed.removeprefix(above).partition(".")
-        preset = typed == above.removesuffix(".")
-        if not preset and (not typed.startswith(above) or group not in (product, "train")):
-            continue
-        if preset or setting not in MEASURED_BY[group]:
-            free = [f"{above}{g}.{name}" for g in (product, "train") for name in MEASURED_BY[g]]
+        group, _, setting = typed.removeprefix(prefix).partition(".")
+        preset = typed == prefix.removesuffix(".")
+        if typed in options:
+            setattr(getattr(settings, group), setting, getattr(getattr(cfg, group), setting))
+        elif preset or (typed.startswith(prefix) and group in (product, "train")):
             raise UserError(
                 f"{typed} does nothing beside {key}={cfg.model}, which is evaluated as it was "
-                f"trained: leave it out; the options are {', '.join(free)}",
+                f"trained: leave it out; the options are {', '.join(options)}",
                 code="unused-setting",
             )
-        setattr(getattr(settings, group), setting, getattr(getattr(cfg, group), setting))
 
 
 def check_unseen(model: str, trained: BenchmarkConfig, tested: BenchmarkConfig) -> None:
@@ -167,12 +167,7 @@ def check_unseen(model: str, trained: BenchmarkConfig, tested: BenchmarkConfig) 
     Raises:
         UserError: training scenes may be among the tested ones.
     """
-    scenes = (
-        "simulator",
-        "standin",
-        "folder",
-        *(("seed",) if trained.simulator == "bullet" else ()),
-    )
+    scenes = ["simulator", "standin", "folder"] + ["seed"] * (trained.simulator == "bullet")
     if any(getattr(trained, key) != getattr(tested, key) for key in scenes):
         return
     if trained.seed != tested.seed or tested.test_share > trained.test_share:
@@ -195,19 +190,14 @@ def check_modes(folder: Path, regime: str, modes: Sequence[str]) -> None:
     trained = modes_of(regime)
     if set(modes) <= set(trained):
         return
-    if not trained:
-        raise UserError(
-            f"model={folder} was trained to describe, not to choose: evaluate it as a base with "
-            f"student.model={product_folder(folder, 'student')}",
-            code="untrained-mode",
+    if trained:
+        problem = (
+            f"in {' and '.join(trained)} mode only (train.regime={regime}), not in "
+            f"{' and '.join(modes)} mode: set modes=[{','.join(trained)}]"
         )
-    raise UserError(
-        f"model={folder} was trained in {' and '.join(trained)} mode only "
-        f"(train.regime={regime}), not in {' and '.join(modes)} mode: set "
-        f"modes=[{','.join(trained)}]",
-        code="untrained-mode",
-    )
-
-
-def _finished(folder: Path, product: str) -> bool:
-    return (folder / "metrics.json").exists() and (folder / product).is_dir()
+    else:
+        problem = (
+            "to describe, not to choose: evaluate it as a base with "
+            f"student.model={product_folder(folder, 'student')}"
+        )
+    raise UserError(f"model={folder} was trained {problem}", code="untrained-mode")

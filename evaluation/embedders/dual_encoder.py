@@ -7,9 +7,9 @@ prefix's and its question's unit embeddings.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from conf.schema import RetrieverConfig
 from data.records import FrameRef, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from evaluation.embedders.base import Query
-from models.loading import DTYPES, UNREADABLE, check_reachable, load_error
+from models.loading import DTYPES, explain_unloadable
 
 EmbedClips = Callable[[list[np.ndarray]], np.ndarray]
 
@@ -154,14 +154,8 @@ def load_dual(preset: RetrieverConfig, precision: str) -> DualEncoder:
     return DualEncoder(preset, model, model, processor.tokenizer, processor.image_processor)
 
 
-@contextmanager
-def reading_model(source: str, key: str = "model") -> Iterator[None]:
-    """Raise a UserError that names the setting `key` if its model's files cannot be read."""
-    check_reachable("retriever", source, key)
-    try:
-        yield
-    except UNREADABLE as error:
-        raise load_error("retriever", source, error, key) from error
+reading_model = partial(explain_unloadable, "retriever")
+"""Raises a UserError that names the setting `key` if its model's files cannot be read."""
 
 
 def load_complete(

@@ -13,7 +13,7 @@ from evaluation.generators.response_schema import instruction as record_instruct
 from evaluation.generators.response_schema import schema
 from models.precision import resolve_precision
 from models.student.generation import response_token_limit
-from models.student.prompts import Sample, instructed_sample, instruction
+from models.student.prompts import Sample, instruction, selection_sample
 
 INPUTS = 1
 """Version of the prompt layout. Increment it when the layout changes, so that earlier responses are
@@ -80,9 +80,8 @@ def item_sample(
     item: SelectionItem,
 ) -> Sample:
     """Return the prompt of a selection item in a mode, for a training regime."""
-    return instructed_sample(
-        item, mode, item_instruction(mode, regime), frames, cfg.frames, control=control
-    )
+    text = item_instruction(mode, regime)
+    return selection_sample(item, mode, regime, frames, cfg.frames, control=control, text=text)
 
 
 def response_settings(

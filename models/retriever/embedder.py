@@ -11,7 +11,6 @@ last token, or one vector per token (`models.retriever.multi_vector`). Saved ret
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -21,29 +20,27 @@ import torch
 from safetensors.torch import load_file
 from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
+from sentence_transformers.util import is_sentence_transformer_model
 from tqdm import tqdm
 from transformers import AutoConfig
 
 from conf.errors import UserError
 from conf.runs import world_size
-from conf.schema import LoraConfig, RetrieverConfig
+from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from models.attention import choose_attention
-from models.checks import PEFT, check_processor, check_tower
+from models.checks import PEFT, check_processor
 from models.compat import keep_differentiable
 from models.distributed import from_main
 from models.loading import (
-    DTYPES,
-    UNREADABLE,
-    check_reachable,
-    damaged_error,
-    load_error,
-    nf4_config,
-    no_targets_error,
+    explain_damage,
+    explain_unloadable,
+    lora_config,
     pin_sizes,
+    weight_options,
 )
-from models.retriever.checks import check_family, check_modules, check_pooling, is_retriever
+from models.retriever.checks import check_family, check_modules, check_pooling
 from models.retriever.multi_vector import keep_head_fp32, load_multi_vector, multi_vector_modules
 from models.student.prompts import load_clip
 from models.tiny_qwen3_vl import build_model, build_processor
@@ -85,15 +82,13 @@ def load_retriever(
     source = cfg.model
     if cfg.architecture is not None:
         source = from_main(partial(build_base, cfg, texts, folder))
-    check_reachable("retriever", source)
-    if is_retriever(source, cfg.revision):
-        check_modules(source, cfg.revision)
-        if cfg.late is None:
-            check_pooling(source, cfg.revision)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
-    try:
+    with explain_unloadable("retriever", source):
+        if is_sentence_transformer_model(source, revision=cfg.revision):
+            check_modules(source, cfg.revision)
+            if cfg.late is None:
+                check_pooling(source, cfg.revision)
         config = AutoConfig.from_pretrained(source, **origin)
-        check_tower("retriever", source, config)
         check_family(source, config)
         backbone = Transformer(
             source,
@@ -102,8 +97,6 @@ def load_retriever(
             config_kwargs=origin,
             processing_kwargs=PROCESSING,
         )
-    except UNREADABLE as error:
-        raise load_error("retriever", cfg.model, error) from error
     check_processor("retriever", source, config, backbone.processor)
     pin_sizes(backbone.processor, cfg.image_size, cfg.frames)
     options = {
@@ -123,34 +116,22 @@ def load_retriever(
 
 
 def prepare_for_training(model: Retriever, cfg: RetrieverConfig, precision: str) -> None:
-    """Set a loaded retriever's attention, and add adapters if the preset has any."""
-    choose_attention(model[0].model, precision, cfg.max_length)
-    keep_differentiable(model[0])
-    if cfg.lora.rank:
-        add_adapters(model, cfg.lora)
-
-
-def add_adapters(model: Retriever, lora: LoraConfig) -> None:
-    """Freeze the backbone and add LoRA adapters to its language tower's projections.
-
-    Adapters are fp32 even if the base is bf16: their updates are so small that bf16 would round
-    them to zero.
+    """Set a loaded retriever's attention and, if the preset has adapters, freeze its backbone and
+    add them to the projections of the language tower.
 
     Raises:
         UserError: `lora.targets` is an invalid pattern, or matches no module that LoRA supports.
     """
-    import peft
-
+    choose_attention(model[0].model, precision, cfg.max_length)
+    keep_differentiable(model[0])
+    if not cfg.lora.rank:
+        return
     model[0].requires_grad_(False)
-    config = peft.LoraConfig(
-        r=lora.rank, lora_alpha=lora.alpha, lora_dropout=lora.dropout, target_modules=lora.targets
-    )
-    try:
+    with lora_config("retriever", cfg.lora) as config:
         model.add_adapter(config)
-    except (ValueError, re.error) as error:
-        raise no_targets_error("retriever", lora) from error
     for weight in model[0].parameters():
         if weight.requires_grad:
+            # Updates of this size would vanish in bf16's rounding.
             weight.data = weight.data.float()
 
 
@@ -201,52 +182,28 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
     """
     if (folder / EXPORT).exists() and not (folder / "adapter_config.json").exists():
         return load_merged(folder, cfg)
-    options = {
-        "model_kwargs": weight_options(cfg, precision),
-        "trust_remote_code": cfg.trust_remote_code,
-        "local_files_only": True,
-    }
-    try:
-        if cfg.late is not None:
-            model = load_multi_vector(folder, **options)
-            keep_head_fp32(model)
-        else:
-            model = SentenceTransformer(str(folder), **options)
-    except UNREADABLE as error:
-        raise damaged_error(folder, error) from error
+    weights = weight_options(cfg, precision)
+    model = _load_saved(folder, cfg, model_kwargs=weights, trust_remote_code=cfg.trust_remote_code)
+    if cfg.late is not None:
+        keep_head_fp32(model)
     choose_attention(model[0].model, precision, cfg.max_length)
     return model
 
 
 def load_merged(folder: Path, cfg: RetrieverConfig) -> Retriever:
-    """Load a merged retriever that `train.export` saved, with sentence-transformers alone.
-
-    Its weights keep the precision in which they were saved.
+    """Load a merged retriever that `train.export` saved, with sentence-transformers alone, in the
+    precision of its weights.
 
     Raises:
         UserError: The retriever cannot be read.
     """
-    options = {"model_kwargs": {"dtype": "auto", "use_safetensors": True}, "local_files_only": True}
-    try:
-        if cfg.late is not None:
-            return load_multi_vector(folder, **options)
-        return SentenceTransformer(str(folder), **options)
-    except UNREADABLE as error:
-        raise damaged_error(folder, error, "delete it and export again") from error
+    return _load_saved(folder, cfg, model_kwargs={"dtype": "auto", "use_safetensors": True})
 
 
-def weight_options(cfg: RetrieverConfig, precision: str) -> dict[str, Any]:
-    """Return the arguments of `from_pretrained` for the weights.
-
-    Weights are fp32 if all of them are trained. Otherwise they have the given precision, or 4 bits
-    if the preset quantizes the base. Only safetensors files are read.
-    """
-    trains_all = cfg.quantization == "none" and cfg.lora.rank == 0
-    dtype = torch.float32 if trains_all else DTYPES[precision]
-    options: dict[str, Any] = {"dtype": dtype, "use_safetensors": True}
-    if cfg.quantization == "nf4":
-        options["quantization_config"] = nf4_config(dtype)
-    return options
+def _load_saved(folder: Path, cfg: RetrieverConfig, **options: Any) -> Retriever:
+    load = SentenceTransformer if cfg.late is None else load_multi_vector
+    with explain_damage(folder):
+        return load(str(folder), local_files_only=True, **options)
 
 
 def tokenizer_texts(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list[str]:
@@ -276,23 +233,13 @@ def frame_input(frame: FrameRef, frames: FrameReader) -> Any:
     return frames.image(frame.scene_id, frame.frame)
 
 
-def item_input(item: Item, frames: FrameReader, cfg: RetrieverConfig) -> Any:
-    """A query or a frame as sentence-transformers takes it."""
-    if isinstance(item, FrameRef):
-        return frame_input(item, frames)
-    return query_input(item, frames, cfg)
-
-
-def instruction_of(item: Item, cfg: RetrieverConfig) -> str:
-    """The system message of a query or of a frame."""
-    return cfg.frame_instruction if isinstance(item, FrameRef) else cfg.query_instruction
-
-
-def item_name(item: Item) -> str:
-    """The name of a query or of a frame in messages."""
-    if isinstance(item, FrameRef):
-        return f"frame {item.frame} of {item.scene_id}"
-    return f"query {item.query_id}"
+def model_inputs(
+    items: Sequence[Item], frames: FrameReader, cfg: RetrieverConfig
+) -> tuple[list[Any], str]:
+    """Return queries, or frames, as sentence-transformers takes them, and their instruction."""
+    if isinstance(items[0], FrameRef):
+        return [frame_input(frame, frames) for frame in items], cfg.frame_instruction
+    return [query_input(query, frames, cfg) for query in items], cfg.query_instruction
 
 
 def embed(
@@ -322,12 +269,8 @@ def embed(
     starts = range(0, len(items), step)
     for start in tqdm(starts, desc=progress, unit="batch", leave=False, disable=progress is None):
         part = items[start : start + step]
-        embedded = encode(
-            [item_input(item, frames, cfg) for item in part],
-            prompt=instruction_of(items[0], cfg),
-            batch_size=batch,
-            show_progress_bar=False,
-        )
+        inputs, instruction = model_inputs(part, frames, cfg)
+        embedded = encode(inputs, prompt=instruction, batch_size=batch, show_progress_bar=False)
         vectors = [torch.as_tensor(row).float().cpu() for row in embedded]
         check_finite(vectors, part)
         rows += vectors
@@ -338,8 +281,9 @@ def check_finite(vectors: Sequence[torch.Tensor], items: Sequence[Item]) -> None
     """Raise UserError if the embedding of an item has a NaN or an Inf."""
     for item, embedded in zip(items, vectors, strict=True):
         if not embedded.isfinite().all():
+            kind = "frame" if isinstance(item, FrameRef) else "query"
             raise UserError(
-                f"non-finite embedding (NaN or Inf) for {item_name(item)}: lower train.lr or set "
+                f"non-finite embedding (NaN or Inf) for {kind} {item.name}: lower train.lr or set "
                 "train.precision=fp32; the checkpoints written so far are kept",
                 code="non-finite-embedding",
             )

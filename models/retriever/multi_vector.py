@@ -7,7 +7,7 @@ frame's vectors (late interaction, ColBERT's MaxSim).
 
 from __future__ import annotations
 
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,13 +17,17 @@ from sentence_transformers.multi_vector_encoder.modules import HierarchicalToken
 from torch import nn
 
 from conf.schema import LateConfig
+from models import compat
 from models.retriever.scored_tokens import ScoredTokens
 
 MESSAGE_END = "<|im_end|>"
 
 # A saved model names its module by this path, and the library finds the file in the folder.
 ScoredTokens.__module__ = "scored_tokens"
-SAVED_AS = {"scored_tokens.ScoredTokens": ScoredTokens}
+load_multi_vector = partial(
+    compat.load_multi_vector, classes={"scored_tokens.ScoredTokens": ScoredTokens}
+)
+"""Loads a saved retriever; its `ScoredTokens` is this project's class."""
 
 
 def multi_vector_modules(backbone: Transformer, late: LateConfig) -> list[Module]:
@@ -48,12 +52,6 @@ def multi_vector_modules(backbone: Transformer, late: LateConfig) -> list[Module
     if late.pool > 1:
         modules.append(HierarchicalTokenPooling(late.pool, num_protected_tokens=0))
     return modules
-
-
-def load_multi_vector(folder: Path, **options: Any) -> MultiVectorEncoder:
-    """Load a saved multi-vector retriever. Its `ScoredTokens` is this project's class: code in
-    `folder` is not executed."""
-    return MultiVectorEncoder._load_with_module_classes(str(folder), SAVED_AS, **options)
 
 
 def keep_head_fp32(model: MultiVectorEncoder) -> None:

@@ -164,6 +164,7 @@ def selection_sample(
     frame_count: int,
     response: str | None = None,
     control: str | None = None,
+    text: str | None = None,
 ) -> Sample:
     """Return the conversation about a selection item.
 
@@ -172,27 +173,15 @@ def selection_sample(
         frame_count: Frames of the prefix that are visible.
         response: The assistant's text, or None if it is to be generated.
         control: How the prefix is altered (see `data.tracks.controls`).
+        text: The instruction, if it is not that of the mode.
     """
-    text = instruction(mode, regime)
-    return instructed_sample(item, mode, text, frames, frame_count, response, control)
-
-
-def instructed_sample(
-    item: SelectionItem,
-    mode: str,
-    instruction: str,
-    frames: FrameReader,
-    frame_count: int,
-    response: str | None = None,
-    control: str | None = None,
-) -> Sample:
-    """Return the conversation about a selection item with another instruction."""
     visible = prefix_under_control(item, frame_count, control)
     parts: list[str | np.ndarray] = [item.question]
     for letter, c in zip(LETTERS, item.candidates, strict=True):
         parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
+    parts.append(f"\n{text or instruction(mode, regime)}")
     clip = load_clip(item.scene_id, visible, frames) if visible else None
-    return conversation(f"{item.item_id} ({mode})", [*parts, f"\n{instruction}"], response, clip)
+    return conversation(f"{item.item_id} ({mode})", parts, response, clip)
 
 
 def text_sample(

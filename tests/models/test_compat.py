@@ -12,10 +12,9 @@ import torch
 from peft.tuners.lora import LoraLayer
 from peft.tuners.lora.bnb import Linear4bit
 from peft.tuners.lora.layer import Linear, LoraVariant
-from sentence_transformers import MultiVectorEncoder
+from sentence_transformers import MultiVectorEncoder, SentenceTransformerTrainer
 from torch import nn
 from transformers import AttentionInterface, AttentionMaskInterface, Trainer, TrainingArguments
-from transformers.models.qwen3_vl import modeling_qwen3_vl
 
 from models import attention, compat
 from models.lora_kernels import fuse
@@ -103,24 +102,31 @@ def test_peft_layers_use_a_lora_variant(model) -> None:
     )
 
 
-@pytest.mark.parametrize("name", ["mm_encoder_outputs", "logits_to_keep"])
-def test_qwen3_vl_takes_the_inputs_of_training(model, name) -> None:
-    parameters = inspect.signature(type(model).forward).parameters
-    inner = inspect.signature(type(model.model).forward).parameters
-    assert name in {*parameters, *inner}, f"{CHANGED} Qwen3-VL's forward takes no {name}"
+def test_qwen3_vl_takes_the_vision_towers_outputs_instead_of_pixels(model) -> None:
+    token, grid = model.config.image_token_id, torch.tensor([[1, 4, 4]])
+    ids = torch.tensor([[5, *[token] * 4, 6]])
+    inputs = {"input_ids": ids, "image_grid_thw": grid, "mm_token_type_ids": (ids == token).long()}
+    pixels = torch.randn(16, 3 * 2 * 16 * 16)
+    with torch.no_grad():
+        (image,) = compat.encode_images(model, pixels, grid, bf16=False)
+        outputs = {"image": compat.encoder_outputs(image)}
+        cached = model(**inputs, mm_encoder_outputs=outputs).logits
+        direct = model(**inputs, pixel_values=pixels).logits
+    assert torch.equal(cached, direct), f"{CHANGED} mm_encoder_outputs does not replace the pixels"
 
 
-def test_qwen3_vl_gives_image_features() -> None:
-    fields = modeling_qwen3_vl.BaseModelOutputWithDeepstackFeatures.__dataclass_fields__
-    assert {"pooler_output", "deepstack_features"} <= set(fields), (
-        f"{CHANGED} the outputs of Qwen3-VL's vision tower have other names"
-    )
-
-
-def test_a_multi_vector_encoder_loads_with_named_module_classes() -> None:
-    assert hasattr(MultiVectorEncoder, "_load_with_module_classes"), (
-        f"{CHANGED} MultiVectorEncoder._load_with_module_classes is gone"
-    )
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        (MultiVectorEncoder, ["_load_with_module_classes"]),
+        (SentenceTransformerTrainer,
+         ["_load_from_checkpoint", "_load_best_model", "get_batch_sampler", "collect_features"]),
+        (Linear4bit, ["_cast_input_dtype"]),
+    ],
+)  # fmt: skip
+def test_overridden_methods_exist(kind, names) -> None:
+    for name in names:
+        assert hasattr(kind, name), f"{CHANGED} {kind.__name__}.{name} is gone"
 
 
 def test_freed_memory_is_kept() -> None:

@@ -106,39 +106,43 @@ def test_a_saved_retriever_encodes_the_same_without_this_project(
         )
 
 
+@pytest.mark.parametrize("late", [None, LateConfig(width=24)], ids=["one", "many"])
 def test_adapters_are_loaded_over_the_4_bit_weights_they_were_trained_on(
-    micro_store, frames, retriever_cfg, saved_base, tmp_path
+    micro_store, frames, retriever_cfg, saved_base, tmp_path, late
 ) -> None:
-    cfg = replace(
-        retriever_cfg, architecture=None, model=saved_base, quantization="nf4", lora=LoraConfig()
-    )
+    over = {"architecture": None, "model": saved_base, "quantization": "nf4", "late": late}
+    cfg = replace(retriever_cfg, **over, lora=LoraConfig())
     model = load(micro_store, cfg, tmp_path)
     with torch.no_grad():
         for name, weight in model.named_parameters():
             if "lora_B" in name:
                 weight.normal_(std=0.1, generator=torch.Generator().manual_seed(0))
+    towers = count_towers(model)
+    assert towers["language"].four_bit > 0
+    assert ("projection" in towers) == (late is not None)
     model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
     again = embedder.load_trained(cfg, "fp32", tmp_path / "saved")
     assert count_towers(again)["language"].four_bit > 0
     keep_differentiable(again)
     query = [query_input(micro_store.retrieval("train")[0], frames, cfg)]
-    one, two = (m.encode(query, prompt_name="query") for m in (model, again))
-    np.testing.assert_allclose(one, two, atol=1e-5)
+    one, two = (torch.as_tensor(m.encode_query(query)[0]) for m in (model, again))
+    torch.testing.assert_close(one, two, atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize("late", [None, LateConfig(width=24)], ids=["one", "many"])
 @pytest.mark.parametrize("quantization", ["none", "nf4"])
-def test_adapters_are_trained_in_fp32_over_a_bf16_base(
-    micro_store, frames, retriever_cfg, saved_base, tmp_path, quantization
+def test_adapters_and_projection_are_trained_in_fp32_over_a_bf16_base(
+    micro_store, frames, retriever_cfg, saved_base, tmp_path, quantization, late
 ) -> None:
-    cfg = replace(
-        retriever_cfg, architecture=None, model=saved_base, quantization=quantization,
-        lora=LoraConfig(),
-    )  # fmt: skip
+    over = {"architecture": None, "model": saved_base, "quantization": quantization, "late": late}
+    cfg = replace(retriever_cfg, **over, lora=LoraConfig())
     model = embedder.load_retriever(cfg, "bf16", [], tmp_path)
-    assert {p.dtype for p in model.parameters() if p.requires_grad} == {torch.float32}
+    trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
+    assert {p.dtype for p in trained.values()} == {torch.float32}
+    assert ("1.linear.weight" in trained) == (late is not None)
     assert next(model[0].parameters()).dtype == torch.bfloat16
     query = [query_input(micro_store.retrieval("train")[0], frames, cfg)]
-    assert np.isfinite(model.encode(query, prompt_name="query")).all()
+    assert torch.as_tensor(model.encode_query(query)[0]).isfinite().all()
 
 
 def test_frames_of_the_database_look_different(micro_store) -> None:
@@ -184,5 +188,5 @@ def test_the_evaluator_ranks_as_the_library_with_all_pixels_in_memory(
         return [embedded[0] * float("nan"), *embedded[1:]]
 
     monkeypatch.setattr(model, "encode_document", torn)
-    with raises_user_error("non-finite-embedding", f"frame {first.frame} of {first.scene_id}"):
+    with raises_user_error("non-finite-embedding", f"frame {first.name}"):
         evaluator(model)

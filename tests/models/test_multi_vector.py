@@ -3,7 +3,6 @@ MultiVectorEncoder."""
 
 from __future__ import annotations
 
-import re
 import sys
 from dataclasses import replace
 
@@ -13,8 +12,7 @@ from sentence_transformers import MultiVectorEncoder
 from transformers import dynamic_module_utils
 
 from conf.compose import compose, register
-from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
-from models.compat import keep_differentiable
+from conf.schema import ContrastiveCommand, LateConfig
 from models.retriever.embedder import (
     frame_input,
     load_retriever,
@@ -156,35 +154,6 @@ def test_code_in_a_saved_folder_is_not_executed(micro_store, late_cfg, tmp_path)
     model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
     (tmp_path / "saved" / "scored_tokens.py").write_text("raise RuntimeError('this ran')")
     assert find_scored_tokens(load_trained(late_cfg, "fp32", tmp_path / "saved")).media_ids
-
-
-def test_adapters_and_projection_are_loaded_over_4_bit_weights(
-    micro_store, late_cfg, queries, frames, saved_base, tmp_path
-) -> None:
-    over = {"architecture": None, "model": saved_base, "quantization": "nf4"}
-    cfg = replace(late_cfg, **over, lora=LoraConfig())
-    model = load(cfg, micro_store, tmp_path, noise=0.1)
-    audit = audit_retriever(model, cfg, queries[0], frames)
-    assert re.search(r"projection +1,536 +0 +0 +1,536", audit)
-    model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
-    again = load_trained(cfg, "fp32", tmp_path / "saved")
-    keep_differentiable(again)
-    inputs = [query_input(queries[0], frames, cfg), frame_input(queries[0].target, frames)]
-    for one, two in zip(vectors_by(model, inputs), vectors_by(again, inputs), strict=True):
-        torch.testing.assert_close(one, two, atol=1e-5, rtol=0)
-
-
-def test_the_projection_is_trained_in_fp32_over_a_bf16_base(
-    micro_store, late_cfg, queries, frames, saved_base, tmp_path
-) -> None:
-    cfg = replace(late_cfg, architecture=None, model=saved_base, lora=LoraConfig())
-    model = load_retriever(cfg, "bf16", [], tmp_path)
-    trained = {n: p for n, p in model.named_parameters() if p.requires_grad}
-    assert "1.linear.weight" in trained
-    assert {p.dtype for p in trained.values()} == {torch.float32}
-    assert next(model[0].parameters()).dtype == torch.bfloat16
-    (vectors,) = model.encode_document([frame_input(queries[0].target, frames)])
-    torch.testing.assert_close(vectors.norm(dim=1), torch.ones(FRAME_TOKENS))
 
 
 @pytest.mark.parametrize("pool", [1, 2, 4])

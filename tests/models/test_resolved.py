@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
+import torch
 from safetensors.torch import load_file, save_file
 
 from conf.schema import RetrieverConfig, StudentConfig
@@ -52,6 +53,16 @@ def test_a_resumed_run_keeps_its_precision(base, tmp_path, monkeypatch) -> None:
     assert resolved_precision(tmp_path, "auto") == "bf16"
     assert resolve_precision("auto") == "fp32"
     assert resolved_precision(tmp_path / "nowhere", "auto") == "auto"
+
+
+@pytest.mark.parametrize(
+    ("instructions", "expected"),
+    [({"avx512_bf16": True, "avx2": True}, "bf16"), ({"amx_bf16": False, "avx2": True}, "fp32")],
+)
+def test_auto_is_what_the_cpu_has_instructions_for(monkeypatch, instructions, expected) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: instructions)
+    assert resolve_precision("auto") == expected
 
 
 def test_other_data_are_refused(base, tmp_path) -> None:

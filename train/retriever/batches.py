@@ -86,7 +86,7 @@ class QueryBatchSampler(DefaultBatchSampler):
         ranked: set[FrameRef] = set()
         for position, k in enumerate(waiting):
             query = self._queries[k]
-            documents = {query.target, *query.hard_negatives[: self._negatives]}
+            documents = set(documents_of(query, self._negatives))
             if query.target in ranked or documents & targets:
                 postponed.append(k)
                 continue
@@ -105,5 +105,10 @@ def batch_columns(
 ) -> list[list[RetrievalQuery | FrameRef]]:
     """Return the columns of a batch as `train.retriever.loss` takes them: the queries, their
     targets, then a column for each hard negative."""
-    documents = [[q.target, *q.hard_negatives[:negatives]] for q in queries]
+    documents = (documents_of(query, negatives) for query in queries)
     return [list(queries), *map(list, zip(*documents, strict=True))]
+
+
+def documents_of(query: RetrievalQuery, negatives: int) -> list[FrameRef]:
+    """Return a query's target and its first hard negatives."""
+    return [query.target, *query.hard_negatives[:negatives]]

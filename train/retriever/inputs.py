@@ -7,11 +7,11 @@ from typing import Any
 
 import torch
 from accelerate.utils import send_to_device
-from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
 
 from conf.schema import RetrieverConfig
 from data.render.frame_cache import FrameReader
-from models.retriever.embedder import Item, Retriever, instruction_of, item_input
+from models.compat import encode_images, encoder_outputs
+from models.retriever.embedder import Item, Retriever, model_inputs
 from models.student.collator import MEDIA
 
 FEATURES = "vision_features"
@@ -48,8 +48,8 @@ class RetrieverInputs:
         kept = self._kept.pop(tuple(items), None)
         if kept is not None:
             return kept
-        inputs = [item_input(item, self._frames, self._cfg) for item in items]
-        return self._model.preprocess(inputs, prompt=instruction_of(items[0], self._cfg))
+        inputs, instruction = model_inputs(items, self._frames, self._cfg)
+        return self._model.preprocess(inputs, prompt=instruction)
 
     def prepare(
         self, items: Sequence[Item], inputs: dict[str, Any], first_pass: bool
@@ -64,16 +64,12 @@ class RetrieverInputs:
 
     def _encode_media(self, inputs: dict[str, Any]) -> dict[str, Any]:
         encoded = dict(inputs)
-        autocast = torch.autocast(self._model.device.type, torch.bfloat16, enabled=self._bf16)
         for kind, (pixels, grid) in MEDIA.items():
             if pixels in encoded:
-                with torch.no_grad(), autocast:
-                    # The tower encodes a clip as the images of its pairs of frames.
-                    outputs = self._model[0].model.get_image_features(
-                        encoded.pop(pixels), encoded[grid]
-                    )
-                layers = (outputs.pooler_output, *outputs.deepstack_features)
-                encoded[f"{FEATURES}_{kind}"] = tuple(torch.cat(layer) for layer in layers)
+                images = encode_images(
+                    self._model[0].model, encoded.pop(pixels), encoded[grid], self._bf16
+                )
+                encoded[f"{FEATURES}_{kind}"] = torch.cat(images, dim=1)
         return encoded
 
 
@@ -81,12 +77,6 @@ def pass_features(module: Any, args: tuple[dict[str, Any]]) -> None:
     """Before the backbone's forward: pass kept outputs of the vision tower under the argument that
     the model has for them."""
     (inputs,) = args
-    outputs = {}
-    for kind in MEDIA:
-        if (layers := inputs.pop(f"{FEATURES}_{kind}", None)) is not None:
-            merged, *deepstack = layers
-            outputs[kind] = BaseModelOutputWithDeepstackFeatures(
-                pooler_output=(merged,), deepstack_features=[(layer,) for layer in deepstack]
-            )
-    if outputs:
+    kept = {kind: inputs.pop(f"{FEATURES}_{kind}", None) for kind in MEDIA}
+    if outputs := {k: encoder_outputs(layers) for k, layers in kept.items() if layers is not None}:
         inputs["mm_encoder_outputs"] = outputs

@@ -68,10 +68,7 @@ def build_trainer(
         return embed(model, items, frames, retriever, train.mini_batch, label)
 
     negatives = train.hard_negatives
-    miner = HardNegativeMiner(
-        training, negatives, train.mine_every, train.mine_margin,
-        model, embed_rows, store, run.folder,
-    )  # fmt: skip
+    miner = HardNegativeMiner(training, train, model, embed_rows, store, run.folder)
     sampler = QueryBatchSampler(training, negatives, train.batch, cfg.seed, world_size())
     # The dataset holds numbers; the loss loads pixels, and prefetches them itself.
     common = common_arguments(train, run, cfg.seed, checkpoint) | {"dataloader_num_workers": 0}

@@ -11,7 +11,7 @@ from transformers import ProcessorMixin, TrainingArguments
 
 from conf.runs import Run, local_world_size, world_size
 from conf.schema import SftCommand
-from models.distributed import accumulation_steps
+from models.distributed import split_batch
 from models.memory import available_cpu_bytes
 from models.student.collator import Collator, letter_ids
 from train.common.arguments import common_arguments
@@ -35,11 +35,11 @@ def training_arguments(cfg: SftCommand, run: Run, checkpoint: Path | None) -> Tr
         checkpoint: The checkpoint that the run resumes from, or None.
     """
     train = cfg.train
-    accumulation = accumulation_steps(train.batch, train.micro_batch)
+    accumulation = split_batch(train.batch, train.micro_batch)
     return TrainingArguments(
         **common_arguments(train, run, cfg.seed, checkpoint),
         per_device_train_batch_size=train.micro_batch,
-        gradient_accumulation_steps=accumulation,
+        gradient_split_batch=accumulation,
         per_device_eval_batch_size=train.micro_batch,
         dataloader_prefetch_factor=prefetch_factor(train.workers, accumulation),
         label_names=["labels"],

@@ -15,9 +15,9 @@ import numpy as np
 import peft
 import torch
 from torch import nn
-from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
 
 from conf.errors import UserError
+from models.compat import encode_images, encoder_outputs
 from models.distributed import is_sharded
 from models.student.collator import MEDIA
 from models.student.prompts import Sample
@@ -95,10 +95,7 @@ class VisionCache:
                 for key in digests[start : start + count]
             ]
             start += count
-            merged, *deepstack = torch.cat(features, dim=1).unbind()
-            outputs[kind] = BaseModelOutputWithDeepstackFeatures(
-                pooler_output=(merged,), deepstack_features=[(layer,) for layer in deepstack]
-            )
+            outputs[kind] = encoder_outputs(torch.cat(features, dim=1))
         inputs["mm_encoder_outputs"] = outputs
         for key, features in new.items():
             if self.bytes + features.nbytes <= self._limit:
@@ -114,8 +111,5 @@ class VisionCache:
         height, width = next(inputs[g] for _, g in MEDIA.values() if g in inputs)[0, 1:].tolist()
         patches = torch.cat(list(slices.values()))
         grid = torch.tensor([[1, height, width]] * len(slices), device=patches.device)
-        bf16 = self._precision == "bf16"
-        with torch.no_grad(), torch.autocast(patches.device.type, torch.bfloat16, enabled=bf16):
-            encoded = self._base.get_image_features(patches, grid)
-        layers = [encoded.pooler_output, *encoded.deepstack_features]
-        return {key: torch.stack([layer[k] for layer in layers]) for k, key in enumerate(slices)}
+        encoded = encode_images(self._base, patches, grid, self._precision == "bf16")
+        return dict(zip(slices, encoded, strict=True))

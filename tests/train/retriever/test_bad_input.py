@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from conf.errors import UserError
 from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
 from data import store
 from data.store import add_checksum, load_rows, save_rows
-from models.retriever.checks import check_pooling
 from tests.user_errors import raises_user_error
 from train import contrastive
 
@@ -144,26 +142,6 @@ def test_a_base_whose_last_modules_would_be_lost(
     late = over(contrastive_settings, saved)
     late.retriever.late = LateConfig(width=8)
     assert_refused(late, tmp_path / "late", "Dense")
-
-
-@pytest.mark.parametrize(
-    ("on", "outcome"),
-    [
-        (["lasttoken"], nullcontext()),
-        (["mean_tokens"], pytest.raises(UserError, match="mean_tokens")),
-        (["cls_token", "lasttoken"], pytest.raises(UserError, match="cls_token")),
-    ],
-)
-def test_pooling_as_earlier_versions_saved_it(saved_base, tmp_path, on, outcome) -> None:
-    saved = tmp_path / "saved"
-    whole = SentenceTransformer(modules=[Transformer(saved_base), Pooling(64, pooling_mode="mean")])
-    whole.save_pretrained(str(saved), create_model_card=False)
-    names = ("cls_token", "lasttoken", "max_tokens", "mean_tokens")
-    flags = {f"pooling_mode_{name}": name in on for name in names}
-    config = {"word_embedding_dimension": 64, **flags, "include_prompt": True}
-    (saved / "1_Pooling" / "config.json").write_text(json.dumps(config))
-    with outcome:
-        check_pooling(saved)
 
 
 def test_a_base_of_the_hubs_cache_with_another_pooling(

@@ -4,29 +4,23 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import bitsandbytes
 import pytest
 import torch
 from huggingface_hub import ModelCard
 from safetensors.torch import load_file
 
 from conf.entry import Run
-from conf.errors import UserError
 from conf.runs import open_run
 from conf.schema import (
     ContrastiveCommand,
     ExportModelCommand,
     LateConfig,
     LoraConfig,
-    RetrieveCommand,
-    RetrieverConfig,
 )
-from evaluation import retrieve
 from models import compat, loading
 from models.resolved import resolve_run
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
@@ -80,26 +74,6 @@ def forms(settings, runs, tmp_path_factory) -> dict[str, tuple[dict, Path]]:
     """The metrics and the folder of each format."""
     root = tmp_path_factory.mktemp("exports")
     return {f: exported(settings, runs, f, root / f) for f in ("bf16", "fp32", "adapter")}
-
-
-def test_a_merged_weight_is_the_dequantised_one_and_its_adapters_product(
-    settings, runs, forms
-) -> None:
-    merged = load_file(forms["fp32"][1] / "model.safetensors")
-    adapters = load_file(runs / "contrastive" / "run" / "retriever" / "adapter_model.safetensors")
-    scale = settings.retriever.lora.alpha / settings.retriever.lora.rank
-    base = load_file(Path(settings.retriever.model) / "model.safetensors")
-    changed = 0
-    for place in {name.partition("lora_")[0] for name in adapters}:
-        name = f"{place.removeprefix('base_model.model.')}weight"
-        weight = next(w for key, w in base.items() if key.endswith(name))
-        packed, state = bitsandbytes.functional.quantize_4bit(weight, quant_type="nf4")
-        dequantised = bitsandbytes.functional.dequantize_4bit(packed, state)
-        added = scale * adapters[f"{place}lora_B.weight"] @ adapters[f"{place}lora_A.weight"]
-        assert added.norm() > 0.1 * weight.norm()
-        torch.testing.assert_close(merged[name], dequantised + added, atol=1e-6, rtol=1e-5)
-        changed += 1
-    assert changed == 2 * 7
 
 
 def test_the_measured_difference_is_recorded_and_small(forms) -> None:
@@ -158,23 +132,6 @@ def test_the_library_alone_computes_the_same_embeddings(
             torch.testing.assert_close(one.cpu(), torch.as_tensor(two).cpu(), atol=1e-4, rtol=0)
 
 
-@pytest.mark.slow
-def test_every_format_evaluates_like_the_run(settings, runs, forms, tmp_path) -> None:
-    results = {}
-    models = {f: forms[f][1] for f in ("fp32", "adapter")} | {"run": runs / "contrastive" / "run"}
-    for name, model in models.items():
-        cfg = RetrieveCommand(
-            benchmark=settings.benchmark, retriever=RetrieverConfig(name="unused", model="unused"),
-            store=settings.store, model=str(model), batch=16,
-        )  # fmt: skip
-        (tmp_path / name).mkdir()
-        retrieve.main.__wrapped__(cfg, Run(name, tmp_path / name))
-        rows = json.loads((tmp_path / name / "report.json").read_text())["rows"]
-        results[name] = {r["width"]: r["mrr"]["value"] for r in reversed(rows[: len(rows) // 2])}
-    assert results["adapter"] == results["run"]
-    assert results["fp32"] == pytest.approx(results["run"], abs=0.05)
-
-
 def test_the_card_describes_the_run(settings, forms) -> None:
     card = ModelCard.load(forms["adapter"][1] / "README.md")
     assert card.data.library_name == "peft"
@@ -187,31 +144,6 @@ def test_the_card_describes_the_run(settings, forms) -> None:
     ):
         assert row in card.text
     assert "| query difference |" in ModelCard.load(forms["fp32"][1] / "README.md").text
-
-
-@pytest.mark.slow
-def test_an_export_that_embeds_otherwise_is_not_kept(settings, runs, tmp_path, monkeypatch) -> None:
-    """Here merging leaves out the adapters."""
-    monkeypatch.setattr(loading, "merge_adapters", lambda base, *_: base.dequantize(torch.float32))
-    with raises_user_error("merge-difference"):
-        exported(settings, runs, "fp32", tmp_path)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_retriever_trained_whole_has_nothing_to_merge(settings, runs, tmp_path) -> None:
-    shutil.copytree(runs, tmp_path / "runs")
-    config = tmp_path / "runs" / "contrastive" / "run" / "config.yaml"
-    config.write_text(config.read_text().replace("rank: 4", "rank: 0").replace("nf4", "none"))
-    with raises_user_error("nothing-to-merge", "retriever.lora.rank=0"):
-        exported(settings, tmp_path / "runs", "fp32", tmp_path / "into")
-
-
-def test_a_run_of_another_product_is_refused(settings, runs, tmp_path) -> None:
-    cfg = ExportModelCommand(run="run", checkpoints=str(runs))
-    with pytest.raises(UserError, match="sft/run"):
-        export.main.__wrapped__(cfg, Run("run", tmp_path))
-    (problem,) = ExportModelCommand(run="checkpoints/contrastive/x").check()
-    assert "product=retriever" in problem
 
 
 def test_a_missing_benchmark_is_not_built(settings, runs, tmp_path) -> None:

@@ -23,9 +23,8 @@ from models.lora_kernels import fuse, unfuse
 from models.retriever.embedder import (
     Retriever,
     embed,
-    instruction_of,
-    item_input,
     load_retriever,
+    model_inputs,
     tokenizer_texts,
 )
 from tests.user_errors import raises_user_error
@@ -105,13 +104,10 @@ def ranking_loss(model, inputs: RetrieverInputs, cfg: RetrieverConfig, **options
 def library(trained, distinct, frames) -> Gradients:
     """The library's loss and gradients, on inputs that are all in memory."""
     model, cfg = trained
-    features = [
-        model.preprocess(
-            [item_input(item, frames, cfg) for item in column],
-            prompt=instruction_of(column[0], cfg),
-        )
-        for column in batch_columns(distinct, NEGATIVES)
-    ]
+    features = []
+    for column in batch_columns(distinct, NEGATIVES):
+        inputs, instruction = model_inputs(column, frames, cfg)
+        features.append(model.preprocess(inputs, prompt=instruction))
     options = {"scale": scale(cfg), "mini_batch_size": 3}
     if cfg.late:
         loss = CachedMultiVectorMultipleNegativesRankingLoss(model, **options)

@@ -170,7 +170,7 @@ def other_tokenizer(folder: Path) -> None:
     [
         (other_processor, "other-processor", "CLIPProcessor"),
         (no_processor, "unloadable-model", "student.model"),
-        (other_grid, "other-processor", "patch size"),
+        (other_grid, "other-processor", "patch_size"),
         (other_tokenizer, "other-processor", "tokenizer"),
     ],
 )
