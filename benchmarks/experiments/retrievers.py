@@ -1,5 +1,5 @@
 """The tiny retriever trained in several ways on the small benchmark: in-batch negatives, same-scene
-hard negatives, mined negatives and late interaction, three seeds each, at every width.
+hard negatives and late interaction, three seeds each, at every width.
 
     python -m benchmarks.experiments.retrievers            # train and evaluate what is missing
     python -m benchmarks.experiments.retrievers --table    # print the recorded results
@@ -26,7 +26,6 @@ RANKS = Path(__file__).with_name("ranks.parquet")
 VARIANTS: dict[str, list[str]] = {
     "in-batch": ["train.hard_negatives=0"],
     "hard": [],
-    "mined": ["train.mine_every=40"],
     "late": ["+exp=late_interaction"],
 }
 """Overrides of `train.contrastive`; without any it takes one same-scene hard negative a query."""

@@ -103,11 +103,6 @@ class ContrastiveTrainConfig(TrainConfig):
     """Queries or frames per forward pass; changes memory and speed, not the gradient."""
     hard_negatives: int = setting(1, least=0)
     """Hard negatives per query: wrong-time frames of the query's own scene."""
-    mine_every: int = setting(0, least=0)
-    """Steps between two minings of hard negatives, which replace a query's hard negatives by the
-    wrong frames that the retriever ranks highest; 0 keeps those of the benchmark."""
-    mine_margin: float = setting(24.0, least=0)
-    """Minimum displacement (px at 336 x 336) of a mined frame from the target in the same scene."""
     scale: float = setting(50.0, above=0)
     """Inverse temperature: factor of the cosine similarities, or of their sum for
     retriever.late."""
@@ -121,16 +116,10 @@ class ContrastiveTrainConfig(TrainConfig):
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)
-        no_negatives = f"{group}hard_negatives=0"
         if self.batch < 2 and not self.hard_negatives:
             yield (
-                f"{group}batch={self.batch} with {no_negatives} leaves no negatives: set "
+                f"{group}batch={self.batch} with {group}hard_negatives=0 leaves no negatives: set "
                 f"{group}batch to 2 or more, or {group}hard_negatives to 1 or more"
-            )
-        if self.mine_every and not self.hard_negatives:
-            yield (
-                f"{group}mine_every={self.mine_every} with {no_negatives} mines nothing: set "
-                f"{group}hard_negatives to 1 or more, or {group}mine_every=0"
             )
         if not 1 <= self.mini_batch <= self.batch:
             yield f"{group}mini_batch={self.mini_batch} must be from 1 to {group}batch={self.batch}"

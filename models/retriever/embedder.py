@@ -21,7 +21,6 @@ from safetensors.torch import load_file
 from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
 from sentence_transformers.util import is_sentence_transformer_model
-from tqdm import tqdm
 from transformers import AutoConfig
 
 from conf.errors import UserError
@@ -248,13 +247,11 @@ def embed(
     frames: FrameReader,
     cfg: RetrieverConfig,
     batch: int,
-    progress: str | None = None,
 ) -> list[torch.Tensor]:
     """Embed queries or frames. Items are all of one kind.
 
     Args:
         batch: Items per rank of which pixels are in memory at a time.
-        progress: Label of a progress bar; None shows none.
 
     Returns:
         An fp32 tensor on the CPU for each item, (width,) or (vectors, width).
@@ -266,8 +263,7 @@ def embed(
     rows: list[torch.Tensor] = []
     # In a distributed evaluation, each call divides its inputs among the ranks.
     step = batch * world_size()
-    starts = range(0, len(items), step)
-    for start in tqdm(starts, desc=progress, unit="batch", leave=False, disable=progress is None):
+    for start in range(0, len(items), step):
         part = items[start : start + step]
         inputs, instruction = model_inputs(part, frames, cfg)
         embedded = encode(inputs, prompt=instruction, batch_size=batch, show_progress_bar=False)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from sentence_transformers import (
     MultiVectorEncoderTrainingArguments,
@@ -17,7 +15,7 @@ from conf.schema import ContrastiveCommand, ContrastiveTrainConfig, RetrieverCon
 from data.records import RetrievalQuery
 from data.render.frame_cache import FrameReader
 from data.store import Store
-from models.retriever.embedder import Retriever, embed, longest_query
+from models.retriever.embedder import Retriever, longest_query
 from train.common.arguments import common_arguments
 from train.common.audit import audit_retriever
 from train.common.callbacks import EpochCallback
@@ -29,7 +27,6 @@ from train.retriever.evaluator import (
 )
 from train.retriever.inputs import RetrieverInputs
 from train.retriever.loss import RankingLoss
-from train.retriever.mining import HardNegativeMiner
 from train.retriever.trainer import (
     IndexCollator,
     MultiVectorTrainer,
@@ -63,12 +60,7 @@ def build_trainer(
     train, retriever = cfg.train, cfg.retriever
     frames = FrameReader(store, retriever.image_size)
     log.info(audit_retriever(model, retriever, longest_query(training, model.tokenizer), frames))
-
-    def embed_rows(items: Sequence[Any], label: str) -> list[Any]:
-        return embed(model, items, frames, retriever, train.mini_batch, label)
-
     negatives = train.hard_negatives
-    miner = HardNegativeMiner(training, train, model, embed_rows, store, run.folder)
     sampler = QueryBatchSampler(training, negatives, train.batch, cfg.seed, world_size())
     # The dataset holds numbers; the loss loads pixels, and prefetches them itself.
     common = common_arguments(train, run, cfg.seed, checkpoint) | {"dataloader_num_workers": 0}
@@ -87,11 +79,9 @@ def build_trainer(
         ),
         loss=build_loss(train, retriever, model, frames),
         data_collator=IndexCollator(preprocess_fn=model.preprocess),
-        callbacks=[miner, EpochCallback(sampler)],
+        callbacks=[EpochCallback(sampler)],
         sampler=sampler,
-        columns_of=lambda numbers: batch_columns(
-            [miner.update(training[k]) for k in numbers], negatives
-        ),
+        columns_of=lambda numbers: batch_columns([training[k] for k in numbers], negatives),
     )
 
 

@@ -1,8 +1,7 @@
 """sentence-transformers' trainers on batches of query numbers.
 
 The library's collator loads everything that a batch shows, and its sampler knows no scenes. Here a
-batch holds the numbers of queries until a step begins: its hard negatives may be mined in between,
-and its pixels are loaded by the loss.
+batch holds the numbers of its queries, and the loss loads their pixels.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ def training_arguments(cfg: SftCommand, run: Run, checkpoint: Path | None) -> Tr
     return TrainingArguments(
         **common_arguments(train, run, cfg.seed, checkpoint),
         per_device_train_batch_size=train.micro_batch,
-        gradient_split_batch=accumulation,
+        gradient_accumulation_steps=accumulation,
         per_device_eval_batch_size=train.micro_batch,
         dataloader_prefetch_factor=prefetch_factor(train.workers, accumulation),
         label_names=["labels"],

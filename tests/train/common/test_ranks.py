@@ -174,10 +174,9 @@ def test_two_ranks_train_what_one_trains(
     late = replace(contrastive_settings, retriever=many, train=replace(train, scale=1.0))
     base = {"architecture": None, "model": saved_base, "lora": LoraConfig(rank=4)}
     adapted = replace(contrastive_settings.retriever, **base)
-    # Mined frames are often another query's target, which both ranks mask.
-    train = replace(train, mine_every=2, reuse_features=True)
-    mined = replace(contrastive_settings, retriever=adapted, train=train)
-    retrievers = {"plain": contrastive_settings, "mined": mined, "late": late}
+    train = replace(train, reuse_features=True)
+    reused = replace(contrastive_settings, retriever=adapted, train=train)
+    retrievers = {"plain": contrastive_settings, "adapters": reused, "late": late}
     for name, retriever_settings in retrievers.items():
         (folder := tmp_path / "contrastive" / name).mkdir(parents=True)
         contrastive.main.__wrapped__(retriever_settings, Run(name, folder))
@@ -211,7 +210,7 @@ def test_two_ranks_train_what_one_trains(
     for name in retrievers:
         whole, two = tmp_path / "contrastive" / name, tmp_path / "contrastive" / f"{name}-two"
         check_same_journals(whole, two)
-        weights = "adapter_model" if name == "mined" else "model"
+        weights = "adapter_model" if name == "adapters" else "model"
         check_same_weights(whole, two, f"retriever/{weights}.safetensors")
     check_same_weights(whole, two, "retriever/1_Dense/model.safetensors")
     for name in ("resumed", "sharded-resumed"):

@@ -107,7 +107,6 @@ def test_batch_settings_that_contradict_each_other(contrastive_settings) -> None
     for change, name in (
         ({"batch": 1, "mini_batch": 1, "hard_negatives": 0}, "train.hard_negatives=0"),
         ({"mini_batch": 5}, "train.mini_batch=5"),
-        ({"mine_every": 2, "hard_negatives": 0}, "train.mine_every=2"),
     ):
         (problem,) = replace(train, **change).check("train.")
         assert name in problem
