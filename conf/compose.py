@@ -52,6 +52,7 @@ REMOVED_KEYS: dict[str, str] = {
     "train.mask_identical": "leave it out: identical frames are always masked",
     "train.mask_near": "leave it out: frames near the target count as negatives",
     "train.hard_weight": "leave it out: all negatives count equally",
+    "retriever.late.pool": "leave it out: every vector is kept",
     "train.mine_every": "leave it out: hard negatives are the benchmark's",
     "train.mine_margin": "leave it out: hard negatives are the benchmark's",
 }

@@ -128,9 +128,6 @@ class LateConfig(Settings):
 
     width: int = setting(128, least=1)
     """Dimensions of a vector."""
-    pool: int = setting(1, least=1)
-    """Pooling factor: the number of similar vectors of a frame that are averaged into one; 1 keeps
-    every vector."""
 
 
 @dataclass

@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from sentence_transformers import MultiVectorEncoder
 from sentence_transformers.base.modules import Dense, Module, Normalize, Transformer
-from sentence_transformers.multi_vector_encoder.modules import HierarchicalTokenPooling
 from torch import nn
 
 from conf.schema import LateConfig
@@ -48,26 +47,17 @@ def multi_vector_modules(backbone: Transformer, late: LateConfig) -> list[Module
         media_end=config.vision_end_token_id,
         message_end=backbone.tokenizer.convert_tokens_to_ids(MESSAGE_END),
     )
-    modules = [backbone, projection, scored, Normalize("token_embeddings")]
-    if late.pool > 1:
-        modules.append(HierarchicalTokenPooling(late.pool, num_protected_tokens=0))
-    return modules
+    return [backbone, projection, scored, Normalize("token_embeddings")]
 
 
 def keep_head_fp32(model: MultiVectorEncoder) -> None:
-    """Compute the modules after the backbone in fp32: the projection, because updates of its size
-    vanish in bf16's steps, and the distances of token pooling, which the library cannot convert to
-    NumPy when autocast on a CPU makes them bf16."""
+    """Compute the projection in fp32: updates of its size vanish in bf16's steps."""
     model[1].float().register_forward_pre_hook(cast_to_fp32)
-    for module in model:
-        if isinstance(module, HierarchicalTokenPooling):
-            module.pool_one = torch.autocast("cpu", enabled=False)(module.pool_one)
 
 
 def cast_to_fp32(_: nn.Module, args: tuple[dict[str, Any]]) -> None:
     """Before a module's forward: convert the token states."""
-    (features,) = args
-    features["token_embeddings"] = features["token_embeddings"].float()
+    args[0]["token_embeddings"] = args[0]["token_embeddings"].float()
 
 
 def find_scored_tokens(model: MultiVectorEncoder) -> ScoredTokens:

@@ -108,26 +108,10 @@ def test_vectors_are_the_scored_tokens_projected_and_normalised(
         torch.testing.assert_close(spoilt, vectors, atol=1e-5, rtol=0)
 
 
-def test_pooling_reduces_the_vectors_of_frames_but_not_of_queries(
-    micro_store, late_cfg, queries, frames, tmp_path
-) -> None:
-    pooled = replace(late_cfg, late=LateConfig(width=24, pool=3))
-    counts = []
-    for cfg in (late_cfg, pooled):
-        model = load(cfg, micro_store, tmp_path)
-        frame = model.encode_document([frame_input(queries[0].target, frames)])[0]
-        torch.testing.assert_close(frame.norm(dim=1), torch.ones(len(frame)))
-        counts.append(
-            (len(frame), len(model.encode_query([query_input(queries[0], frames, cfg)])[0]))
-        )
-    assert counts[0][0] == FRAME_TOKENS
-    assert counts[1] == (FRAME_TOKENS // 3, counts[0][1])
-
-
 def test_a_saved_retriever_encodes_the_same_without_this_project(
     micro_store, late_cfg, queries, frames, tmp_path, monkeypatch
 ) -> None:
-    cfg = replace(late_cfg, late=LateConfig(width=24, pool=2))
+    cfg = late_cfg
     model = load(cfg, micro_store, tmp_path / "base")
     saved = tmp_path / "saved"
     model.save_pretrained(str(saved), create_model_card=False)
@@ -156,17 +140,12 @@ def test_code_in_a_saved_folder_is_not_executed(micro_store, late_cfg, tmp_path)
     assert find_scored_tokens(load_trained(late_cfg, "fp32", tmp_path / "saved")).media_ids
 
 
-@pytest.mark.parametrize("pool", [1, 2, 4])
-def test_tokens_are_pooled_in_bf16_as_in_fp32(
-    micro_store, late_cfg, queries, frames, tmp_path, pool
-) -> None:
-    cfg = replace(late_cfg, late=LateConfig(width=24, pool=pool))
-    model = load(cfg, micro_store, tmp_path)
+def test_vectors_are_finite_in_bf16(model, queries, frames) -> None:
     images = [frame_input(queries[0].target, frames)]
     (exact,) = model.encode_document(images)
     with torch.autocast("cpu", torch.bfloat16):
         (vectors,) = model.encode_document(images)
-    assert vectors.shape == exact.shape == (FRAME_TOKENS // pool, 24)
+    assert vectors.shape == exact.shape == (FRAME_TOKENS, 24)
     assert vectors.isfinite().all()
 
 

@@ -54,7 +54,6 @@ VARIANTS = {
     "adapters": {"quantization": "nf4", "lora": LoraConfig(rank=4)},
     "multi-vector": {"late": LATE},
     "multi-vector adapters": {"late": LATE, "lora": LoraConfig(rank=4)},
-    "pooled": {"late": replace(LATE, pool=2)},
 }
 
 
@@ -147,7 +146,7 @@ def test_reused_vision_features_change_no_gradient(trained, distinct, frames, li
     assert_equal(own(trained, distinct, frames, reuse_features=True), library)
 
 
-@pytest.mark.parametrize("trained", ["whole", "multi-vector", "pooled"], indirect=True)
+@pytest.mark.parametrize("trained", ["whole", "multi-vector"], indirect=True)
 def test_the_loss_is_its_formula_without_identical_frames(
     trained, queries, distinct, frames
 ) -> None:
