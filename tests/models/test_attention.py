@@ -1,4 +1,4 @@
-"""The attention that is chosen gives the numbers of the library's own."""
+"""The chosen attention gives the results of the library's own."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def grid(lengths: list[int]) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("lengths", [[7] * 5, [7, 7, 3, 7], [9]])
-def test_frames_at_once_are_frames_one_by_one(lengths) -> None:
+def test_all_frames_at_once_equal_frames_one_by_one(lengths) -> None:
     query, key, value = heads(1, 2, sum(lengths), 8)
     found, _ = attend_by_frame(
         Layer(), query, key, value, None,
@@ -74,7 +74,7 @@ def causal(length: int, dtype: torch.dtype) -> torch.Tensor:
     return torch.full((length, length), torch.finfo(dtype).min, dtype=dtype).triu(1)[None, None]
 
 
-def test_products_are_the_librarys_eager_attention() -> None:
+def test_products_equal_the_librarys_eager_attention() -> None:
     query, key, value = heads(2, 4, 33, 16)
     key, value = key[:, :2].detach().requires_grad_(), value[:, :2].detach().requires_grad_()
     layer = Layer()
@@ -124,11 +124,11 @@ def loss_of(model: PreTrainedModel, batch: dict) -> torch.Tensor:
 
 def test_every_pass_over_the_frames_is_one_call(samples, processor, model, monkeypatch) -> None:
     choose_attention(model, "bf16", LENGTH)
-    seen = []
+    shapes = []
     from models import attention
 
     def counted(module, query, *args, **settings):
-        seen.append(query.shape)
+        shapes.append(query.shape)
         return attend_by_products(module, query, *args, **settings)
 
     monkeypatch.setattr(attention, "attend_by_products", counted)
@@ -136,10 +136,10 @@ def test_every_pass_over_the_frames_is_one_call(samples, processor, model, monke
         loss_of(model, Collator(processor, LENGTH)(samples))
     layers = len(model.model.visual.blocks)
     # The images of two samples, and then the frames of their clips.
-    assert [shape[0] for shape in seen] == [2 * 4] * layers + [2 * 6] * layers
+    assert [shape[0] for shape in shapes] == [2 * 4] * layers + [2 * 6] * layers
 
 
-def test_the_choice_goes_by_precision_and_length(model) -> None:
+def test_attention_depends_on_precision_and_length(model) -> None:
     text, vision = model.config.text_config, model.config.vision_config
     for precision, length, expected in (
         ("bf16", SHORT, PRODUCTS),
@@ -174,7 +174,7 @@ def test_padding_and_a_cache_change_nothing(samples, processor, model, precision
     torch.testing.assert_close(with_cache[0], without[0], atol=tolerance, rtol=0)
 
 
-def test_a_saved_model_does_not_ask_for_it(model, tmp_path) -> None:
+def test_a_saved_model_names_no_attention_of_this_project(model, tmp_path) -> None:
     choose_attention(model, "bf16", LENGTH)
     model.save_pretrained(tmp_path)
     assert "dynapix" not in (tmp_path / "config.json").read_text()

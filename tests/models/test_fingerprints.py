@@ -1,4 +1,4 @@
-"""What tells one model's weights from another's."""
+"""Digests of a model's weights."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ SHAPES = {"first": (300, 200), "middle": (7,), "visual": (2000, 300)}
 
 
 @pytest.mark.parametrize("changed", SHAPES)
-def test_weights_are_known_by_each_of_their_tensors(tmp_path, changed) -> None:
-    """A merged student differs from its base in some of the tensors, which may stand anywhere."""
+def test_the_digest_covers_every_tensor(tmp_path, changed) -> None:
+    """A merged student differs from its base in some of the tensors."""
     one, other = tmp_path / "one", tmp_path / "other"
     one.mkdir()
     save_file({n: torch.randn(s) for n, s in SHAPES.items()}, one / "model.safetensors")
@@ -28,15 +28,15 @@ def test_weights_are_known_by_each_of_their_tensors(tmp_path, changed) -> None:
     assert weights_digest(one) != weights_digest(other)
 
 
-def headed(offsets: object) -> bytes:
-    """A file of safetensors with one tensor at such a place."""
+def with_offsets(offsets: object) -> bytes:
+    """A safetensors file with one tensor at these offsets."""
     head = json.dumps({"weight": {"dtype": "F32", "shape": [1], "data_offsets": offsets}}).encode()
     return len(head).to_bytes(8, "little") + head
 
 
 def test_a_damaged_file_has_a_digest_too(tmp_path) -> None:
     for k, content in enumerate(
-        (b"", b"\xff" * 100, b"\x02" + bytes(7) + b"[]", headed("x"), headed([-9, 2]))
+        (b"", b"\xff" * 100, b"\x02" + bytes(7) + b"[]", with_offsets("x"), with_offsets([-9, 2]))
     ):
         (tmp_path / "model.safetensors").write_bytes(content)
         assert len(weights_digest(tmp_path)) == 16, k

@@ -1,4 +1,4 @@
-"""A model that computes in fewer operations gives what it gives without."""
+"""The faster operations give the same results."""
 
 from __future__ import annotations
 
@@ -33,54 +33,56 @@ def student(request, nf4_cfg, micro_store, frames):
         if "lora_B" in name:
             nn.init.normal_(weight, std=0.1)
     items = micro_store.selection("train")[:2]
-    shown = [selection_sample(i, "answer", "cot", frames, cfg.frames, "Answer: A") for i in items]
-    batch = Collator(processor, 1500)(shown)
+    samples = [selection_sample(i, "answer", "cot", frames, cfg.frames, "Answer: A") for i in items]
+    batch = Collator(processor, 1500)(samples)
     return model.train(), batch, cfg.lora.rank > 0
 
 
-def passed(model: nn.Module, batch: dict) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+def loss_and_gradients(
+    model: nn.Module, batch: dict
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """The loss, and every gradient, of the same dropout."""
     model.zero_grad()
     torch.manual_seed(1)
-    given = {name: value for name, value in batch.items() if name not in ("labels", "sample_ids")}
-    loss = token_mean(model(**given), batch["labels"])
+    inputs = {name: value for name, value in batch.items() if name not in ("labels", "sample_ids")}
+    loss = token_mean(model(**inputs), batch["labels"])
     loss.backward()
-    found = {n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None}
-    return loss.detach(), found
+    computed = {n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None}
+    return loss.detach(), computed
 
 
 def test_loss_and_every_gradient_are_the_same(student) -> None:
     model, batch, adapted = student
-    plain, gradients = passed(model, batch)
+    plain, gradients = loss_and_gradients(model, batch)
     fuse(model)
-    fused, found = passed(model, batch)
+    fused, computed = loss_and_gradients(model, batch)
     assert any(isinstance(module, PatchProduct) for module in model.modules())
     variants = [v for m in model.modules() for v in getattr(m, "lora_variant", {}).values()]
     assert bool(variants) is adapted
     assert all(isinstance(v, AddedInPlace) for v in variants)
     torch.testing.assert_close(fused, plain, rtol=1e-5, atol=0)
-    assert found.keys() == gradients.keys()
+    assert computed.keys() == gradients.keys()
     for name, gradient in gradients.items():
-        assert (found[name] - gradient).norm() <= 1e-4 * gradient.norm(), name
+        assert (computed[name] - gradient).norm() <= 1e-4 * gradient.norm(), name
     unfuse(model)
-    again, _ = passed(model, batch)
+    again, _ = loss_and_gradients(model, batch)
     assert torch.equal(again, plain)
 
 
-def test_bf16_is_no_further_from_fp32_than_without(student) -> None:
+def test_rounding_to_bf16_is_no_larger(student) -> None:
     model, batch, _ = student
-    exact, _ = passed(model, batch)
+    exact, _ = loss_and_gradients(model, batch)
 
-    def apart() -> float:
+    def difference() -> float:
         with torch.autocast("cpu", torch.bfloat16):
-            return abs(passed(model, batch)[0] - exact).item()
+            return abs(loss_and_gradients(model, batch)[0] - exact).item()
 
-    plain = apart()
+    plain = difference()
     fuse(model)
-    assert apart() <= max(2 * plain, 2e-2 * exact.item())
+    assert difference() <= max(2 * plain, 2e-2 * exact.item())
 
 
-def test_what_is_saved_is_the_same_and_gives_the_same_elsewhere(student, tmp_path) -> None:
+def test_saved_weights_are_unchanged_and_give_the_same_logits(student, tmp_path) -> None:
     model, batch, adapted = student
     before = {name: value.clone() for name, value in model.state_dict().items()}
     fuse(model)
@@ -88,10 +90,10 @@ def test_what_is_saved_is_the_same_and_gives_the_same_elsewhere(student, tmp_pat
     assert after.keys() == before.keys()
     assert all(torch.equal(after[name], value) for name, value in before.items())
     if adapted:
-        given = {k: v for k, v in batch.items() if k not in ("labels", "sample_ids")}
+        inputs = {k: v for k, v in batch.items() if k not in ("labels", "sample_ids")}
         with torch.no_grad():
-            fused = model.eval()(**given).logits
+            fused = model.eval()(**inputs).logits
             model.save_pretrained(tmp_path)
             unfuse(model)
             again = peft.PeftModel.from_pretrained(model.unload(), tmp_path).eval()
-            torch.testing.assert_close(again(**given).logits, fused, atol=1e-4, rtol=1e-4)
+            torch.testing.assert_close(again(**inputs).logits, fused, atol=1e-4, rtol=1e-4)

@@ -90,7 +90,7 @@ def adapted(preset: str) -> nn.Module:
 
 
 def projections(text: dict[str, Any]) -> dict[str, tuple[int, int]]:
-    """What goes into and comes out of each projection of a language layer."""
+    """The input and output sizes of each projection of a language layer."""
     hidden, forward = text["hidden_size"], text["intermediate_size"]
     queries = text["num_attention_heads"] * text["head_dim"]
     keys = text["num_key_value_heads"] * text["head_dim"]
@@ -125,7 +125,7 @@ def vision_parameters(vision: dict[str, Any]) -> int:
 
 
 def towers_of(config: dict[str, Any], rank: int) -> dict[str, Tower]:
-    """What an audit must count, from the sizes alone."""
+    """The expected counts, from the sizes alone."""
     text = config["text_config"]
     hidden, layers = text["hidden_size"], text["num_hidden_layers"]
     sides = projections(text).values()
@@ -154,11 +154,11 @@ def names_of(model: nn.Module, kind: type) -> set[str]:
 
 
 @presets
-def test_the_recipe_is_the_papers(preset) -> None:
+def test_settings_are_those_of_the_paper(preset) -> None:
     cfg = compose("train.sft", SftCommand, [f"student={preset}"])
-    asked, train = cfg.student, cfg.train
-    assert (asked.quantization, asked.lora.rank, asked.lora.alpha) == ("nf4", RANK, 32)
-    assert (asked.frames, asked.image_size, asked.max_length) == (12, 336, 3072)
+    student, train = cfg.student, cfg.train
+    assert (student.quantization, student.lora.rank, student.lora.alpha) == ("nf4", RANK, 32)
+    assert (student.frames, student.image_size, student.max_length) == (12, 336, 3072)
     assert (train.lr, train.epochs, train.batch, train.micro_batch) == (2e-5, 3, 16, 1)
     assert train.precision == "bf16"
 
@@ -171,7 +171,7 @@ def test_the_tree_has_the_size_of_the_released_model(preset) -> None:
 
 
 @presets
-def test_the_audit_counts_what_the_sizes_say(preset) -> None:
+def test_counts_equal_those_from_the_sizes(preset) -> None:
     towers = count_towers(adapted(preset))
     assert towers == towers_of(config_of(preset), RANK)
     cfg = student(preset)
@@ -187,7 +187,7 @@ def test_the_language_towers_projections_alone_are_quantised_and_adapted(preset)
 
 
 @presets
-def test_the_head_is_spared_and_tied_where_the_release_ties_it(preset) -> None:
+def test_the_head_is_not_quantised_and_tied_as_released(preset) -> None:
     base = base_of(preset, nf4())
     assert type(base.lm_head) is nn.Linear
     tied = base.lm_head.weight is base.model.language_model.embed_tokens.weight
@@ -195,7 +195,7 @@ def test_the_head_is_spared_and_tied_where_the_release_ties_it(preset) -> None:
 
 
 @presets
-def test_a_bare_model_is_quantised_alike(preset) -> None:
+def test_a_bare_model_is_quantised_the_same_way(preset) -> None:
     """A retriever has no head, and its names start one level further down."""
     base = base_of(preset, nf4(), AutoModel)
     assert names_of(base, bnb.nn.Linear4bit) == projection_names(preset, "language_model.")
@@ -215,16 +215,16 @@ def test_adapters_are_fp32_over_a_base_that_stays_bf16(preset, quantized) -> Non
 
 
 @pytest.mark.parametrize(
-    ("spared", "message"),
+    ("skipped", "message"),
     [
         (["visual", "lm_head"], "vision has some 4-bit parameters"),
         (["model.visual"], "embeddings and head has some 4-bit parameters"),
         (["model.visual", "model.language_model", "lm_head"], "language has no 4-bit parameters"),
     ],
 )
-def test_a_wrong_skip_list_is_stopped(spared, message) -> None:
+def test_a_wrong_skip_list_is_refused(skipped, message) -> None:
     quantization = nf4()
-    quantization.llm_int8_skip_modules = spared
+    quantization.llm_int8_skip_modules = skipped
     cfg = student("qwen3_vl_2b")
     model = loading.add_adapters(base_of(cfg.name, quantization), cfg.lora)
     with raises_user_error("other-parameters", contains=message):
@@ -239,7 +239,7 @@ def test_a_wrong_skip_list_is_stopped(spared, message) -> None:
         (r".*\.embed_tokens", "embeddings and head has some LoRA parameters"),
     ],
 )
-def test_adapters_outside_the_language_tower_are_stopped(targets, message) -> None:
+def test_adapters_outside_the_language_tower_are_refused(targets, message) -> None:
     cfg = student("qwen3_vl_2b")
     model = loading.add_adapters(base_of(cfg.name, nf4()), replace(cfg.lora, targets=targets))
     with raises_user_error("other-parameters", contains=message):
@@ -292,8 +292,8 @@ def test_frames_come_at_320_px_and_at_their_true_times(
     assert len(shown) == cfg.frames
     # Two frames share a patch in time, which stands at the mean of their times.
     times = [(a + b) / 2 / FPS for a, b in zip(shown[::2], shown[1::2], strict=True)]
-    told = re.findall(r"<(\d+\.\d) seconds>", released.tokenizer.decode(encoded.input_ids))
-    assert told == [f"{time:.1f}" for time in times]
+    timestamps = re.findall(r"<(\d+\.\d) seconds>", released.tokenizer.decode(encoded.input_ids))
+    assert timestamps == [f"{time:.1f}" for time in times]
 
 
 def media(size: int, count: int) -> Sample:
@@ -303,7 +303,7 @@ def media(size: int, count: int) -> Sample:
 
 
 def test_a_video_of_default_size_is_shrunk_where_an_image_is_not(processor) -> None:
-    """What pinning is for: the library's default, should it change, needs another look."""
+    """The reason for `pin_sizes`; check it again if the library's default changes."""
     encoded = encode(media(336, 12), released_processor(processor, {}), 3072)
     assert encoded.media["video_grid_thw"].tolist() == [[6, 16, 16]]
     assert encoded.media["image_grid_thw"].tolist() == [[1, 20, 20]]
@@ -336,12 +336,12 @@ def test_the_longest_rationale_fits_and_the_whole_audit_needs_no_weights(
     longest = max(supervised, key=lambda s: len(s.text))
     words = longest.rationale.split()
     more = " ".join((words * MAX_SENTENCE_TAGS)[: MAX_SENTENCE_TAGS - len(words)])
-    text = f"{more}\n{longest.rationale}"
-    assert len(text.split()) == MAX_SENTENCE_TAGS
-    told = response(text, longest.matches, longest.item.letter, "reasoning", regime)
+    rationale = f"{more}\n{longest.rationale}"
+    assert len(rationale.split()) == MAX_SENTENCE_TAGS
+    target = response(rationale, longest.matches, longest.item.letter, "reasoning", regime)
     frames = FrameReader(micro_store, cfg.image_size)
-    sample = selection_sample(longest.item, "reasoning", regime, frames, cfg.frames, told)
-    seen = audit(adapted(preset), released, cfg, sample, Collator(released, cfg.max_length))
-    assert "336 x 336 px become a video of 6 x 10 x 10 tokens and an image of 1 x 10 x 10" in seen
+    sample = selection_sample(longest.item, "reasoning", regime, frames, cfg.frames, target)
+    text = audit(adapted(preset), released, cfg, sample, Collator(released, cfg.max_length))
+    assert "336 x 336 px become a video of 6 x 10 x 10 tokens and an image of 1 x 10 x 10" in text
     for tower in towers_of(config_of(preset), RANK).values():
-        assert f"{tower.parameters:,}" in seen
+        assert f"{tower.parameters:,}" in text

@@ -1,4 +1,4 @@
-"""Answers that are drawn: by the temperature, from the likeliest, and each by its own seed."""
+"""Sampled responses: by temperature, from the most likely tokens, each with its own seed."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from models.student.token_sampling import sampling_processors
 LOGITS = torch.tensor([2.0, 1.0, 0.5, 0.0, -1.0, -3.0])
 
 
-def drawing(**changes: object) -> StudentConfig:
+def sampling_cfg(**changes: object) -> StudentConfig:
     return StudentConfig(name="any", model="any", **{"temperature": 1.0, **changes})
 
 
-def drawn(cfg: StudentConfig, count: int = 20_000) -> np.ndarray:
-    """How often each token is drawn, by as many seeds."""
+def frequencies(cfg: StudentConfig, count: int = 20_000) -> np.ndarray:
+    """How often each token is sampled, with `count` seeds."""
     steps = sampling_processors(cfg, range(count))
     scores = LOGITS.expand(count, -1).clone()
     tokens = steps(torch.zeros(count, 1, dtype=torch.long), scores).argmax(1)
@@ -30,20 +30,20 @@ def drawn(cfg: StudentConfig, count: int = 20_000) -> np.ndarray:
 
 
 @pytest.mark.parametrize("temperature", [0.6, 1.0, 2.0])
-def test_tokens_are_drawn_from_the_softmax(temperature) -> None:
+def test_tokens_are_sampled_from_the_softmax(temperature) -> None:
     share = torch.softmax(LOGITS / temperature, 0).numpy()
-    assert drawn(drawing(temperature=temperature)) == pytest.approx(share, abs=0.015)
+    assert frequencies(sampling_cfg(temperature=temperature)) == pytest.approx(share, abs=0.015)
 
 
-def test_tokens_are_drawn_from_the_likeliest_alone() -> None:
+def test_only_the_most_likely_tokens_are_sampled() -> None:
     share = torch.softmax(LOGITS[:3], 0).tolist()
-    assert drawn(drawing(top_k=3)) == pytest.approx([*share, 0, 0, 0], abs=0.015)
+    assert frequencies(sampling_cfg(top_k=3)) == pytest.approx([*share, 0, 0, 0], abs=0.015)
     # The first two hold 0.77 of all, the third brings that above 0.8.
-    assert drawn(drawing(top_p=0.8)) == pytest.approx([*share, 0, 0, 0], abs=0.015)
+    assert frequencies(sampling_cfg(top_p=0.8)) == pytest.approx([*share, 0, 0, 0], abs=0.015)
 
 
-def test_a_row_is_drawn_by_its_seed_whatever_stands_beside_it() -> None:
-    cfg, ids = drawing(), torch.zeros(3, 1, dtype=torch.long)
+def test_a_row_depends_on_its_seed_only() -> None:
+    cfg, ids = sampling_cfg(), torch.zeros(3, 1, dtype=torch.long)
     steps = {seeds: sampling_processors(cfg, seeds) for seeds in ((5, 6, 7), (6,), (7, 6, 5))}
     for _ in range(20):
         rows = {
@@ -55,40 +55,39 @@ def test_a_row_is_drawn_by_its_seed_whatever_stands_beside_it() -> None:
         assert not torch.equal(rows[5, 6, 7][0], rows[5, 6, 7][1])
 
 
-def test_without_a_temperature_nothing_is_drawn() -> None:
+def test_decoding_without_a_temperature_is_greedy() -> None:
     assert not sampling_processors(StudentConfig(name="any", model="any"), [0])
 
 
-def test_a_models_answer_is_its_items_own(
+def test_a_response_is_independent_of_its_batch(
     model, processor, micro_store, frames, student_cfg
 ) -> None:
-    """Whichever items it is asked with, as after a kill."""
     items = micro_store.selection("test")[:4]
 
-    def asked(group: list[int], seed: int = 0) -> list[str]:
+    def responses(group: list[int], seed: int = 0) -> list[str]:
         samples = [
             selection_sample(items[k], "answer", "cot", frames, student_cfg.frames) for k in group
         ]
-        steps = sampling_processors(drawing(top_k=50), [100 * seed + k for k in group])
+        steps = sampling_processors(sampling_cfg(top_k=50), [100 * seed + k for k in group])
         inputs = Collator(processor, 1500)(samples)
-        return [w.text for w in generate(model.eval(), processor, inputs, 12, "fp32", steps)]
+        return [r.text for r in generate(model.eval(), processor, inputs, 12, "fp32", steps)]
 
-    together = asked([0, 1, 2, 3])
-    assert asked([2]) + asked([3, 0]) == [together[k] for k in (2, 3, 0)]
+    together = responses([0, 1, 2, 3])
+    assert responses([2]) + responses([3, 0]) == [together[k] for k in (2, 3, 0)]
     assert len(set(together)) == 4
-    assert asked([0, 1, 2, 3], seed=1) != together
+    assert responses([0, 1, 2, 3], seed=1) != together
 
 
 @pytest.mark.parametrize("thinking", [True, False])
-def test_a_thought_that_the_prompt_opens_is_opened_in_the_text(
+def test_a_thought_that_the_prompt_opens_begins_the_text(
     thinking, model, processor, micro_store, frames, student_cfg
 ) -> None:
     thinker = deepcopy(processor)
     thinker.chat_template += "{{ '<think>\n' if enable_thinking else '<think>\n\n</think>\n\n' }}"
     [item, *_] = micro_store.selection("test")
     sample = selection_sample(item, "answer", "cot", frames, student_cfg.frames)
-    [written] = generate(
+    [response] = generate(
         model.eval(), thinker, Collator(thinker, 1500, thinking)([sample]), 4, "fp32"
     )
-    assert written.text.startswith("<think>") == thinking
-    assert written.cut
+    assert response.text.startswith("<think>") == thinking
+    assert response.cut

@@ -1,9 +1,9 @@
-"""Run by vLLM's own Python: the token ids that its engine is given for a prompt with media.
+"""Print the token ids of a prompt with media in vLLM's engine. vLLM's own Python runs this.
 
     python vllm_prompt.py MODEL CONVERSATION.npz
 
 The conversation is its text with a placeholder for each medium, the clip's pixels and metadata, and
-the images' pixels. It is taken the way a request takes: through the model's multi-modal processor.
+the images' pixels. It passes the model's multi-modal processor, as a request does.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from vllm.multimodal import MULTIMODAL_REGISTRY
 
 
 def main(model: str, path: str) -> None:
-    with np.load(path) as told:
-        text, metadata = str(told["text"]), json.loads(str(told["metadata"]))
-        media = {"image": [Image.fromarray(pixels) for pixels in told["images"]]}
+    with np.load(path) as conversation:
+        text, metadata = str(conversation["text"]), json.loads(str(conversation["metadata"]))
+        media = {"image": [Image.fromarray(pixels) for pixels in conversation["images"]]}
         if metadata is not None:
-            media["video"] = [(told["clip"], metadata)]
+            media["video"] = [(conversation["clip"], metadata)]
     config = ModelConfig(model, limit_mm_per_prompt={"image": 4, "video": 1})
     with set_current_vllm_config(VllmConfig(model_config=config)):
         processor = MULTIMODAL_REGISTRY.create_processor(config)
