@@ -132,18 +132,10 @@ def parse_choice(raw: str, letters: str = LETTERS, cut: bool = False) -> ParsedA
         return ParsedAnswer(None, Reason.CUT_OFF)
     choices, records, flag, prose = _read_records(text)
     if choices:
-        answer = _agreed(
-            [
-                ParsedAnswer(None, Reason.MALFORMED)
-                if choice is None
-                else _read_statement(choice, letters)
-                for choice in choices
-            ]
-        )
+        answer = _agreed([_read_statement(choice, letters) for choice in choices])
         record = records[0] if len(records) == 1 and flag is None else None
-        if answer.reason in (None, Reason.MALFORMED):
-            return ParsedAnswer(answer.letter, flag or answer.reason, record)
-        return answer
+        broken = answer.reason in (None, Reason.MALFORMED) and flag
+        return ParsedAnswer(answer.letter, broken or answer.reason, record)
     if flag is Reason.CUT_OFF:
         return ParsedAnswer(None, flag)
     # With "xx" at its end an incomplete last word is no letter.
@@ -249,8 +241,11 @@ def _read_lone_letter(text: str, letters: str) -> ParsedAnswer:
     return answer
 
 
-def _read_statement(value: str, letters: str) -> ParsedAnswer:
-    """Read a short statement, such as "B", "option (C)" or "B, because the cube has turned"."""
+def _read_statement(value: str | None, letters: str) -> ParsedAnswer:
+    """Read a short statement, such as "B", "option (C)" or "B, because the cube has turned"; None
+    is an unreadable one."""
+    if value is None:
+        return ParsedAnswer(None, Reason.MALFORMED)
     value = _strip_markup(value)
     match = _STATEMENT.fullmatch(value)
     if len(_named_letters(value, match)) > 1:
