@@ -53,7 +53,7 @@ def flash_attention(precision: str) -> str | None:
 
 
 def attend_by_products(
-    module: Module, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, **settings: Any
+    module: Module, query: Tensor, key: Tensor, value: Tensor, attention_mask: Any, **settings: Any
 ) -> tuple[Tensor, None]:
     """Attend from (B, H, Q, D) queries to (B, G, K, D) keys and values; return (B, Q, H, D).
 
@@ -63,8 +63,8 @@ def attend_by_products(
     groups = query.shape[1] // key.shape[1]
     key, value = repeat_kv(key, groups), repeat_kv(value, groups)
     scores = torch.matmul(query * settings["scaling"], key.transpose(2, 3))
-    if mask is not None:
-        scores.add_(mask)
+    if attention_mask is not None:
+        scores.add_(attention_mask)
     weights = dropout(scores.softmax(dim=-1), settings.get("dropout", 0.0))
     return torch.matmul(weights, value).transpose(1, 2).contiguous(), None
 
@@ -76,7 +76,7 @@ def products_mask(*args: Any, dtype: torch.dtype, **settings: Any) -> Tensor | N
 
 
 def attend_by_frame(
-    module: Module, query: Tensor, key: Tensor, value: Tensor, mask: None, **settings: Any
+    module: Module, query: Tensor, key: Tensor, value: Tensor, attention_mask: Any, **settings: Any
 ) -> tuple[Tensor, None]:
     """Attend among the (1, H, N, D) patches of several frames, each within its frame; return
     (1, N, H, D). Of the settings, `cu_seq_lens_q` has the bounds of the frames among the patches,
