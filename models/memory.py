@@ -1,4 +1,4 @@
-"""Free memory, and what to tell a user when it runs out."""
+"""Available memory, and the error for running out of it."""
 
 from __future__ import annotations
 

@@ -74,13 +74,13 @@ def trained_settings(
     """
     config = folder / "config.yaml"
     try:
-        there = OmegaConf.load(config)
+        saved = OmegaConf.load(config)
         if (folder / product / EXPORT).exists():
             raise UserError(
                 f"{key}={folder} contains an export: give {key}={folder / product}",
                 code="missing-run",
             )
-        if not OmegaConf.is_dict(there) or product not in there:
+        if not OmegaConf.is_dict(saved) or product not in saved:
             raise UserError(
                 f"{key}={folder} is not a run that trained a {product}", code="missing-run"
             )
@@ -90,7 +90,7 @@ def trained_settings(
                 f"{key}={folder} is not finished: run its command again to resume it",
                 code="unfinished-run",
             )
-        settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), there))
+        settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), saved))
     except FileNotFoundError as error:
         raise UserError(
             f"{key}={folder} is not the folder of a trained {product}: {config} is missing; give "
