@@ -83,8 +83,6 @@ def audit_retriever(
             mask = inputs["attention_mask"]
             scored = find_scored_tokens(model).scored(ids, mask)[0].tolist()
         lines += describe_input(name, model.tokenizer, ids[0].tolist(), scored, "scored")
-    if cfg.late is not None and cfg.late.pool > 1:
-        lines.append(f"a frame keeps one of {cfg.late.pool} of its vectors")
     return "\n".join(lines)
 
 
