@@ -102,7 +102,8 @@ class RankingLoss(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (items, vectors, width), and (items, vectors) whether a vector is scored."""
         task = "document" if isinstance(part[0], FrameRef) else "query"
-        outputs = self.model(inputs, task=task)
+        # Of the outputs, torch's wrapper for several ranks only finds those in a plain dict.
+        outputs = self.model(dict(inputs), task=task)
         if (single := outputs.get("sentence_embedding")) is not None:
             return single[:, None], single.new_ones(len(single), 1, dtype=torch.bool)
         return outputs["token_embeddings"], outputs["attention_mask"].bool()
