@@ -20,11 +20,14 @@ MAIN_RANK_GRACE = 3.0
 """Time (s) for the main rank to print an error before another rank does."""
 PEER_ENDED = r"gloo.*(by peer|[Bb]roken pipe)"
 """Error of a rank that waits for the others after one of them has ended."""
+FAILED_WRITE = r"PytorchStreamWriter|unexpected pos|\(os error (27|28|122)\)"
+"""Errors of torch and safetensors for a file that they cannot write; torch names no cause."""
 FULL_DISK_BYTES = 1 << 20
 """Free space below which a disk counts as full."""
 WRITE_ERRORS = (
     errno.ENOSPC,
     errno.EDQUOT,
+    errno.EFBIG,
     errno.EROFS,
     errno.EACCES,
     errno.EPERM,
@@ -59,9 +62,11 @@ def report_failures(folder: str = ".") -> Iterator[None]:
     except Exception as error:
         if world_size() > 1 and re.search(PEER_ENDED, str(error)):
             _end_process(1)
-        if not _is_disk_full(folder):
+        if _is_disk_full(folder):
+            _exit_after_failed_write(folder, os.strerror(errno.ENOSPC))
+        if not re.search(FAILED_WRITE, str(error)):
             raise
-        _exit_after_failed_write(folder, os.strerror(errno.ENOSPC))
+        _exit_after_failed_write(folder, f"a file was not written ({error})")
 
 
 def _exit_after_failed_write(path: str, reason: str) -> NoReturn:

@@ -57,11 +57,11 @@ def test_mistake_ends_in_one_sentence(folder, arguments, status, end):
 
 def test_library_error_on_a_full_disk_is_a_failed_write(monkeypatch, tmp_path, capsys):
     with pytest.raises(RuntimeError), report_failures(str(tmp_path)):
-        raise RuntimeError("unexpected pos 304000 vs 303892")
+        raise RuntimeError("shapes do not match")
     full = shutil.disk_usage(tmp_path)._replace(free=0)
     monkeypatch.setattr("conf.failures.shutil.disk_usage", lambda _: full)
     with pytest.raises(SystemExit) as ended, report_failures(str(tmp_path)):
-        raise RuntimeError("unexpected pos 304000 vs 303892")
+        raise RuntimeError("shapes do not match")
     assert ended.value.code == 1
     assert capsys.readouterr().err == f"error: {tmp_path}: No space left on device; {RESUME}"
 

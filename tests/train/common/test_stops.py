@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from conf import gpus
 from conf.entry import Run
+from conf.failures import report_failures
 from conf.schema import SftCommand
 from data.records import SelectionItem
 from data.store import Store
@@ -132,3 +135,17 @@ def test_a_run_without_ranks_uses_one_gpu(monkeypatch, visible, rank, expected) 
         monkeypatch.setenv("LOCAL_RANK", rank)
     gpus.restrict_to_one_gpu()
     assert os.environ["CUDA_VISIBLE_DEVICES"] == expected
+
+
+@pytest.mark.parametrize("save", [torch.save, save_file])
+def test_weights_that_cannot_be_written_are_a_failed_write(tmp_path, capsys, save):
+    """The libraries' errors are not OSErrors, and the disk may have space again."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(SystemExit) as ended, report_failures(str(tmp_path)):
+            save({"weight": torch.zeros(60_000)}, tmp_path / "weights")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert ended.value.code == 1
+    assert "[write-failed]" in capsys.readouterr().err
