@@ -104,7 +104,7 @@ def test_peft_layers_use_a_lora_variant(model) -> None:
 
 def test_qwen3_vl_takes_the_vision_towers_outputs_instead_of_pixels(model) -> None:
     token, grid = model.config.image_token_id, torch.tensor([[1, 4, 4]])
-    ids = torch.tensor([[5, *[token] * 4, 6]])
+    ids = torch.tensor([[10, *[token] * 4, 11]])
     inputs = {"input_ids": ids, "image_grid_thw": grid, "mm_token_type_ids": (ids == token).long()}
     pixels = torch.randn(16, 3 * 2 * 16 * 16)
     with torch.no_grad():
