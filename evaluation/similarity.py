@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from conf.entry import Run, command
-from conf.runs import write_text
+from conf.runs import write_json_lines
 from conf.schema import ContrastiveCommand, SimilarityCommand
 
 log = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     candidates = {FrameRef(c.scene_id, c.frame) for item in items for c in item.candidates}
-    choices, score_lines = [], []
+    choices, score_rows = [], []
     for embedder in open_embedders(folder, trained, store, run.folder, cfg.batch):
         name = embedder.name
         queries = embedder.embed_queries(items)
@@ -42,11 +42,14 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         log.info("scoring %s items with %s", f"{len(items):,}", name)
         scores = nearest_candidate.score_candidates(items, queries, embeddings, preset)
         credits = nearest_candidate.credit_choices(scores, [item.answer for item in items])
-        score_lines += nearest_candidate.format_scores(name, items, scores)
+        score_rows += [
+            {"by": name, "item_id": item.item_id, "scores": row}
+            for item, row in zip(items, scores.tolist(), strict=True)
+        ]
         letters = nearest_candidate.choose_letters(scores)
         choices.append(Choices(name, SIMILARITY, None, credits, letters))
 
-    write_text(run.folder / "scores.jsonl", "".join(f"{line}\n" for line in score_lines))
+    write_json_lines(run.folder / "scores.jsonl", score_rows)
     results = write_report(
         choices, items, store.name, cfg.seed, run.folder, cfg.suite, build=store.identity
     )

@@ -3,14 +3,13 @@ encoder matches the text to the whole test database."""
 
 from __future__ import annotations
 
-import json
 import logging
 from functools import partial
 from pathlib import Path
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import write_text
+from conf.runs import write_json_lines
 from conf.schema import ContrastiveCommand, SftCommand, TwoStageCommand
 from conf.schema.evaluation import ROUTES
 
@@ -81,7 +80,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         build=store.identity,
         texts=counts,
     )
-    write_text(run.folder / "matched.jsonl", "".join(json.dumps(m) + "\n" for m in matched))
+    write_json_lines(run.folder / "matched.jsonl", matched)
     return metrics
 
 

@@ -12,9 +12,9 @@ from typing import Any
 
 from tqdm import tqdm
 
+from conf.runs import read_json_lines
 from data.records import FrameRef, RetrievalQuery, SelectionItem
 from evaluation.generators.response_schema import Record, read_record
-from evaluation.reporting.runs import json_lines
 from models.fingerprints import settings_key
 from models.student.answer_parser import parse_choice
 from models.student.generation import GeneratedText
@@ -96,7 +96,7 @@ class ResponseLog:
         self._path = path
         self.keys = {mode: settings_key([mode, of_mode]) for mode, of_mode in settings.items()}
         self._subject_of = {subject.name: subject for subject in subjects}
-        rows = list(json_lines(path)) if path.exists() else []
+        rows = list(read_json_lines(path)) if path.exists() else []
         self.responses = self._score(rows)
         recorded = {row.get("key") for row in rows if "asked" in row}
         heads = [
@@ -112,7 +112,7 @@ class ResponseLog:
         """Add other files' responses under the same keys; return their number."""
         before = len(self.responses)
         for path in others:
-            found = self._score(json_lines(path))
+            found = self._score(read_json_lines(path))
             self.append([r for key, r in found.items() if key not in self.responses])
         return len(self.responses) - before
 

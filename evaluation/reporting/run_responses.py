@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from conf.runs import read_json_lines
 from data.records import LETTERS
 from evaluation.metrics.results import variant_name
-from evaluation.reporting.runs import FinishedRun, json_lines, reading
+from evaluation.reporting.runs import FinishedRun, reading
 from models.student.answer_parser import Reason, parse_choice
 
 
@@ -55,7 +56,7 @@ def read_responses(run: FinishedRun) -> dict[str, Responses]:
 def _read_scores(run: FinishedRun) -> dict[str, Responses]:
     responses: dict[str, dict[str, ItemResponse]] = {}
     with reading(run.folder, "scores.jsonl"):
-        for row in json_lines(run.folder / "scores.jsonl"):
+        for row in read_json_lines(run.folder / "scores.jsonl"):
             scores = dict(zip(LETTERS, row["scores"], strict=True))
             responses.setdefault(row["by"], {})[row["item_id"]] = nearest_candidates(scores)
     return responses
@@ -75,7 +76,7 @@ def _read_texts(run: FinishedRun) -> dict[str, Responses]:
         variants = {key: variant_name(mode, control) for mode, control, key in run.report["asked"]}
     responses: dict[str, dict[str, ItemResponse]] = {v: {} for v in variants.values()}
     with reading(run.folder, "answers.jsonl"):
-        for row in json_lines(run.folder / "answers.jsonl"):
+        for row in read_json_lines(run.folder / "answers.jsonl"):
             if "text" in row and row["key"] in variants:
                 response = parse_response(str(row["text"]), bool(row["cut"]))
                 responses[variants[row["key"]]][row["item_id"]] = response

@@ -150,15 +150,3 @@ def reading(folder: Path, file: str = "report.json", remedy: str = "") -> Iterat
             "run out with runs=[...]",
             code="damaged-file",
         ) from error
-
-
-def json_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """The objects in a file of JSON lines; torn lines are skipped."""
-    with open(path, encoding="utf-8", errors="replace") as file:
-        for line in file:
-            try:
-                row = json.loads(line)
-            except ValueError:
-                continue
-            if isinstance(row, dict):
-                yield row

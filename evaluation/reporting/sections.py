@@ -10,6 +10,7 @@ from functools import cached_property, partial
 from typing import Any
 
 from conf.multirun.table import AT_START_SUFFIX
+from conf.runs import read_json_lines
 from evaluation.metrics.calibration import Calibration, PositionBias
 from evaluation.metrics.intervals import Interval
 from evaluation.metrics.results import RetrieverDifference, from_json
@@ -29,7 +30,6 @@ from evaluation.reporting.runs import (
     STUDY_KINDS,
     TRAINING_KINDS,
     FinishedRun,
-    json_lines,
     reading,
 )
 from evaluation.reporting.summary_tables import overall_table, summary_table
@@ -291,7 +291,7 @@ def training(runs: Sequence[FinishedRun]) -> Section:
             if name + AT_START_SUFFIX in metrics
         ]  # fmt: skip
         journal = run.folder / "metrics.jsonl"
-        if journal.exists() and (records := [*json_lines(journal)]):
+        if journal.exists() and (records := [*read_json_lines(journal)]):
             name = f"training-{run.title.replace('/', '-')}"
             section.figures.append(Figure(name, f"Training of {run.title}.", plot_curves, records))
     if any(groups.values()):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 
 import numpy as np
@@ -51,11 +50,3 @@ def choose_letters(scores: np.ndarray) -> list[str | None]:
 def is_best(scores: np.ndarray) -> np.ndarray:
     """Return which candidates (items, candidates) have their item's highest score."""
     return scores == scores.max(axis=1, keepdims=True)
-
-
-def format_scores(name: str, items: Sequence[SelectionItem], scores: np.ndarray) -> list[str]:
-    """Return the scores (items, candidates) of the embedder `name` as one JSON line per item."""
-    return [
-        json.dumps({"by": name, "item_id": item.item_id, "scores": row})
-        for item, row in zip(items, scores.tolist(), strict=True)
-    ]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from conf.runs import write_text
+from conf.runs import write_json_lines, write_text
 from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
@@ -52,7 +52,7 @@ def write_ranks(
 
     A count is null if the target was not found.
     """
-    lines = []
+    rows = []
     for name, of_retriever in ranks.items():
         for k, query in enumerate(queries):
             found = of_retriever.found[:, k]
@@ -60,9 +60,9 @@ def write_ranks(
                 key: [int(n) if hit else None for n, hit in zip(of[:, k], found, strict=True)]
                 for key, of in (("before", of_retriever.greater), ("tied", of_retriever.tied))
             }
-            row = {"by": name, "query_id": query.query_id, "widths": of_retriever.widths, **counts}
-            lines.append(json.dumps(row))
-    write_text(folder / "ranks.jsonl", "".join(f"{line}\n" for line in lines))
+            about = {"by": name, "query_id": query.query_id, "widths": of_retriever.widths}
+            rows.append({**about, **counts})
+    write_json_lines(folder / "ranks.jsonl", rows)
 
 
 def write_report(

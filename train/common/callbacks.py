@@ -10,7 +10,7 @@ from transformers import ProgressCallback, TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.errors import UserError
-from conf.runs import write_text
+from conf.runs import write_json_lines
 from train.common.curves import plot_curves
 from train.common.journal import ANSWERS, CURVES, JOURNAL, read_journal, read_lines
 
@@ -36,7 +36,7 @@ class JournalCallback(TrainerCallback):
         for path in (self._path, self._path.with_name(ANSWERS)):
             kept = [r for r in read_lines(path) if resumed and r["step"] <= state.global_step]
             if kept or path.exists():
-                write_text(path, "".join(json.dumps(r) + "\n" for r in kept))
+                write_json_lines(path, kept)
 
     def on_log(self, args, state: TrainerState, control: TrainerControl, logs=None, **_) -> None:
         values = {k: v for k, v in (logs or {}).items() if not k.endswith(NOT_REPRODUCIBLE)}

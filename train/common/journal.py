@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from conf.multirun.table import AT_START_SUFFIX
+from conf.runs import read_json_lines
 
 JOURNAL = "metrics.jsonl"
 ANSWERS = "samples.jsonl"
@@ -23,17 +23,8 @@ def read_journal(folder: Path) -> list[dict[str, Any]]:
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
     """Return the JSON lines of a file that have a step."""
-    if not path.exists():
-        return []
-    records = []
-    for line in path.read_text(errors="replace").splitlines():
-        try:
-            record = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(record, dict) and "step" in record:
-            records.append(record)
-    return records
+    records = read_json_lines(path) if path.exists() else ()
+    return [record for record in records if "step" in record]
 
 
 def run_metrics(folder: Path, best_step: int | None = None) -> dict[str, float]:
