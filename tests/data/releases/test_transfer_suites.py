@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 from collections import Counter
 from dataclasses import replace
-from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -70,10 +69,10 @@ SCENES = {
 def items_of(
     suite: str, family: str, subtype: str, scenes: dict[str, Scene]
 ) -> list[SelectionItem]:
-    make_item = partial(TRANSFER_SUITES[suite][family].make_item, subtype)
+    recipe = TRANSFER_SUITES[suite][family]
     scene_ids = {"train": [], "test": list(scenes)}
     cell = CellInputs(scene_ids, scenes.__getitem__, Quota(0, 24), seed=0, least=LEAST)
-    return fill_quota(subtype, make_item, cell)[0]
+    return fill_quota(subtype, recipe.timings, recipe.make_item, cell)[0]
 
 
 CELLS = [
