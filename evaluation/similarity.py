@@ -42,10 +42,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         log.info("scoring %s items with %s", f"{len(items):,}", name)
         scores = nearest_candidate.score_candidates(items, queries, embeddings, preset)
         credits = nearest_candidate.credit_choices(scores, [item.answer for item in items])
-        score_rows += [
-            {"by": name, "item_id": item.item_id, "scores": row}
-            for item, row in zip(items, scores.tolist(), strict=True)
-        ]
+        score_rows += nearest_candidate.score_rows(name, items, scores)
         letters = nearest_candidate.choose_letters(scores)
         choices.append(Choices(name, SIMILARITY, None, credits, letters))
 

@@ -50,3 +50,11 @@ def choose_letters(scores: np.ndarray) -> list[str | None]:
 def is_best(scores: np.ndarray) -> np.ndarray:
     """Return which candidates (items, candidates) have their item's highest score."""
     return scores == scores.max(axis=1, keepdims=True)
+
+
+def score_rows(name: str, items: Sequence[SelectionItem], scores: np.ndarray) -> list[dict]:
+    """Return the rows of scores.jsonl for the scores (items, candidates) of the embedder `name`."""
+    return [
+        {"by": name, "item_id": item.item_id, "scores": row}
+        for item, row in zip(items, scores.tolist(), strict=True)
+    ]

@@ -12,6 +12,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from conf.entry import Run
+from conf.runs import write_json_lines
 from conf.schema import (
     ContrastiveCommand,
     ReportCommand,
@@ -127,16 +128,16 @@ def similarity_run(
     scores = {f"untrained {name}": np.tile(np.float32(untrained), (len(items), 1))}
     if model is not None:
         scores = {model: np.eye(4, dtype=np.float32)[answers], **scores}
-    choices, lines = [], []
+    choices, rows = [], []
     for title, of in scores.items():
         credits = nearest_candidate.credit_choices(of, answers)
         letters = nearest_candidate.choose_letters(of)
         choices.append(Choices(title, SIMILARITY, None, credits, letters))
-        lines += nearest_candidate.format_scores(title, items, of)
+        rows += nearest_candidate.score_rows(title, items, of)
     folder = root / "similarity" / (model or name)
     finish(folder, settings)
     write_report(choices, items, store.name, 0, folder, build=store.identity)
-    (folder / "scores.jsonl").write_text("".join(f"{line}\n" for line in lines))
+    write_json_lines(folder / "scores.jsonl", rows)
     return folder
 
 
