@@ -149,7 +149,7 @@ def print_ranks(ranks: Ranks) -> None:
     """Print the peak memory, and how often the target is first (random ranks: almost never)."""
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
     for k, width in enumerate(ranks.widths):
-        first = (ranks.found[k] & (ranks.greater[k] == 0)).mean()
+        first = (ranks.found & (ranks.greater[k] == 0)).mean()
         print(f"  width {width}: target first {first:.1%}, tied {(ranks.tied[k] > 0).mean():.1%}")
 
 

@@ -92,7 +92,8 @@ class RetrievalResult:
     Attributes:
         width: Embedding width; None for a pipeline without widths.
         builder: The queries' builder; None for all queries.
-        bytes, seconds: Cost of the search, as in `evaluation.retrieval.exact_search.Ranks`.
+        bytes: Size of the searched vectors at this width.
+        seconds: Time to rank for all queries, at all widths together.
     """
 
     benchmark: str
@@ -186,7 +187,7 @@ def retrieval_results(
             per_query = _query_metrics(ranks, k, indices)
             measures = [_measure(measure, per_query[measure], scenes) for measure in MEASURES]
             sizes = (len(indices), ranks.frames)
-            cost = (ranks.bytes and ranks.bytes[k], ranks.seconds and ranks.seconds[k])
+            cost = (ranks.vectors * width * np.dtype(np.float32).itemsize, ranks.seconds)
             results.append(
                 RetrievalResult(benchmark, name, width, builder, *measures, *sizes, *cost)
             )
@@ -223,7 +224,7 @@ def compare_retrievers(
 
 def _query_metrics(ranks: Ranks, k: int, indices: np.ndarray | slice) -> dict[str, np.ndarray]:
     """Return the measures of some queries at the k-th width."""
-    counts = (ranks.greater[k, indices], ranks.tied[k, indices], ranks.found[k, indices])
+    counts = (ranks.greater[k, indices], ranks.tied[k, indices], ranks.found[indices])
     return query_metrics(*counts, ranks.frames, RECALLS)
 
 
@@ -245,6 +246,6 @@ def recall_curve(name: str, ranks: Ranks) -> dict[str, Any]:
     """Return recall over k at the widest width: `name`, `ks` up to the size of the database, and
     `recalls`."""
     ks = sorted({round(k) for k in np.geomspace(1, ranks.frames, 60)})
-    counts = ranks.greater[0], ranks.tied[0], ranks.found[0]
+    counts = ranks.greater[0], ranks.tied[0], ranks.found
     recalls = [float(expected_hits(*counts, k).mean()) for k in ks]
     return {"name": name, "ks": ks, "recalls": recalls}

@@ -15,11 +15,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from data.parallel import batched
 from evaluation.metrics.ranking import count_above_and_equal
 
 GRID = 2.0**26
 """Steps of a unit vector's entries."""
-FP32 = np.dtype(np.float32).itemsize
 QUERIES, FRAMES = 256, 1024
 """Size of a block: its scores stay in a core's cache while they are counted."""
 
@@ -32,9 +32,9 @@ class Ranks:
         widths: Widest first.
         greater, tied: (widths, queries) frames that score above the target, and other frames that
             score exactly as it does.
-        found: (widths, queries) False for a query that cannot be ranked: a miss.
+        found: (queries,) False for a query that cannot be ranked: a miss.
         frames: Size of the database.
-        bytes: Size of the database's vectors at each width.
+        vectors: Vectors that were searched; a multi-vector retriever has several per frame.
         seconds: Time to rank for all queries, at all widths together.
     """
 
@@ -43,8 +43,18 @@ class Ranks:
     tied: np.ndarray
     found: np.ndarray
     frames: int
-    bytes: tuple[int, ...] | None = None
-    seconds: tuple[float, ...] | None = None
+    vectors: int
+    seconds: float
+
+    @classmethod
+    def from_counts(
+        cls, widths: Sequence[int], counts: np.ndarray, frames: int, vectors: int, began: float
+    ) -> Ranks:
+        """Build the ranks from the counts (2, widths, queries) of the frames above each target, and
+        of those with its score, which include the target."""
+        (greater, equal), found = counts, np.ones(counts.shape[2], bool)
+        seconds = time.perf_counter() - began
+        return cls(tuple(widths), greater, equal - 1, found, frames, vectors, seconds)
 
 
 class GridEmbeddings:
@@ -139,21 +149,11 @@ def exact_ranks(
     targets_of = list(pair_scores(grid, GridEmbeddings(targets, widths)))
     counts = np.zeros((2, len(widths), len(queries)), np.int64)
     frames = 0
-    for block in blocks(database, widths):
+    blocks = (rows for part in database for rows in batched(part, FRAMES))
+    for block in (GridEmbeddings(rows, widths) for rows in blocks):
         frames += len(block)
         for start in range(0, len(queries), QUERIES):
             some = slice(start, start + QUERIES)
             for k, scores in enumerate(block_scores(grid[some], block)):
                 counts[:, k, some] += count_above_and_equal(scores, targets_of[k][some])
-    greater, equal = counts[:, ::-1]
-    # The target itself is among the equal ones.
-    found = np.ones(greater.shape, bool)
-    sizes = tuple(frames * width * FP32 for width in widths)
-    seconds = (time.perf_counter() - began,) * len(widths)
-    return Ranks(tuple(widths), greater, equal - 1, found, frames, sizes, seconds)
-
-
-def blocks(database: Iterable[np.ndarray], widths: Sequence[int]) -> Iterator[GridEmbeddings]:
-    for part in database:
-        for start in range(0, len(part), FRAMES):
-            yield GridEmbeddings(part[start : start + FRAMES], widths)
+    return Ranks.from_counts(widths, counts[:, ::-1], frames, frames, began)

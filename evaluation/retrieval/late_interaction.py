@@ -7,13 +7,14 @@ the sum, over the query's vectors, of its maximum cosine with one of the frame's
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import numpy as np
 import torch
 
+from data.parallel import batched
 from evaluation.metrics.ranking import count_above_and_equal
-from evaluation.retrieval.exact_search import FP32, Ranks
+from evaluation.retrieval.exact_search import Ranks
 
 GRID = 2.0**20
 """Steps of a unit vector's entries. In this unit the product of two vectors is an integer of up to
@@ -40,7 +41,13 @@ def late_ranks(
     target_scores = pair_scores(queries, targets, width)
     counts = np.zeros((2, 1, len(queries)), np.int64)
     frames = vectors = 0
-    for rows in blocks(database, width):
+    # The number of vectors per frame may differ between parts.
+    blocks = (
+        rows
+        for part in database
+        for rows in batched(part, max(1, VECTORS // (part.shape[1] // width)))
+    )
+    for rows in blocks:
         frames += len(rows)
         vectors += int(rows.reshape(-1, width).any(axis=1).sum())
         frame_vectors = vectors_of(rows, width)
@@ -49,11 +56,7 @@ def late_ranks(
             some = slice(start, start + step)
             scores = block_scores(to_grid(queries[some], width), frame_vectors)
             counts[:, 0, some] += count_above_and_equal(scores, target_scores[some])
-    greater, equal = counts
-    # The target itself is among the equal ones.
-    found = np.ones(greater.shape, bool)
-    size, seconds = vectors * width * FP32, time.perf_counter() - began
-    return Ranks((width,), greater, equal - 1, found, frames, (size,), (seconds,))
+    return Ranks.from_counts([width], counts, frames, vectors, began)
 
 
 def pair_scores(queries: np.ndarray, frames: np.ndarray, width: int) -> np.ndarray:
@@ -68,13 +71,6 @@ def block_scores(queries: torch.Tensor, frames: torch.Tensor) -> np.ndarray:
     best = products.unflatten(1, frames.shape[:2]).amax(dim=-1)
     total = best.unflatten(0, queries.shape[:2]).sum(dim=1)
     return (total / GRID**2).float().cpu().numpy()
-
-
-def blocks(database: Iterable[np.ndarray], width: int) -> Iterator[np.ndarray]:
-    for part in database:
-        step = max(1, VECTORS // (part.shape[1] // width))
-        for start in range(0, len(part), step):
-            yield part[start : start + step]
 
 
 def vectors_of(rows: np.ndarray, width: int) -> torch.Tensor:

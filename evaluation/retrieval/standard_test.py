@@ -48,20 +48,16 @@ def rank_targets(
 def write_ranks(
     folder: Path, ranks: Mapping[str, Ranks], queries: Sequence[RetrievalQuery]
 ) -> None:
-    """Write ranks.jsonl: by retriever and query, the counts `before` and `tied` at each width.
-
-    A count is null if the target was not found.
-    """
+    """Write ranks.jsonl: for each retriever and query, the frames `before` the target and the other
+    frames `tied` with it, at each width; null for a miss."""
     rows = []
     for name, of_retriever in ranks.items():
         for k, query in enumerate(queries):
-            found = of_retriever.found[:, k]
-            counts = {
-                key: [int(n) if hit else None for n, hit in zip(of[:, k], found, strict=True)]
-                for key, of in (("before", of_retriever.greater), ("tied", of_retriever.tied))
-            }
-            about = {"by": name, "query_id": query.query_id, "widths": of_retriever.widths}
-            rows.append({**about, **counts})
+            row = {"by": name, "query_id": query.query_id, "widths": of_retriever.widths}
+            for key, of in (("before", of_retriever.greater), ("tied", of_retriever.tied)):
+                missing = [None] * len(of_retriever.widths)
+                row[key] = of[:, k].tolist() if of_retriever.found[k] else missing
+            rows.append(row)
     write_json_lines(folder / "ranks.jsonl", rows)
 
 

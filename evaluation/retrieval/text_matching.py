@@ -187,19 +187,9 @@ def rank_by_text(
         embeddings = matcher.embed_frames(database)
         target_rows, parts = embeddings.rows(targets), embeddings.parts(names)
     ranks = rank_targets(matcher.preset, query_rows, target_rows, parts)
-    return add_misses(ranks, np.array(valid), len(names))
-
-
-def add_misses(ranks: Ranks, valid: np.ndarray, frames: int) -> Ranks:
-    """Extend the ranks of the `valid` queries to all queries, with misses among `frames`."""
-
-    def extend(counts: np.ndarray) -> np.ndarray:
-        extended = np.zeros((len(counts), len(valid)), counts.dtype)
-        extended[:, valid] = counts
-        return extended
-
-    counts = {name: extend(getattr(ranks, name)) for name in ("greater", "tied", "found")}
-    return replace(ranks, frames=frames, **counts)
+    greater, tied = np.zeros((2, len(ranks.widths), len(queries)), np.int64)
+    greater[:, valid], tied[:, valid] = ranks.greater, ranks.tied
+    return replace(ranks, greater=greater, tied=tied, found=np.array(valid), frames=len(names))
 
 
 def matched_texts(
@@ -209,9 +199,8 @@ def matched_texts(
 
     A miss has the database's size as its rank.
     """
-    counts = (ranks.greater[0], ranks.tied[0], ranks.found[0])
-    places = query_metrics(*counts, ranks.frames, ())["median_rank"]
+    metrics = query_metrics(ranks.greater[0], ranks.tied[0], ranks.found, ranks.frames, ())
     return [
         {"query_id": q.query_id, "route": route, "text": texts[q.name], "rank": float(place)}
-        for q, place in zip(queries, places, strict=True)
+        for q, place in zip(queries, metrics["median_rank"], strict=True)
     ]

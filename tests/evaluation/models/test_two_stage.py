@@ -112,11 +112,11 @@ def test_texts_rank_by_their_scores_and_a_missing_text_is_a_miss(rank, store, ma
     assert row.median_rank.value == pytest.approx(expected["median_rank"], abs=1)
 
     missing = rank("predict_image", ["", *texts[1:-1], ""])
-    assert missing.found.tolist() == [[False, *[True] * (len(texts) - 2), False]] * 2
+    assert missing.found.tolist() == [False, *[True] * (len(texts) - 2), False]
     assert (missing.greater[:, 1:-1] == found.greater[:, 1:-1]).all()
     row = retrieval_results("micro", "x", missing, queries, 0)[0]
     assert (row.queries, row.frames) == (len(queries), len(database))
-    measures = query_metrics(found.greater[0], found.tied[0], found.found[0], len(database), [1])
+    measures = query_metrics(found.greater[0], found.tied[0], found.found, len(database), [1])
     assert row.mrr.value == pytest.approx(measures["mrr"][1:-1].sum() / len(queries))
     with raises_user_error("no-texts", contains="predict -> image"):
         rank("predict_image", [""] * len(queries))
@@ -155,7 +155,7 @@ def test_captions_match_by_their_words(rank, store) -> None:
     first = captions.index(texts[0])
     captions[first] = ""
     missing = rank("predict_caption", texts, captions)
-    assert missing.found[0].tolist() == [text != texts[0] for text in texts]
+    assert missing.found.tolist() == [text != texts[0] for text in texts]
     assert missing.frames == len(database)
 
 

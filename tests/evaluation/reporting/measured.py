@@ -152,9 +152,8 @@ def retrieve_run(
     rows, curves, found = [], [], {}
     for title in (name, "untrained small"):
         greater = rng.integers(frames, size=(2, len(queries)))
-        every = np.ones(greater.shape, bool)
-        sizes = ((frames * 256, frames * 128), (0.5, 0.5))
-        ranks = Ranks((64, 32), greater, np.zeros_like(greater), every, frames, *sizes)
+        every = np.ones(len(queries), bool)
+        ranks = Ranks((64, 32), greater, np.zeros_like(greater), every, frames, frames, 0.5)
         found[title] = ranks
         rows += retrieval_results(store.name, title, ranks, queries, 0)
         curves.append(recall_curve(title, ranks))
