@@ -3,36 +3,25 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 from conf.entry import Run, command
-from conf.schema import ContrastiveCommand, RetrieveCommand
+from conf.schema import RetrieveCommand
 
 log = logging.getLogger(__name__)
 
 
 @command("evaluation.retrieve", RetrieveCommand)
 def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
-    from models.trained_runs import resolve_model
-
-    folder, trained = resolve_model(
-        cfg, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides
-    )
-    preset = trained.retriever
-
-    from data.build import ensure_benchmark
-
-    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
-
-    from evaluation.embedders.base import open_embedders
+    from evaluation.embedders.base import open_retriever
     from evaluation.metrics import results
     from evaluation.reporting import tables
     from evaluation.retrieval import standard_test
 
+    preset, store, embedders = open_retriever(cfg, run)
     queries, database = standard_test.load_standard_test(store)
     names = [f.name for f in database]
     rows, curves, ranks = [], [], {}
-    for embedder in open_embedders(folder, trained, store, run.folder, cfg.batch):
+    for embedder in embedders:
         query_embeddings = embedder.embed_queries(queries)
         embeddings = embedder.embed_frames(database)
         name = embedder.name

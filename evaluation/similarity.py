@@ -3,39 +3,28 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 from conf.entry import Run, command
 from conf.runs import write_json_lines
-from conf.schema import ContrastiveCommand, SimilarityCommand
+from conf.schema import SimilarityCommand
 
 log = logging.getLogger(__name__)
 
 
 @command("evaluation.similarity", SimilarityCommand)
 def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
-    from models.trained_runs import resolve_model
-
-    folder, trained = resolve_model(
-        cfg, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides
-    )
-    preset = trained.retriever
-
-    from data.build import ensure_benchmark
-
-    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
-
     from data.records import FrameRef
-    from evaluation.embedders.base import open_embedders
+    from evaluation.embedders.base import open_retriever
     from evaluation.metrics.results import SIMILARITY
     from evaluation.reporting.selection_report import Choices, write_report
     from evaluation.retrieval import nearest_candidate
     from evaluation.select import select_items
 
+    preset, store, embedders = open_retriever(cfg, run)
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     candidates = {FrameRef(c.scene_id, c.frame) for item in items for c in item.candidates}
     choices, score_rows = [], []
-    for embedder in open_embedders(folder, trained, store, run.folder, cfg.batch):
+    for embedder in embedders:
         name = embedder.name
         queries = embedder.embed_queries(items)
         embeddings = embedder.embed_frames(candidates)

@@ -15,8 +15,10 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from conf.runs import Run
 from conf.schema import ContrastiveCommand, MatcherConfig, RetrieverConfig
 from conf.schema.evaluation import EmbeddingCommand
+from data.build import ensure_benchmark
 from data.records import FrameRef, RetrievalQuery, SelectionItem
 from data.render.frame_cache import FrameReader
 from data.store import Store
@@ -32,7 +34,7 @@ from models.fingerprints import (
 from models.precision import resolve_precision
 from models.resolved import check_base
 from models.retriever.checks import check_pooling, check_widths
-from models.trained_runs import product_folder, run_title
+from models.trained_runs import product_folder, resolve_model, run_title
 
 EMBEDDINGS = "embeddings"
 """Their folder in a store."""
@@ -154,6 +156,22 @@ class Embedder:
             "benchmark": self.store.identity,
             "made by": {package: version(package) for package in PACKAGES},
         }
+
+
+def open_retriever(
+    cfg: EmbeddingCommand, run: Run
+) -> tuple[RetrieverConfig, Store, Iterator[Embedder]]:
+    """Return the retriever's preset, the benchmark's store and the embedders of `open_embedders`.
+
+    Raises:
+        UserError: The model cannot be used on this benchmark, or the benchmark cannot be built.
+    """
+    folder, trained = resolve_model(
+        cfg, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides
+    )
+    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    embedders = open_embedders(folder, trained, store, run.folder, cfg.batch)
+    return trained.retriever, store, embedders
 
 
 def open_embedders(

@@ -50,7 +50,7 @@ class EmbeddingCache:
         self.kind, self._about = kind, json.dumps(about)
         self.path = root / f"{kind}-{settings_key(about)}.sqlite"
         root.mkdir(parents=True, exist_ok=True)
-        with self._damage_named():
+        with self._explain_damage():
             self._db = sqlite3.connect(self.path, timeout=60)
             self._db.executescript(SCHEMA)
 
@@ -66,12 +66,11 @@ class EmbeddingCache:
         Raises:
             UserError: An embedding is non-finite, or the file is damaged.
         """
-        with self._damage_named():
-            present = {name for (name,) in self._db.execute("SELECT name FROM embedding")}
+        present = {name for (name,) in self._query("SELECT name FROM embedding")}
         missing = [name for name in inputs if name not in present]
         if not missing:
             return
-        with self._damage_named(), self._db:
+        with self._explain_damage(), self._db:
             self._db.execute("INSERT OR IGNORE INTO about VALUES (?)", [self._about])
         done = len(inputs) - len(missing)
         with tqdm(total=len(inputs), initial=done, desc="embedding", unit=self.kind) as bar:
@@ -79,7 +78,7 @@ class EmbeddingCache:
                 rows = embed([inputs[name] for name in names])
                 self._check_finite(rows, names)
                 pairs = zip(names, map(np.ndarray.tobytes, rows.astype(np.float32)), strict=True)
-                with self._damage_named(), self._db:
+                with self._explain_damage(), self._db:
                     self._db.executemany("INSERT OR REPLACE INTO embedding VALUES (?, ?)", pairs)
                 bar.update(len(names))
 
@@ -87,7 +86,7 @@ class EmbeddingCache:
         """Yield the embeddings of `names`, some at a time and in any order."""
         wanted, width = set(names), self.width
         bar = tqdm(total=len(wanted), desc="ranking", unit=self.kind, leave=False)
-        with self._damage_named(), bar:
+        with self._explain_damage(), bar:
             cursor = self._db.execute("SELECT name, entries FROM embedding")
             while rows := cursor.fetchmany(PART_ROWS):
                 if entries := [row for name, row in rows if name in wanted]:
@@ -98,8 +97,7 @@ class EmbeddingCache:
         """Return (names, entries) in the order of `names`, which may repeat."""
         unique = list(dict.fromkeys(names))
         query = "SELECT entries FROM embedding WHERE name = ?"
-        with self._damage_named():
-            entries = [self._db.execute(query, [name]).fetchone()[0] for name in unique]
+        entries = [entries for name in unique for (entries,) in self._query(query, name)]
         rows = pad_rows([_array(e) for e in entries], self.width)
         row_of = {name: k for k, name in enumerate(unique)}
         return rows[[row_of[name] for name in names]]
@@ -107,12 +105,15 @@ class EmbeddingCache:
     @property
     def width(self) -> int:
         """Entries of the longest embedding."""
-        with self._damage_named():
-            [(size,)] = self._db.execute("SELECT max(length(entries)) FROM embedding")
+        [(size,)] = self._query("SELECT max(length(entries)) FROM embedding")
         return size // np.dtype(np.float32).itemsize
 
+    def _query(self, query: str, *values: str) -> list[tuple[Any, ...]]:
+        with self._explain_damage():
+            return self._db.execute(query, values).fetchall()
+
     @contextmanager
-    def _damage_named(self) -> Iterator[None]:
+    def _explain_damage(self) -> Iterator[None]:
         try:
             yield
         except sqlite3.DatabaseError as error:
@@ -137,8 +138,7 @@ class EmbeddingCache:
 
 def pad_rows(rows: Sequence[np.ndarray], width: int | None = None) -> np.ndarray:
     """Stack rows (entries,) of several lengths, padded with zeros to `width` or the longest."""
-    width = max(map(len, rows)) if width is None else width
-    padded = np.zeros((len(rows), width), np.float32)
+    padded = np.zeros((len(rows), width or max(map(len, rows))), np.float32)
     for target, row in zip(padded, rows, strict=True):
         target[: len(row)] = row
     return padded
