@@ -77,7 +77,8 @@ class DualEncoder:
         if self.text_tower.config.model_type.startswith("siglip"):
             fields = {"input_ids": fields["input_ids"]}
         with torch.inference_mode():
-            return unit_rows(as_array(self.text_tower.get_text_features(**fields).pooler_output))
+            features = self.text_tower.get_text_features(**fields).pooler_output
+        return unit_rows(features.float().cpu().numpy())
 
     def _embed_means(self, clips: list[np.ndarray]) -> np.ndarray:
         ends = np.cumsum([len(clip) for clip in clips])[:-1]
@@ -110,7 +111,7 @@ def image_features(
             for name, value in batch.items()
         }
         with torch.inference_mode():
-            features.append(as_array(tower.get_image_features(**batch).pooler_output))
+            features.append(tower.get_image_features(**batch).pooler_output.float().cpu().numpy())
     return np.concatenate(features)
 
 
@@ -118,10 +119,6 @@ def unit_rows(rows: np.ndarray) -> np.ndarray:
     """Normalise rows to length 1, fp32; a row of zeros stays zero."""
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     return (rows / np.where(lengths > 0, lengths, 1)).astype(np.float32)
-
-
-def as_array(features: torch.Tensor) -> np.ndarray:
-    return features.float().cpu().numpy()
 
 
 def load_dual(preset: RetrieverConfig, precision: str) -> DualEncoder:
@@ -186,13 +183,8 @@ def load_complete(
 
 
 def check_tokenizer(preset: RetrieverConfig, config: Any, tokenizer: Any) -> None:
-    """Check that a tokenizer is the model's: without its files the library builds an empty one.
-
-    A model's vocabulary may be padded with unused entries.
-
-    Raises:
-        UserError: The tokenizer's size does not match the model's vocabulary.
-    """
+    """Raise UserError if a tokenizer does not fit the model's vocabulary, which may be padded with
+    unused entries. Without its files the library builds an empty tokenizer."""
     tokens, vocabulary = len(tokenizer), config.text_config.vocab_size
     if not vocabulary / 2 < tokens <= vocabulary:
         raise UserError(
@@ -203,10 +195,7 @@ def check_tokenizer(preset: RetrieverConfig, config: Any, tokenizer: Any) -> Non
 
 
 def check_size(preset: RetrieverConfig, config: Any) -> None:
-    """
-    Raises:
-        UserError: The model's tower needs another image size than the preset's.
-    """
+    """Raise UserError if a model's tower needs another image size than the preset's."""
     size = getattr(config.vision_config, "image_size", None)
     if size is not None and size != preset.image_size:
         raise UserError(

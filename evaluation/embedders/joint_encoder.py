@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from conf.schema import RetrieverConfig
+from data.parallel import batched
 from data.records import FrameRef
 from data.render.frame_cache import FrameReader
 from evaluation.embedders.base import Encoder, Query
@@ -41,8 +42,8 @@ class JointEncoder:
         longest = max(map(len, self._model.tokenizer(texts)["input_ids"]))
         size = max(1, MAX_TOKEN_PAIRS // max(1, longest) ** 2)
         instruction = self._preset.query_instruction
-        batches = [texts[k : k + size] for k in range(0, len(texts), size)]
-        return np.concatenate([self._encode(batch, instruction, "query") for batch in batches])
+        batches = [self._encode(batch, instruction, "query") for batch in batched(texts, size)]
+        return np.concatenate(batches)
 
     def _encode(self, inputs: list[Any], prompt: str, kind: str) -> np.ndarray:
         """A row holds one vector, or an input's vectors one after the other."""

@@ -71,41 +71,12 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
         UserError: A model cannot be loaded, is of another type, is incomplete, or needs another
             number or size of frames.
     """
-    image_source = preset.image_model, "image_model"
+    video = load_tower(LanguageBindVideo, preset, precision, "model", preset.revision)
+    image = load_tower(CLIPModel, preset, precision, "image_model", preset.image_revision)
     with reading_model(preset.model):
-        video_config = read_config(preset.model, preset.revision)
-    with reading_model(*image_source):
-        image_config = read_config(preset.image_model, preset.image_revision)
-    times = getattr(video_config.vision_config, "num_frames", None)
-    if not is_video_model(video_config):
-        raise UserError(
-            f"retriever.model={preset.model} has no attention over time: set a fully fine-tuned "
-            "LanguageBind video model, such as LanguageBind/LanguageBind_Video_FT",
-            code="wrong-model-type",
-        )
-    if times != preset.frames:
-        raise UserError(
-            f"retriever.frames={preset.frames}, but {preset.model} needs clips of {times} frames: "
-            f"set retriever.frames={times}",
-            code="wrong-frame-count",
-        )
-    if is_video_model(image_config):
-        raise UserError(
-            f"retriever.image_model={preset.image_model} is a video model: set an image model of "
-            "LanguageBind, such as LanguageBind/LanguageBind_Image",
-            code="wrong-model-type",
-        )
-    check_size(preset, video_config)
-    check_size(preset, image_config)
-    with reading_model(preset.model):
-        origin = {"revision": preset.revision}
-        tokenizer = CLIPTokenizer.from_pretrained(preset.model, **origin)
-        origin["config"] = video_config
-        video = load_complete(LanguageBindVideo, preset.model, precision, **origin)
-    with reading_model(*image_source):
-        origin = {"revision": preset.image_revision, "config": image_config}
-        image = load_complete(CLIPModel, preset.image_model, precision, "image_model", **origin)
-    check_tokenizer(preset, video_config, tokenizer)
+        tokenizer = CLIPTokenizer.from_pretrained(preset.model, revision=preset.revision)
+    check_tokenizer(preset, video.config, tokenizer)
+    times = preset.frames
     size = {"height": preset.image_size, "width": preset.image_size}
     # The released models lack a processor file; their authors' transform is CLIP's.
     processor = CLIPImageProcessor(crop_size=size, size={"shortest_edge": preset.image_size})
@@ -123,11 +94,27 @@ def spread(frames: int, wanted: int) -> list[int]:
     return [int(k) for k in np.linspace(0, frames - 1, wanted).round()]
 
 
-def is_video_model(config: CLIPConfig) -> bool:
-    return getattr(config.vision_config, "add_time_attn", False)
-
-
-def read_config(source: str, revision: str | None) -> CLIPConfig:
-    # CLIPConfig.from_pretrained would warn that the file has another model type.
-    config, _ = CLIPConfig.get_config_dict(source, revision=revision)
-    return CLIPConfig.from_dict(config)
+def load_tower(
+    kind: type[CLIPModel], preset: RetrieverConfig, precision: str, key: str, revision: str | None
+) -> CLIPModel:
+    """Load the model that the setting `key` names. Errors are those of `load_languagebind`."""
+    source = getattr(preset, key)
+    with reading_model(source, key):
+        # CLIPConfig.from_pretrained would warn that the file has another model type.
+        config = CLIPConfig.from_dict(CLIPConfig.get_config_dict(source, revision=revision)[0])
+        is_video = getattr(config.vision_config, "add_time_attn", False)
+        if is_video != (kind is LanguageBindVideo):
+            example, needed = ("Image", "without") if is_video else ("Video_FT", "with")
+            raise UserError(
+                f"retriever.{key}={source} is not a LanguageBind model {needed} attention over "
+                f"time: set one, such as LanguageBind/LanguageBind_{example}",
+                code="wrong-model-type",
+            )
+        if is_video and (times := config.vision_config.num_frames) != preset.frames:
+            raise UserError(
+                f"retriever.frames={preset.frames}, but {source} needs clips of {times} frames: "
+                f"set retriever.frames={times}",
+                code="wrong-frame-count",
+            )
+        check_size(preset, config)
+        return load_complete(kind, source, precision, key, revision=revision, config=config)

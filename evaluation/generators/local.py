@@ -14,6 +14,7 @@ from transformers import ProcessorMixin
 from xgrammar.contrib.hf import LogitsProcessor
 
 from conf.schema import SelectCommand, StudentConfig, TwoStageCommand
+from data.parallel import batched
 from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
 from evaluation.generators.response_schema import schema
 from models import loading
@@ -83,8 +84,7 @@ class LocalModel:
         collator = Collator(processor, cfg.max_length, cfg.thinking)
         limit = response_token_limit(mode, cfg.max_new_tokens, cfg.thinking)
         grammar = compile_record_grammar(model, processor) if mode == "constrained" else None
-        for start in range(0, len(subjects), self._batch):
-            group = subjects[start : start + self._batch]
+        for group in batched(subjects, self._batch):
             steps = sampling_processors(cfg, [response_seed(self._seed, s, mode) for s in group])
             if grammar is not None:
                 # The grammar comes first, so that tokens are sampled from those that it allows.

@@ -35,8 +35,6 @@ from teacher.servers.server import (
 
 log = logging.getLogger(__name__)
 
-MIN_PIXELS = 1
-"""Lower bound of an image's pixels; no image is enlarged."""
 CANARY_SIZE = 64
 """Edge in px of the blank frames of a canary request."""
 
@@ -61,7 +59,21 @@ class ServedModel:
         self._server = replace(cfg.server, model=cfg.server.model or student.model)
         self.name = run_title(folder) if folder else f"{student.name} base"
         origin = served_origin(self._server)
-        self._check_adapter(folder, origin["parent"])
+        if folder is None and origin["parent"]:
+            raise UserError(
+                f"server.model={self._server.model} is an adapter over {origin['parent']}: set "
+                "model=RUN, the run that trained it, so that it gets the prompt that it was "
+                "trained on",
+                code="adapter-without-run",
+            )
+        if origin["parent"] and student.quantization == "nf4":
+            log.warning(
+                "%s serves the adapters of %s over an unquantised base, but they were trained over "
+                "NF4: its responses differ from those of the student and of its merged export "
+                "(python -m train.export)",
+                self._server.model,
+                folder,
+            )
         weights = product_folder(folder, "student") if folder else None
         source = origin["parent"] or origin["root"]
         if source is None or not Path(source).is_dir():
@@ -78,22 +90,6 @@ class ServedModel:
             "weights": weights_digest(origin["root"], origin["parent"], weights),
             "processor": processor_digest(source),
         }
-
-    def _check_adapter(self, folder: Path | None, parent: str | None) -> None:
-        if folder is None and parent:
-            raise UserError(
-                f"server.model={self._server.model} is an adapter over {parent}: set model=RUN, "
-                "the run that trained it, so that it gets the prompt that it was trained on",
-                code="adapter-without-run",
-            )
-        if folder is not None and parent and self._student.quantization == "nf4":
-            log.warning(
-                "%s serves the adapters of %s over an unquantised base, but they were trained over "
-                "NF4: its responses differ from those of the student and of its merged export "
-                "(python -m train.export)",
-                self._server.model,
-                folder,
-            )
 
     def respond(
         self, mode: str, sample_of: SampleOf, subjects: list[Subject], save: SaveResponses
@@ -175,10 +171,10 @@ def request_fields(cfg: StudentConfig, mode: str, clip: Clip | None) -> RequestF
 
     Frames are neither sampled again nor resized, as with a local model.
     """
-    area = cfg.image_size**2
-    # Twice the actual pixels, as with a local model: no budget shrinks a frame.
-    images = {"size": {"shortest_edge": MIN_PIXELS, "longest_edge": 2 * area}}
-    videos = {"size": {"shortest_edge": MIN_PIXELS, "longest_edge": 2 * cfg.frames * area}}
+    # Bounds of the pixels, as with a local model, which neither enlarge nor shrink a frame.
+    most = 2 * cfg.image_size**2
+    images = {"size": {"shortest_edge": 1, "longest_edge": most}}
+    videos = {"size": {"shortest_edge": 1, "longest_edge": most * cfg.frames}}
     extra: dict[str, Any] = {
         "chat_template_kwargs": {"enable_thinking": cfg.thinking},
         "mm_processor_kwargs": {
