@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from data.records import FAMILIES, LETTERS
+from data.records import LETTERS
 from evaluation.metrics.accuracy import accuracy_by_family
 
 
-def summary(votes: pd.DataFrame, items: int, annotators: Sequence[str]) -> dict[str, Any]:
-    """The report of a study, ready for JSON; undefined values are None.
+def summarize_votes(votes: pd.DataFrame, items: int, annotators: Sequence[str]) -> dict[str, Any]:
+    """Return the report of a study, ready for JSON; undefined values are None.
 
     Args:
         votes: As `storage.read_votes` returns them.
@@ -32,13 +32,18 @@ def summary(votes: pd.DataFrame, items: int, annotators: Sequence[str]) -> dict[
         `fleiss_kappa` and its `items`, which all annotators answered; `krippendorff_alpha` and its
         `items`, which have two votes or more; and median `seconds` by family.
     """
-    counts = count_votes(votes)
+    # Votes (items, 4) for each candidate.
+    counts = pd.crosstab(votes.item_id, votes.choice)
+    counts = counts.reindex(columns=range(len(LETTERS)), fill_value=0)
     depth = counts.sum(axis=1)
     active = [name for name in annotators if name in set(votes.annotator)]
     complete = counts[(depth == len(active)) & (depth > 1)]
     several = counts[depth > 1]
     items_by_depth = {0: items - len(counts), **depth.value_counts()}
-    accuracy = {name: _accuracy(of) for name, of in votes.groupby("annotator")}
+    accuracy = {
+        name: asdict(accuracy_by_family(list(of.family), list(of.right)))
+        for name, of in votes.groupby("annotator")
+    }
     return {
         "items": items,
         "judgments": len(votes),
@@ -52,31 +57,22 @@ def summary(votes: pd.DataFrame, items: int, annotators: Sequence[str]) -> dict[
     }
 
 
-def count_votes(votes: pd.DataFrame) -> pd.DataFrame:
-    """(items, 4) votes for each candidate."""
-    counts = pd.crosstab(votes.item_id, votes.choice)
-    return counts.reindex(columns=range(len(LETTERS)), fill_value=0)
-
-
 def majority(counts: pd.DataFrame) -> pd.Series:
-    """The choice of more than half of each item's votes; NaN for an item without one."""
+    """Return the choice of more than half of each item's votes; NaN for an item without one."""
     return counts.idxmax(axis=1).where(2 * counts.max(axis=1) > counts.sum(axis=1))
 
 
 def fleiss_kappa(counts: pd.DataFrame) -> float | None:
-    """Fleiss' kappa of items with equal numbers of votes, two or more; None where it is undefined:
-    no items, or all votes for one candidate index."""
+    """Return Fleiss' kappa of items with the same number of votes, two or more; None if there are
+    no items, or all votes are for one candidate index."""
     from statsmodels.stats.inter_rater import fleiss_kappa as kappa
 
     return None if _is_undefined(counts) else float(kappa(counts.to_numpy()))
 
 
 def krippendorff_alpha(counts: pd.DataFrame) -> float | None:
-    """Krippendorff's alpha for nominal votes: one minus the disagreement within items over the
-    disagreement between any two votes. None where it is undefined, as for Fleiss' kappa.
-
-    Args:
-        counts: Items with two votes or more, which may differ in their number of votes.
+    """Return Krippendorff's alpha for nominal votes: one minus the disagreement within items over
+    the disagreement between any two votes. Items have two votes or more; None as for Fleiss' kappa.
     """
     if _is_undefined(counts):
         return None
@@ -90,22 +86,11 @@ def krippendorff_alpha(counts: pd.DataFrame) -> float | None:
 
 
 def median_seconds(votes: pd.DataFrame) -> dict[str, dict[str, float | int]]:
-    """Median decision times by family and clock, over votes whose page was loaded once: the total
-    viewing time of the others is unknown."""
-    by_family = dict(list(votes[votes.loads == 1].groupby("family")))
-    return {
-        family: {
-            "server": float(by_family[family].seconds.median()),
-            "client": float(by_family[family].client_seconds.median()),
-            "votes": len(by_family[family]),
-        }
-        for family in FAMILIES
-        if family in by_family
-    }
-
-
-def _accuracy(votes: pd.DataFrame) -> dict[str, Any]:
-    return asdict(accuracy_by_family(list(votes.family), list(votes.right)))
+    """Return median decision times by family and clock, over votes whose page was loaded once: the
+    total viewing time of the others is unknown."""
+    clocks = {"server": ("seconds", "median"), "client": ("client_seconds", "median")}
+    once = votes[votes.loads == 1].groupby("family")
+    return once.agg(**clocks, votes=("seconds", "size")).to_dict("index")
 
 
 def _majority_accuracy(votes: pd.DataFrame, counts: pd.DataFrame) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The order of the items for each annotator, and the letters at which their candidates stand."""
+"""The order of the items for each annotator, and the letters of their candidates."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from data.records import LETTERS, SelectionItem
 from data.tracks.quota import named_rng
 
 Order = tuple[int, ...]
-"""The candidates' indices by the letter at which they stand."""
+"""The index of the candidate at each letter."""
 
 
 @dataclass(frozen=True)
 class Assignment:
-    """One item for one annotator. Of two items that may come next, the lower `rank` comes first."""
+    """An item of an annotator; among items that may come next, the lowest `rank` comes first."""
 
     annotator: str
     item_id: str
@@ -28,7 +28,7 @@ class Assignment:
 def assign_items(
     items: Sequence[SelectionItem], annotators: Sequence[str], seed: int
 ) -> list[Assignment]:
-    """Every annotator's order of items and candidates, by a cyclic Latin square.
+    """Return every annotator's order of items and candidates, by a cyclic Latin square.
 
     The correct answers of an annotator are equally frequent at each letter, within one, over all
     items and within each family. Each candidate of an item moves by one letter from one annotator
@@ -44,23 +44,20 @@ def assign_items(
             orders = _balanced_orders(items, rng)
         ranks = named_rng(seed, "study", digest, annotator).permutation(len(items))
         for rank, item in zip(ranks, items, strict=True):
-            order = _rotate(orders[item.item_id], turn)
+            order = tuple(np.roll(orders[item.item_id], turn).tolist())
             assignments.append(Assignment(annotator, item.item_id, int(rank), order))
     return assignments
 
 
-def _balanced_orders(items: Sequence[SelectionItem], rng: np.random.Generator) -> dict[str, Order]:
-    """A random order of each item's candidates by item, in which the letter of the correct answer
-    advances by one from item to item, family after family."""
+def _balanced_orders(
+    items: Sequence[SelectionItem], rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Return a random order of each item's candidates. The letter of the correct answer advances by
+    one from item to item, family after family."""
     shuffled = [items[k] for k in rng.permutation(len(items))]
     start = int(rng.integers(len(LETTERS)))
     orders = {}
     for letter, item in enumerate(sorted(shuffled, key=lambda i: i.family), start):
-        order = tuple(map(int, rng.permutation(len(LETTERS))))
-        orders[item.item_id] = _rotate(order, letter - order.index(item.answer))
+        order = rng.permutation(len(LETTERS))
+        orders[item.item_id] = np.roll(order, letter - order.tolist().index(item.answer))
     return orders
-
-
-def _rotate(order: Order, letters: int) -> Order:
-    """The order with every candidate moved on by a number of letters, cyclically."""
-    return tuple(np.roll(order, letters).tolist())

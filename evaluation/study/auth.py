@@ -45,11 +45,8 @@ def new_token() -> str:
 
 
 def write_links(db: sqlite3.Connection, path: Path, address: str) -> dict[str, str]:
-    """Write every annotator's unused link to a file that only its owner can read.
-
-    Returns:
-        The links by annotator.
-    """
+    """Write every annotator's unused link to a file that only its owner can read; return the links
+    by annotator."""
     rows = db.execute("SELECT name, link FROM annotator ORDER BY rowid")
     links = {row["name"]: f"{address}/link/{row['link']}" for row in rows}
     note = "# A link signs in once; a new one then replaces it, for another device of that person."
@@ -64,11 +61,8 @@ def is_unused(db: sqlite3.Connection, link: str) -> bool:
 
 
 def sign_in(db: sqlite3.Connection, link: str) -> tuple[str, str] | None:
-    """Use a link. The annotator's previous session ends.
-
-    Returns:
-        The annotator and the secret of the new session; None if the link is used or unknown.
-    """
+    """Use a link, end the annotator's previous session, and return the annotator and the secret of
+    the new session; None if the link is used or unknown."""
     session = new_token()
     with transaction(db):
         row = db.execute(
@@ -79,7 +73,7 @@ def sign_in(db: sqlite3.Connection, link: str) -> tuple[str, str] | None:
 
 
 def find_annotator(db: sqlite3.Connection, session: str) -> sqlite3.Row | None:
-    """The annotator of a session."""
+    """Return the annotator of a session, or None."""
     query = "SELECT * FROM annotator WHERE session = ?"
     return db.execute(query, (_hash(session),)).fetchone()
 
@@ -89,7 +83,7 @@ def _hash(session: str) -> str:
 
 
 def is_cross_site(headers: Headers) -> bool:
-    """Whether a browser says that a form comes from another site."""
+    """Return whether the browser sent the form from a page of another site."""
     if (site := headers.get("sec-fetch-site")) is not None:
         return site not in ("same-origin", "none")
     # Browsers omit that header on plain http, except on this machine.

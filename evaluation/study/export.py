@@ -20,7 +20,7 @@ VOTES_FILE = "votes.jsonl"
 def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
     from evaluation.reporting.tables import human_table
     from evaluation.study import storage
-    from evaluation.study.agreement import summary
+    from evaluation.study.agreement import summarize_votes
 
     studies = Path(cfg.checkpoints) / "study"
     path = studies / resolve_run_name(cfg.run, str(studies)) / storage.DATABASE
@@ -33,11 +33,11 @@ def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
     with storage.transaction(db, read_only=True):
         votes = storage.read_votes(db)
         about, items = storage.read_about(db), len(storage.item_ids(db, practice=False))
-        annotators = storage.annotator_names(db)
+        annotators = [name for (name,) in db.execute("SELECT name FROM annotator ORDER BY rowid")]
     if votes.empty:
         raise UserError(f"{path} has no votes yet", code="no-votes")
     benchmark = {"benchmark": about["benchmark"], "build": about["identity"]}
-    report = benchmark | summary(votes, items, annotators)
+    report = benchmark | summarize_votes(votes, items, annotators)
     rows = votes.to_json(orient="records", lines=True, double_precision=15)
     write_text(run.folder / VOTES_FILE, rows)
     write_text(run.folder / "report.json", json.dumps(report, indent=1))

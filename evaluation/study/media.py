@@ -32,11 +32,11 @@ class Medium:
 
 
 def encode_media(item: SelectionItem, frames: FrameReader) -> list[Medium]:
-    """An item's prefix as a video of all its frames at the scene's rate, and its candidates as
-    images of equal file size.
+    """Encode an item's prefix as a video of all its frames at the scene's rate, and its candidates
+    as images of equal file size.
 
     Raises:
-        UserError: the frames differ in size, or cannot be read.
+        UserError: The frames differ in size, or cannot be read.
     """
     prefix = frames.stack(item.scene_id, list(range(item.prefix_start, item.prefix_stop + 1)))
     candidates = [frames.array(c.scene_id, c.frame) for c in item.candidates]
@@ -62,8 +62,10 @@ def encode_media(item: SelectionItem, frames: FrameReader) -> list[Medium]:
 
 
 def encode_video(pixels: np.ndarray, fps: float) -> bytes:
-    """An mp4 (H.264) of (frames, height, width, 3) uint8 without dates or an encoder's name. The
-    codec needs even sides: an odd side repeats its last line."""
+    """Encode (frames, height, width, 3) uint8 as an mp4 (H.264) without dates or an encoder's name.
+
+    The codec needs even sides: an odd side repeats its last line.
+    """
     import av
     from av.bitstream import BitStreamFilterContext
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import logging
-import math
 import socket
 import sqlite3
 from collections.abc import Callable
@@ -46,11 +45,7 @@ REFUSALS = {
 
 
 class Pages:
-    """The endpoints over one study's database.
-
-    Args:
-        on_sign_in: Called after a link is used.
-    """
+    """The pages of one study. It calls `on_sign_in` after a link is used."""
 
     def __init__(
         self, db: sqlite3.Connection, cfg: StudyCommand, on_sign_in: Callable[[], object]
@@ -140,13 +135,13 @@ class Pages:
         return Response(medium["content"], media_type=medium["kind"])
 
     async def refuse(self, request: Request, error: Exception) -> Response:
-        """The page of a refused request; it repeats nothing of the request."""
+        """Render the page of a refused request, which repeats nothing of the request."""
         status = error.status_code if isinstance(error, HTTPException) else 500
         reason = REFUSALS.get(status, "The server failed. Try again in a moment.")
         return self._render("refusal", status, status=status, reason=reason)
 
     def _annotator(self, request: Request) -> sqlite3.Row:
-        """The annotator of the request's session. Raises HTTPException 401 without one."""
+        """Return the annotator of the request's session; raise HTTPException 401 without one."""
         annotator = auth.find_annotator(self._db, request.cookies.get(COOKIE, ""))
         if annotator is None:
             raise HTTPException(401)
@@ -160,7 +155,7 @@ class Pages:
 def build_app(
     db: sqlite3.Connection, cfg: StudyCommand, on_sign_in: Callable[[], object]
 ) -> Starlette:
-    """The study as an ASGI application."""
+    """Return the study as an ASGI application."""
     pages = Pages(db, cfg, on_sign_in)
     return Starlette(
         routes=pages.routes(),
@@ -170,7 +165,11 @@ def build_app(
 
 
 async def read_form(request: Request) -> dict[str, str]:
-    """The fields of a form. Raises HTTPException 403 for another site's, 400 for another body."""
+    """Return the fields of a form.
+
+    Raises:
+        HTTPException: 403 for a form on another site, 400 for a body that is not a form.
+    """
     if auth.is_cross_site(request.headers):
         raise HTTPException(403)
     try:
@@ -181,16 +180,16 @@ async def read_form(request: Request) -> dict[str, str]:
 
 
 def _parse_seconds(text: str) -> float | None:
-    """A plausible number of seconds, else None."""
+    """Return a plausible number of seconds, or None."""
     try:
         seconds = float(text)
     except ValueError:
         return None
-    return seconds if math.isfinite(seconds) and 0 <= seconds < MAX_SECONDS else None
+    return seconds if 0 <= seconds < MAX_SECONDS else None
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A listening socket. Raises UserError if the address is taken or not this machine's."""
+    """Open a listening socket; raise UserError if the address is in use or not this machine's."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     reasons = {
         errno.EADDRINUSE: f"port={port} is in use: stop the server there, or choose another port=",

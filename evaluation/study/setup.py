@@ -1,4 +1,4 @@
-"""Creates a study, chooses its items and encodes their media."""
+"""Create a study: choose its items and encode their media."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from evaluation.study.media import encode_media
 
 
 def create_study(cfg: StudyCommand, path: Path) -> sqlite3.Connection:
-    """A new study, still without media. Raises UserError."""
+    """Create a study without media. Raises UserError."""
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     items = choose_items(cfg, store)
     practice = sample_items(store.selection("train"), cfg.practice, cfg.seed, "practice")
@@ -39,7 +39,7 @@ def add_missing_media(cfg: StudyCommand, db: sqlite3.Connection, path: Path) -> 
     """Encode the media that the study lacks: all of them for a new study.
 
     Raises:
-        UserError: the benchmark was rebuilt, or lacks the frames.
+        UserError: The benchmark was rebuilt, or lacks the frames.
     """
     missing = storage.items_without_media(db)
     if not missing:
@@ -58,7 +58,7 @@ def add_missing_media(cfg: StudyCommand, db: sqlite3.Connection, path: Path) -> 
 
 
 def choose_items(cfg: StudyCommand, store: Store) -> list[SelectionItem]:
-    """The test items that `items` names or counts. Raises UserError."""
+    """Return the test items that `items` names or counts. Raises UserError."""
     if cfg.items.isdecimal():
         return sample_items(store.selection("test"), int(cfg.items), cfg.seed, "items")
     pool = store.selection("test") + store.selection("test", MATCHED_ANCHOR)
@@ -75,7 +75,7 @@ def choose_items(cfg: StudyCommand, store: Store) -> list[SelectionItem]:
 
 
 def check_items(cfg: StudyCommand, db: sqlite3.Connection) -> None:
-    """Raises UserError if the file `items` names other items than those of the study."""
+    """Raise UserError if the file `items` names other items than those of the study."""
     if cfg.items.isdecimal():
         return
     if read_item_ids(Path(cfg.items)) != storage.item_ids(db, practice=False):
@@ -87,10 +87,10 @@ def check_items(cfg: StudyCommand, db: sqlite3.Connection) -> None:
 
 
 def read_item_ids(path: Path) -> list[str]:
-    """The ids in a file, one a line, plain or as the item_id of a JSON object.
+    """Return the ids in a file, one per line, plain or as the item_id of a JSON object.
 
     Raises:
-        UserError: the file cannot be read, names no item, or names an item twice.
+        UserError: The file cannot be read, names no item, or names an item twice.
     """
     try:
         lines = [line.strip() for line in path.read_text("utf-8").splitlines() if line.strip()]
@@ -116,14 +116,11 @@ def read_item_ids(path: Path) -> list[str]:
 def sample_items(
     pool: Sequence[SelectionItem], count: int, seed: int, setting: str
 ) -> list[SelectionItem]:
-    """`count` items, the families in turn and the subtypes in turn within a family. Scenes repeat
-    only if there are no others: one item's images could answer another item.
-
-    Args:
-        setting: The setting that asks for the items, for the error.
+    """Sample `count` items, the families in turn and the subtypes in turn within a family. Scenes
+    repeat only if no others are left, because one item's images could answer another item.
 
     Raises:
-        UserError: the pool has fewer items.
+        UserError: The pool has fewer items than `setting`.
     """
     if count > len(pool):
         raise UserError(
@@ -148,5 +145,5 @@ def sample_items(
 
 
 def item_scenes(item: SelectionItem) -> set[str]:
-    """Every scene that an item shows a frame of."""
+    """Return the scenes whose frames an item shows."""
     return {item.scene_id, *(c.scene_id for c in item.candidates)}

@@ -62,12 +62,8 @@ def create(
     links: dict[str, str],
     assignments: Sequence[Assignment],
 ) -> sqlite3.Connection:
-    """A new study without media.
-
-    Args:
-        links: Each annotator's first link.
-        assignments: Those of the items and of the practice items.
-    """
+    """Create a study without media. `links` are those of the annotators, by name; `assignments`
+    cover the items and the practice items."""
     # SQLite gives its side files the mode of the database.
     path.touch(mode=0o600)
     path.chmod(0o600)
@@ -95,10 +91,10 @@ def create(
 
 
 def open_study(path: Path) -> sqlite3.Connection | None:
-    """The database of a study; None if there is none yet, or its creation was killed.
+    """Return the database of a study; None if there is none yet, or its creation was killed.
 
     Raises:
-        UserError: it is damaged or of another version.
+        UserError: The database is damaged or of another version.
     """
     if not path.exists():
         return None
@@ -134,22 +130,18 @@ def transaction(db: sqlite3.Connection, read_only: bool = False) -> Iterator[Non
 
 
 def read_about(db: sqlite3.Connection) -> dict[str, str]:
-    """The name and the identity of the study's benchmark."""
+    """Return the name (`benchmark`) and the `identity` of the study's benchmark."""
     return dict(tuple(row) for row in db.execute("SELECT key, value FROM about"))
 
 
-def annotator_names(db: sqlite3.Connection) -> list[str]:
-    return [row["name"] for row in db.execute("SELECT name FROM annotator ORDER BY rowid")]
-
-
 def item_ids(db: sqlite3.Connection, practice: bool) -> list[str]:
-    """The ids of the items or of the practice items, in the order of their choice."""
+    """Return the ids of the items or of the practice items, in the order of their choice."""
     query = "SELECT item_id FROM item WHERE practice = ? ORDER BY place"
     return [row["item_id"] for row in db.execute(query, (practice,))]
 
 
 def items_without_media(db: sqlite3.Connection) -> list[str]:
-    """The ids of items that lack a medium."""
+    """Return the ids of the items that lack a medium."""
     query = """
         SELECT item_id FROM item LEFT JOIN medium USING (item_id)
         GROUP BY item_id HAVING count(slot) <> ? ORDER BY place
@@ -164,13 +156,13 @@ def add_media(db: sqlite3.Connection, item_id: str, media: Sequence[Medium]) -> 
 
 
 def read_votes(db: sqlite3.Connection) -> pd.DataFrame:
-    """The votes in temporal order, without practice; one row is one annotator's answer to one item.
+    """Return the votes in the order of their times, without practice: one row per annotator and
+    item.
 
-    Columns of the item: `annotator`, `item_id`, `suite`, `family`, `subtype`. `answer` and `choice`
-    are the indices of the correct and the chosen candidate in the benchmark's order, `letter` is
-    where the chosen one stood, and `right` is whether they agree. `seconds` and `client_seconds`
-    run by the server's and the browser's clock from the moment when the page was completely
-    visible; if it was loaded more than once (`loads`), from the last time. `answered` is in UTC.
+    `answer` and `choice` are the indices of the correct and the chosen candidate in the benchmark's
+    order; `letter` is the chosen letter on the page, and `right` whether the choice is correct.
+    `seconds` (the server's clock) and `client_seconds` (the browser's) are measured from the moment
+    when the page was completely visible, the last one of `loads`. `answered` is in UTC.
     """
     import pandas as pd
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sqlite3
 import time
 from dataclasses import dataclass
+from typing import Any
 
 from data.records import LETTERS
 from evaluation.study.auth import new_token
@@ -60,20 +61,8 @@ class Stage:
     total: int = 0
 
 
-@dataclass(frozen=True)
-class Question:
-    """An item's page. All of its media have one size in px; `correct` and `chosen` are letters, set
-    after practice only."""
-
-    text: str
-    width: int
-    height: int
-    correct: str | None
-    chosen: str | None
-
-
 def current_stage(db: sqlite3.Connection, annotator: sqlite3.Row, rest_every: int) -> Stage:
-    """An annotator's stage; the next item is opened if none is open."""
+    """Return an annotator's stage, and open the next item if none is open."""
     if annotator["consented"] is None:
         return Stage("consent", "consent")
     name = annotator["name"]
@@ -96,7 +85,7 @@ def current_stage(db: sqlite3.Connection, annotator: sqlite3.Row, rest_every: in
 
 
 def _progress(db: sqlite3.Connection, name: str, practice: bool) -> tuple[list[sqlite3.Row], int]:
-    """An annotator's answered turns, and the number of items."""
+    """Return an annotator's answered turns, and the number of items."""
     turns = db.execute(
         f"{TURN} WHERE annotator = ? AND practice = ? AND answered IS NOT NULL", (name, practice)
     )
@@ -105,25 +94,27 @@ def _progress(db: sqlite3.Connection, name: str, practice: bool) -> tuple[list[s
 
 
 def leave_page(db: sqlite3.Connection, annotator: sqlite3.Row, key: str, rest_every: int) -> None:
-    """Leave the page without a question that has this key, if it is the current page."""
+    """Leave the page with this key, if it is the current one and asks no question."""
     stage = current_stage(db, annotator, rest_every)
+    changes = {
+        "consent": ("consented", time.time()),
+        "ready": ("begun", time.time()),
+        "rest": ("rests", stage.number // rest_every),
+    }
     if stage.key != key:
         return
-    name, now = annotator["name"], time.time()
     with transaction(db):
-        if stage.page == "consent":
-            db.execute("UPDATE annotator SET consented = ? WHERE name = ?", (now, name))
-        elif stage.page == "feedback":
+        if stage.page == "feedback":
             db.execute("UPDATE turn SET closed = 1 WHERE token = ?", (key,))
-        elif stage.page == "ready":
-            db.execute("UPDATE annotator SET begun = ? WHERE name = ?", (now, name))
-        elif stage.page == "rest":
-            rests = stage.number // rest_every
-            db.execute("UPDATE annotator SET rests = ? WHERE name = ?", (rests, name))
+        elif stage.page in changes:
+            column, value = changes[stage.page]
+            query = f"UPDATE annotator SET {column} = ? WHERE name = ?"
+            db.execute(query, (value, annotator["name"]))
 
 
 def record_loaded(db: sqlite3.Connection, name: str, token: str) -> bool:
-    """Start the time of an open item, whose page is completely visible. False if none is open."""
+    """Start the clock of an open item whose page is completely visible; return False if it is not
+    open."""
     with transaction(db):
         changed = db.execute(
             "UPDATE turn SET loaded = ?, loads = loads + 1 "
@@ -136,7 +127,7 @@ def record_loaded(db: sqlite3.Connection, name: str, token: str) -> bool:
 def record_answer(
     db: sqlite3.Connection, name: str, token: str, letter: str, client_seconds: float
 ) -> bool:
-    """Store the answer to an open, loaded item. False if no such item is open."""
+    """Store the answer to an open, loaded item; return False if there is no such item."""
     with transaction(db):
         turn = db.execute(
             f"{TURN} WHERE token = ? AND annotator = ? AND answered IS NULL AND loaded IS NOT NULL",
@@ -153,19 +144,21 @@ def record_answer(
     return True
 
 
-def load_question(db: sqlite3.Connection, token: str) -> Question:
-    """The content of an item's page; an answered practice item includes the correct letter."""
+def load_question(db: sqlite3.Connection, token: str) -> dict[str, Any]:
+    """Return an item's `text` and the `width` and `height` of its media in px; of an answered
+    practice item also the `correct` and the `chosen` letter, which are else None."""
     turn = db.execute(f"{TURN} WHERE token = ?", (token,)).fetchone()
     query = "SELECT width, height FROM medium WHERE item_id = ? AND slot = ?"
-    size = db.execute(query, (turn["item_id"], PREFIX)).fetchone()
-    correct = LETTERS[turn["shown"].index(str(turn["answer"]))]
-    has_feedback = turn["practice"] and turn["answered"] is not None
-    answers = (correct, turn["letter"]) if has_feedback else (None, None)
-    return Question(turn["question"], *size, *answers)
+    size = dict(db.execute(query, (turn["item_id"], PREFIX)).fetchone())
+    letters = {"correct": None, "chosen": None}
+    if turn["practice"] and turn["answered"] is not None:
+        correct = LETTERS[turn["shown"].index(str(turn["answer"]))]
+        letters = {"correct": correct, "chosen": turn["letter"]}
+    return {"text": turn["question"], **size, **letters}
 
 
 def load_medium(db: sqlite3.Connection, name: str, token: str, place: str) -> sqlite3.Row | None:
-    """The kind and content of a medium on the annotator's current page.
+    """Return the kind and content of a medium on the annotator's current page, or None.
 
     Args:
         token: The item's.
@@ -181,7 +174,7 @@ def load_medium(db: sqlite3.Connection, name: str, token: str, place: str) -> sq
 
 
 def _open_item(db: sqlite3.Connection, name: str, practice: bool) -> str:
-    """The token of the open item; without one, the next item is opened."""
+    """Return the token of the open item, and open the next item if none is open."""
     turn = db.execute(
         f"{TURN} WHERE annotator = ? AND practice = ? AND answered IS NULL", (name, practice)
     ).fetchone()

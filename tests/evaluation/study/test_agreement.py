@@ -17,7 +17,7 @@ from conf.schema import ReportCommand
 from data.records import FAMILIES
 from evaluation import report
 from evaluation.reporting.tables import human_table
-from evaluation.study.agreement import fleiss_kappa, krippendorff_alpha, majority, summary
+from evaluation.study.agreement import fleiss_kappa, krippendorff_alpha, majority, summarize_votes
 from tests.user_errors import raises_user_error
 
 
@@ -33,7 +33,7 @@ def vote(
 
 
 def summarize(votes: list[dict[str, Any]], items: int, annotators: list[str]) -> dict[str, Any]:
-    return summary(pd.DataFrame(votes), items, annotators)
+    return summarize_votes(pd.DataFrame(votes), items, annotators)
 
 
 def sample_votes(rng, items: int, depths: list[int]) -> list[list[int]]:
