@@ -20,11 +20,13 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.select", SelectCommand)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
-    from models.trained_runs import check_modes, resolve_model
+    from models.trained_runs import check_modes, modes_of, resolve_model
 
     folder, trained = resolve_model(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
     student, regime = trained.student, trained.train.regime
-    modes = cfg.modes or default_modes(cfg, regime)
+    # By default the modes that the student was trained in, or both record modes of a base.
+    trained_modes = ["record", "constrained"] if folder is None else modes_of(regime)
+    modes = cfg.modes or trained_modes or ["answer"]
     if folder is not None:
         check_modes(folder, regime, modes)
 
@@ -74,43 +76,28 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     }
 
 
-def default_modes(cfg: SelectCommand, regime: str) -> list[str]:
-    """Return the modes that a student was trained in, or both record modes for a base."""
-    from models.trained_runs import modes_of
-
-    if cfg.model is not None:
-        return modes_of(regime) or ["answer"]
-    return ["record", "constrained"]
-
-
 def select_items(
     store: Store, suite: str | None, limit: int | None, seed: int
 ) -> list[SelectionItem]:
-    """Return the test items of a suite, at most `limit`.
-
-    Raises:
-        UserError: The benchmark has none.
-    """
+    """Return the test items of a suite, at most `limit`; raise UserError if there are none."""
     from data.tracks.controls import MATCHED_ANCHOR
 
     items = store.selection("test", suite)
     if not items:
-        hint = (
-            ": set benchmark.selection.matched.test, or choose a benchmark with pairs, such as "
-            "benchmark=small"
-        )
-        raise UserError(
-            f"{store.folder} has no test items of the {suite or store.suite} suite"
-            f"{hint if suite == MATCHED_ANCHOR else ''}",
-            code="no-items",
-        )
+        problem = f"{store.folder} has no test items of the {suite or store.suite} suite"
+        if suite == MATCHED_ANCHOR:
+            problem += (
+                ": set benchmark.selection.matched.test, or choose a benchmark with pairs, such as "
+                "benchmark=small"
+            )
+        raise UserError(problem, code="no-items")
     return limit_items(items, limit, seed)
 
 
 def limit_items(items: list[SelectionItem], limit: int | None, seed: int) -> list[SelectionItem]:
-    """Return `limit` random items with equally many of each family; None keeps all.
+    """Return `limit` random items, evenly over the families, or all items if `limit` is None.
 
-    Of a matched-anchor pair it returns both items or neither.
+    Matched-anchor pairs stay whole.
     """
     import numpy as np
 

@@ -87,10 +87,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
 def check_routes(
     routes: list[str], folder: Path | None, regime: str, matcher: ContrastiveCommand
 ) -> None:
-    """
-    Raises:
-        UserError: The matcher cannot embed texts, or the student writes no rationale.
-    """
+    """Raise UserError if the matcher cannot embed texts, or the student writes no rationale."""
     from models.trained_runs import modes_of
 
     if matcher.retriever.late is not None:

@@ -49,7 +49,7 @@ Input = TypeVar("Input")
 
 
 class Encoder(Protocol):
-    """Returns fp32 embeddings (inputs, entries); frames are read at the preset's size."""
+    """A loaded model that returns fp32 embeddings (inputs, entries)."""
 
     def queries(self, queries: list[Query], frames: FrameReader) -> np.ndarray:
         """Embed prefixes with their questions."""
@@ -62,10 +62,10 @@ class Encoder(Protocol):
 
 @dataclass(frozen=True)
 class Embedder:
-    """A measured retriever, whose encoder is loaded when an embedding is missing.
+    """A retriever that is evaluated. Its encoder is loaded when the first embedding is missing.
 
-    Its methods embed the inputs that the store's cache lacks, `batch` at a time, and raise a
-    UserError if memory runs out, or an embedding is non-finite or narrower than the widths.
+    Its methods embed the inputs that the store's cache lacks, `batch` at a time. They raise
+    UserError if memory runs out, or if an embedding is non-finite or narrower than the widths.
 
     Attributes:
         saved: Folder of the trained retriever; None for the preset's model as it was released.
@@ -181,9 +181,8 @@ def open_embedders(
     run: Path,
     batch: int,
 ) -> Iterator[Embedder]:
-    """Yield the retriever of a run's `folder`, if there is one, and then its untrained base.
-
-    They come one at a time, so that memory holds one.
+    """Yield the retriever of a run's `folder`, if there is one, and then its untrained base: one at
+    a time, so that memory holds only one.
 
     Args:
         trained: The settings of that run, or those of the command.
@@ -203,7 +202,14 @@ def open_embedders(
         digests = weights_digest(model_id(preset), saved), processor_digest(saved)
         yield Embedder(run_title(folder), preset, precision, saved, *digests, *inputs)
     if preset.architecture is not None:
-        base = built_base(preset, precision, store, folder, run)
+        # The base is built from a seed; a training run contains it.
+        base = (folder or run) / "untrained"
+        if folder is None or not base.is_dir():
+            from models.retriever.embedder import load_retriever, tokenizer_texts
+
+            base = run / "untrained"
+            texts = tokenizer_texts(store.retrieval("train"), preset)
+            load_retriever(preset, precision, texts, base)
         preset = replace(preset, architecture=None, model=str(base))
     preset = pin_revisions(preset)
     name = f"{UNTRAINED} {preset.name}" if preset.encoder == "qwen3_vl" else preset.name
@@ -211,16 +217,3 @@ def open_embedders(
     source = model_id(preset)
     digests = weights_digest(source, image_model_id(preset)), processor_digest(source)
     yield Embedder(name, preset, precision, None, *digests, *inputs)
-
-
-def built_base(
-    preset: RetrieverConfig, precision: str, store: Store, folder: Path | None, run: Path
-) -> Path:
-    """Return the folder of a base that is built from a seed: the training run's, or a new one."""
-    if folder is not None and (folder / "untrained").is_dir():
-        return folder / "untrained"
-    from models.retriever.embedder import load_retriever, tokenizer_texts
-
-    texts = tokenizer_texts(store.retrieval("train"), preset)
-    load_retriever(preset, precision, texts, run / "untrained")
-    return run / "untrained"

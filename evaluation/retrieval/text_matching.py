@@ -1,8 +1,7 @@
 """Two-stage retrieval: texts that a model writes about queries and frames, and the ranks by them.
 
-store/<name>/texts/<key>/
-    texts.jsonl         the texts, in a `ResponseLog`; the key is the hash of the model's revision,
-                        so that they serve any matcher
+store/<name>/texts/<key>/texts.jsonl holds the texts in a `ResponseLog`. The key is the hash of the
+writing model's revision, so that every matcher uses the same texts.
 """
 
 from __future__ import annotations
@@ -83,8 +82,8 @@ def write_texts(
     database: Sequence[FrameRef],
     store: Store,
 ) -> dict[str, list[ModelResponse]]:
-    """Return a model's responses in the modes that some routes need, by mode: to every frame in
-    caption mode, else to every query.
+    """Return a model's responses by mode, in the modes that the routes need: to every frame in
+    caption mode, otherwise to every query.
 
     Raises:
         UserError: Another process collects this model's texts, or the model cannot respond.
@@ -97,45 +96,40 @@ def write_texts(
     }
     folder = store.folder / TEXTS / settings_key(model.revision)
     folder.mkdir(parents=True, exist_ok=True)
+    responses = {}
     busy = f"{folder} is in use by another process; run this again when it is done"
     with lock_folder(folder, busy):
         log = ResponseLog(folder / "texts.jsonl", settings, [*queries, *database])
-        responses = {}
         for mode in modes:
             subjects, unit = (database, "frame") if mode == "caption" else (queries, "query")
             # By scene, so that each scene's frames are decoded once.
             ordered = sorted(subjects, key=lambda s: (s.scene_id, s.name))
             respond = partial(model.respond, mode, partial(sample_of, mode))
             responses[mode] = collect_responses(ordered, mode, respond, log, unit)
-        return responses
+    return responses
 
 
 def future_text(text: str) -> str:
     """Return the prediction and outcome of a response if it has these sections, else all of it.
 
-    A thought is left out; one that is not closed leaves nothing.
+    A thought is left out; of a response that ends within its thought nothing is left.
     """
-    # A tokenizer cannot read half of a surrogate pair, which a server may return.
-    text = text.encode(errors="replace").decode()
-    return " ".join(_future_sections(text)) or _without_thought(text)
+    return _future_sections(text) or _without_thought(text)
 
 
 def _without_thought(text: str) -> str:
-    return (strip_thought(text) or "").strip()
+    # A tokenizer cannot read half of a surrogate pair, which a server may return.
+    return (strip_thought(text.encode(errors="replace").decode()) or "").strip()
 
 
-def _future_sections(text: str) -> list[str]:
+def _future_sections(text: str) -> str:
     plain = HEADING.sub(lambda h: f"{h[1].capitalize()}: ", _without_thought(text))
-    sections = [
-        plain[start:stop].strip()
-        for name, start, stop in split_sections(plain)
-        if name in FUTURE_SECTIONS
-    ]
-    return [section for section in sections if section]
+    sections = [(name, plain[start:stop].strip()) for name, start, stop in split_sections(plain)]
+    return " ".join(text for name, text in sections if text and name in FUTURE_SECTIONS)
 
 
 def count_texts(responses: Sequence[ModelResponse]) -> dict[str, int]:
-    """Count the texts, the empty and truncated ones, and those with future sections."""
+    """Count a model's texts: all, empty, truncated, and those with a prediction or an outcome."""
     texts = [response.text for response in responses]
     return {
         "texts": len(texts),
@@ -154,8 +148,7 @@ def rank_by_text(
 ) -> Ranks:
     """Rank the database for every query by its text.
 
-    A query without a text is a miss, and so is one whose target has no caption on a route that
-    matches captions.
+    A query without a text is a miss. If captions are matched, so is a query whose target has none.
 
     Args:
         texts: The texts of queries, and the captions of frames, by mode.
