@@ -47,6 +47,21 @@ def new_run(folder: Path, *overrides: str) -> Run:
     return Run(folder.name, folder, overrides)
 
 
+def tear(log: Path) -> tuple[str, str]:
+    """Cut off the last third of a log, as a kill may; return the complete and the torn text."""
+    complete = log.read_text()
+    torn = complete[: len(complete) * 2 // 3]
+    log.write_text(torn)
+    return complete, torn
+
+
+def check_resumed(log: Path, complete: str, torn: str) -> None:
+    """Check that a log kept its torn text and got the missing lines."""
+    assert log.read_text().startswith(f"{torn}\n")
+    lines = [*complete.splitlines(), torn.rpartition("\n")[2]]
+    assert sorted(log.read_text().splitlines()) == sorted(lines)
+
+
 def save_retriever(
     cfg: RetrieverConfig, folder: Path, micro: BenchmarkConfig, store: Store
 ) -> Path:

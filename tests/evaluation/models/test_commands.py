@@ -12,7 +12,6 @@ from conf.schema import (
     ContrastiveCommand,
     MatcherConfig,
     ReportCommand,
-    RetrieveCommand,
     SelectCommand,
     SftCommand,
     StudentConfig,
@@ -22,7 +21,14 @@ from evaluation.generators.response_log import ResponseLog
 from models import loading
 from models.retriever import embedder
 from models.trained_runs import check_unseen, resolve_model, trained_settings
-from tests.evaluation.models.conftest import RETRIEVER, STUDENT, finish, new_run
+from tests.evaluation.models.conftest import (
+    RETRIEVER,
+    STUDENT,
+    check_resumed,
+    finish,
+    new_run,
+    tear,
+)
 from tests.user_errors import raises_user_error
 
 
@@ -46,18 +52,14 @@ def test_a_student_is_measured_resumed_and_reported(
 
     # A killed run generates only the missing responses, and its results are the same.
     log = run.folder / "answers.jsonl"
-    complete = log.read_text()
-    torn = complete[: len(complete) * 2 // 3]
-    log.write_text(torn)
+    complete, torn = tear(log)
     heads = [json.loads(line) for line in complete.splitlines()[:2]]
     settings = {head["mode"]: head["asked"] for head in heads}
     items = micro_store.selection("test")
     assert 0 < len(ResponseLog(log, settings, items).responses) < 16
     select.main.__wrapped__(cfg, run)
     assert (run.folder / "report.json").read_text() == first
-    assert log.read_text().startswith(f"{torn}\n")
-    lines = [*complete.splitlines(), torn.rpartition("\n")[2]]
-    assert sorted(log.read_text().splitlines()) == sorted(lines)
+    check_resumed(log, complete, torn)
 
     # Responses are scored again when they are read, and a damaged line counts as missing.
     edited = complete.replace('"right": false', '"right": true').splitlines()
@@ -94,12 +96,9 @@ def test_sampled_records_of_a_base_are_the_same_after_a_kill(
     run = new_run(tmp_path / "sampled")
     assert set(select.main.__wrapped__(cfg, run)) >= {"record_micro", "record_parse_rate"}
     log = run.folder / "answers.jsonl"
-    complete = log.read_text()
-    torn = complete[: len(complete) * 2 // 3]
-    log.write_text(torn)
+    complete, torn = tear(log)
     select.main.__wrapped__(replace(cfg, batch=2), run)
-    lines = [*complete.splitlines(), torn.rpartition("\n")[2]]
-    assert sorted(log.read_text().splitlines()) == sorted(lines)
+    check_resumed(log, complete, torn)
     assert len({json.loads(line)["text"] for line in complete.splitlines()[1:]}) == 8
 
 
@@ -168,19 +167,6 @@ def test_a_torn_model_is_named(trained_student, trained_retriever, tmp_path) -> 
     (folder / "model.safetensors").write_bytes(b"{")
     with raises_user_error("damaged-file"):
         embedder.load_trained(RETRIEVER, "bf16", folder)
-
-
-def test_a_report_without_runs_names_the_commands_to_run_first(tmp_path) -> None:
-    with raises_user_error("missing-run", contains="evaluation.select"):
-        report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path)), new_run(tmp_path / "x"))
-
-
-def test_a_report_of_another_version_is_named(tmp_path) -> None:
-    run = new_run(tmp_path / "retrieve" / "run")
-    finish(run.folder, RetrieveCommand())
-    (run.folder / "report.json").write_text('{"rows": [{"name": "old", "mrr": 0.5}]}')
-    with raises_user_error("damaged-file"):
-        report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path)), new_run(tmp_path / "x"))
 
 
 def test_a_limit_spreads_over_the_families(micro_store) -> None:

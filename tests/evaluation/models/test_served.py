@@ -169,15 +169,9 @@ def test_responses_survive_a_server_that_dies(items, frames, start_server, tmp_p
     assert (tmp_path / "answers.jsonl").read_text().startswith(before)
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "served is not a multimodal model",
-        "At most 0 video(s) may be provided in one prompt.",
-        "Per-request media_io_kwargs are disabled by default",
-    ],
-)
-def test_a_server_that_refuses_clips_is_named(words, items, frames, start_server) -> None:
+def test_a_server_that_refuses_clips_is_named(items, frames, start_server) -> None:
+    words = "served is not a multimodal model"
+
     def refuse(request):
         clip = any(p["type"] == "video_url" for p in request["messages"][0]["content"])
         return {"status": 400, "message": words} if clip else "Hello."
@@ -305,7 +299,3 @@ def test_the_command_measures_a_served_model(micro, micro_store, start_server, t
     }  # fmt: skip
     assert report["calibration"]["constrained"]["n"] == 6
     assert report["positions"]["constrained"]["chosen"]["C"] == 6
-    # The same command requests nothing that is in the log.
-    server.requests.clear()
-    assert select.main.__wrapped__(cfg, Run("x", tmp_path)) == metrics
-    assert not server.requests
