@@ -21,12 +21,12 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from models.trained_runs import resolve_model
 
     folder, trained = resolve_model(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
-    matcher_folder, frozen = resolve_model(
+    matcher_folder, matcher_settings = resolve_model(
         cfg.matcher, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides, "matcher.model"
     )
     # The paper's routes: a student's rationale, or all three of a base.
     routes = cfg.routes or (["cot_text"] if cfg.model is not None else list(ROUTES))
-    check_routes(routes, folder, trained.train.regime, frozen)
+    check_routes(routes, folder, trained.train.regime, matcher_settings)
 
     from data.build import ensure_benchmark
 
@@ -36,12 +36,15 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from evaluation.embedders.base import open_embedders
     from evaluation.generators.base import open_generator
     from evaluation.metrics import results
+    from evaluation.metrics.ranking import query_metrics
     from evaluation.reporting import tables
     from evaluation.retrieval import standard_test, text_matching
     from models.student.prompts import text_sample
 
     queries, database = standard_test.load_standard_test(store)
-    matcher = next(open_embedders(matcher_folder, frozen, store, run.folder, cfg.matcher.batch))
+    matcher = next(
+        open_embedders(matcher_folder, matcher_settings, store, run.folder, cfg.matcher.batch)
+    )
     student = trained.student
     sample_of = partial(text_sample, FrameReader(store, student.image_size), student.frames)
     model = open_generator(cfg, folder, trained)
@@ -55,7 +58,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         mode: {r.item_id: text_matching.future_text(r.text) for r in of_mode}
         for mode, of_mode in responses.items()
     }
-    # The matcher needs its memory.
+    # Free the memory for the matcher.
     del model
 
     rows, curves, matched, metrics = [], [], [], {}
@@ -66,7 +69,13 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         route_rows = results.retrieval_results(store.name, title, ranks, queries, cfg.seed)
         rows += route_rows
         curves.append(results.recall_curve(title, ranks))
-        matched += text_matching.matched_texts(key, queries, texts[route.mode], ranks)
+        # At the widest width; a miss has the last rank.
+        counts = ranks.greater[0], ranks.tied[0], ranks.found
+        places = query_metrics(*counts, ranks.frames, ())["median_rank"].tolist()
+        matched += [
+            {"query_id": q.query_id, "route": key, "text": texts[route.mode][q.name], "rank": place}
+            for q, place in zip(queries, places, strict=True)
+        ]
         measures = route_rows[0].measures
         metrics |= {f"{key}_{m}": i.value for m, i in measures.items() if m != "tie_rate"}
 

@@ -122,12 +122,7 @@ def unit_rows(rows: np.ndarray) -> np.ndarray:
 
 
 def load_dual(preset: RetrieverConfig, precision: str) -> DualEncoder:
-    """Load a model of one of the types in `DUAL`.
-
-    Raises:
-        UserError: It cannot be loaded, is of another type, is incomplete, or needs another image
-            size.
-    """
+    """Load a model of one of the types in `DUAL`."""
     origin = {"revision": preset.revision, "trust_remote_code": preset.trust_remote_code}
     with reading_model(preset.model):
         config = AutoConfig.from_pretrained(preset.model, **origin)
@@ -139,13 +134,12 @@ def load_dual(preset: RetrieverConfig, precision: str) -> DualEncoder:
             )
         processor = AutoProcessor.from_pretrained(preset.model, **origin)
         model = load_complete(AutoModel, preset.model, precision, **origin)
-    for part in ("image_processor", "tokenizer"):
-        if not hasattr(processor, part):
-            raise UserError(
-                f"retriever.model={preset.model} lacks its {part.replace('_', ' ')}: add the files "
-                "that were released with the weights",
-                code="incomplete-model",
-            )
+    if missing := [x for x in ("image_processor", "tokenizer") if not hasattr(processor, x)]:
+        raise UserError(
+            f"retriever.model={preset.model} lacks its {missing[0].replace('_', ' ')}: add the "
+            "files that were released with the weights",
+            code="incomplete-model",
+        )
     check_tokenizer(preset, config, processor.tokenizer)
     check_size(preset, config)
     return DualEncoder(preset, model, model, processor.tokenizer, processor.image_processor)
@@ -158,11 +152,8 @@ reading_model = partial(explain_unloadable, "retriever")
 def load_complete(
     kind: Any, source: str, precision: str, key: str = "model", **options: Any
 ) -> PreTrainedModel:
-    """Load a model from safetensors, onto a GPU if there is one.
-
-    Raises:
-        UserError: Weights are missing, which the library would initialise at random.
-    """
+    """Load a model from safetensors, onto a GPU if there is one; raise UserError if weights are
+    missing, which the library would initialise at random."""
     model, loading_info = kind.from_pretrained(
         source,
         dtype=DTYPES[precision],

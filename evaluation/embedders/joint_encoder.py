@@ -59,7 +59,8 @@ def load_encoder(preset: RetrieverConfig, precision: str, saved: Path | None) ->
     """Load the retriever in `saved`, or without a folder a preset's model as it was released.
 
     Raises:
-        UserError: The model cannot be loaded, is incomplete, or is not of the preset's encoder.
+        UserError: The model cannot be loaded, is incomplete, is not of the preset's encoder, has
+            another model's processor, or needs another number or size of frames.
     """
     keep_freed_memory()
     if saved is not None:

@@ -65,12 +65,7 @@ class LanguageBindVideo(CLIPModel):
 
 
 def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
-    """Load the video and text towers of `model`, and the image tower of `image_model`.
-
-    Raises:
-        UserError: A model cannot be loaded, is of another type, is incomplete, or needs another
-            number or size of frames.
-    """
+    """Load the video and text towers of `model`, and the image tower of `image_model`."""
     video = load_tower(LanguageBindVideo, preset, precision, "model", preset.revision)
     image = load_tower(CLIPModel, preset, precision, "image_model", preset.image_revision)
     with reading_model(preset.model):
@@ -97,7 +92,7 @@ def spread(frames: int, wanted: int) -> list[int]:
 def load_tower(
     kind: type[CLIPModel], preset: RetrieverConfig, precision: str, key: str, revision: str | None
 ) -> CLIPModel:
-    """Load the model that the setting `key` names. Errors are those of `load_languagebind`."""
+    """Load the model that the setting `key` names, and check that its frames fit the preset."""
     source = getattr(preset, key)
     with reading_model(source, key):
         # CLIPConfig.from_pretrained would warn that the file has another model type.

@@ -30,12 +30,7 @@ TEMPLATE = (
 
 
 def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer:
-    """Load VLM2Vec; an embedding is the normalised state of the last token.
-
-    Raises:
-        UserError: The model or its base cannot be loaded, is not a Qwen2-VL, is incomplete, or has
-            the processor of another model.
-    """
+    """Load VLM2Vec, whose embedding is the normalised state of the last token."""
     origin = {"revision": preset.revision, "trust_remote_code": preset.trust_remote_code}
     with reading_model(preset.model):
         backbone = Transformer(

@@ -54,8 +54,8 @@ def open_generator(
         trained: The settings of that run; for a base, those of the command.
 
     Raises:
-        UserError: The model cannot be loaded, no server responds, or the base is not the one on
-            which the student was trained.
+        UserError: The base is not the one that the student was trained on, no server responds, or
+            `server.model` is not the model that `cfg` selects.
     """
     if cfg.server.url is not None:
         from evaluation.generators.openai_server import ServedModel

@@ -42,10 +42,6 @@ class LocalModel:
         student: StudentConfig,
         precision: str,
     ) -> None:
-        """
-        Raises:
-            UserError: The student's base is not the one that it was trained on.
-        """
         if folder is None:
             student, self._weights = pin_revisions(student), None
         else:

@@ -45,10 +45,6 @@ class ServedModel:
     def __init__(
         self, cfg: SelectCommand | TwoStageCommand, folder: Path | None, student: StudentConfig
     ) -> None:
-        """
-        Raises:
-            UserError: No server responds, or `server.model` is not the model that `cfg` selects.
-        """
         if folder is not None and cfg.server.model is None:
             raise UserError(
                 f"model={folder} is measured at server.url: set server.model=NAME to the server's "

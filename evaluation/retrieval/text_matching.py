@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,6 @@ from evaluation.generators.response_log import (
     Subject,
     collect_responses,
 )
-from evaluation.metrics.ranking import query_metrics
 from evaluation.retrieval.exact_search import Ranks
 from evaluation.retrieval.standard_test import rank_targets
 from models.fingerprints import settings_key
@@ -183,17 +181,3 @@ def rank_by_text(
     greater, tied = np.zeros((2, len(ranks.widths), len(queries)), np.int64)
     greater[:, valid], tied[:, valid] = ranks.greater, ranks.tied
     return replace(ranks, greater=greater, tied=tied, found=np.array(valid), frames=len(names))
-
-
-def matched_texts(
-    route: str, queries: Sequence[RetrievalQuery], texts: Texts, ranks: Ranks
-) -> list[dict[str, Any]]:
-    """Return each query's text and its target's rank at the widest width, for matched.jsonl.
-
-    A miss has the database's size as its rank.
-    """
-    metrics = query_metrics(ranks.greater[0], ranks.tied[0], ranks.found, ranks.frames, ())
-    return [
-        {"query_id": q.query_id, "route": route, "text": texts[q.name], "rank": float(place)}
-        for q, place in zip(queries, metrics["median_rank"], strict=True)
-    ]

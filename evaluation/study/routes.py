@@ -7,6 +7,7 @@ import logging
 import socket
 import sqlite3
 from collections.abc import Callable
+from http import HTTPStatus
 from urllib.parse import parse_qsl
 
 import jinja2
@@ -33,15 +34,13 @@ MAX_SECONDS = 1e7
 BACKLOG = 2048
 """Connections that may wait to be accepted."""
 REFUSALS = {
-    400: "The server could not read this request.",
     401: "You are not signed in on this device. Open your link; if it has been used, ask for a new "
     "one.",
-    403: "This form comes from another site.",
     404: "This page does not exist.",
-    405: "This page does not exist.",
     410: "This link has been used or is not valid. Ask for a new one.",
-    413: "This request was too long.",
+    500: "The server failed. Try again in a moment.",
 }
+"""Explanations of what annotators may meet; other requests come from no page of the study."""
 
 
 class Pages:
@@ -137,7 +136,7 @@ class Pages:
     async def refuse(self, request: Request, error: Exception) -> Response:
         """Render the page of a refused request, which repeats nothing of the request."""
         status = error.status_code if isinstance(error, HTTPException) else 500
-        reason = REFUSALS.get(status, "The server failed. Try again in a moment.")
+        reason = REFUSALS.get(status, f"{HTTPStatus(status).phrase}.")
         return self._render("refusal", status, status=status, reason=reason)
 
     def _annotator(self, request: Request) -> sqlite3.Row:

@@ -74,14 +74,6 @@ def test_rows_of_several_lengths_are_padded_with_zeros(tmp_path) -> None:
     assert embeddings.rows(["q2", "q1"]).tolist() == [[1, 1, 0], [1, 0, 0]]
 
 
-@pytest.mark.parametrize("changed", [{"weights": "cd"}, {"image_size": 336}, {"precision": "fp32"}])
-def test_embeddings_under_other_settings_are_not_reused(tmp_path, changed) -> None:
-    filled(tmp_path)
-    model = Model()
-    EmbeddingCache(tmp_path, "frame", ABOUT | changed).complete({"scene-000/0": 0}, model, 64)
-    assert model.inputs == [0]
-
-
 KILLED = """
 import os, signal, sys
 from pathlib import Path

@@ -157,7 +157,7 @@ def test_settings_that_a_trained_model_cannot_use_are_refused(
             resolve_model(*resolve, (refused,), "matcher.model")
 
 
-def test_a_torn_model_is_named(trained_student, trained_retriever, tmp_path) -> None:
+def test_a_truncated_model_file_is_refused(trained_student, trained_retriever, tmp_path) -> None:
     folder = shutil.copytree(trained_student / "student", tmp_path / "student")
     weights = folder / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:1000])

@@ -28,13 +28,13 @@ from tests.user_errors import raises_user_error
 
 
 @pytest.fixture
-def world(tmp_path, trained_retriever, micro, micro_store) -> Callable[..., dict]:
+def measure(tmp_path, trained_retriever, micro, micro_store) -> Callable[..., dict]:
     """Measures a copy of the run on a copy of the store; returns the report without the times."""
     shutil.copytree(trained_retriever, tmp_path / "run")
     shutil.copytree(micro_store.folder, tmp_path / "store" / "micro")
     shutil.rmtree(tmp_path / "store" / "micro" / EMBEDDINGS, ignore_errors=True)
 
-    def measure(name: str = "one", batch: int = 16) -> dict:
+    def run_command(name: str = "one", batch: int = 16) -> dict:
         run = new_run(tmp_path / name)
         cfg = RetrieveCommand(
             benchmark=micro, retriever=RetrieverConfig(name="unused", model="unused"),
@@ -47,7 +47,7 @@ def world(tmp_path, trained_retriever, micro, micro_store) -> Callable[..., dict
         assert all(row.pop("seconds") is not None for row in report["rows"])
         return report
 
-    return measure
+    return run_command
 
 
 def embedders(folder: Path, store, run: Path, precision: str = "bf16") -> list[Embedder]:
@@ -59,9 +59,9 @@ def embedders(folder: Path, store, run: Path, precision: str = "bf16") -> list[E
 
 @pytest.mark.slow
 def test_ranks_follow_the_definition_and_embeddings_are_computed_once(
-    world, tmp_path, micro_store
+    measure, tmp_path, micro_store
 ) -> None:
-    first = world()
+    first = measure()
     queries, database = micro_store.standard_test(), micro_store.database()
     frames = FrameReader(micro_store, 96)
     store = open_store(tmp_path / "store" / "micro")
@@ -111,22 +111,22 @@ def test_ranks_follow_the_definition_and_embeddings_are_computed_once(
     # A second evaluation loads no model: without its configuration none could be loaded.
     (tmp_path / "run" / "retriever" / "config.json").unlink()
     (tmp_path / "run" / "untrained" / "config.json").unlink()
-    assert world("two") == first
+    assert measure("two") == first
     # Another precision needs other embeddings.
     config = OmegaConf.load(tmp_path / "run" / "config.yaml")
     config.train.precision = "fp32"
     OmegaConf.save(config, tmp_path / "run" / "config.yaml")
     with raises_user_error("damaged-file", contains="retriever"):
-        world("three")
+        measure("three")
 
 
 def test_a_multi_vector_retriever_is_measured_by_late_interaction(
-    world, tmp_path, micro, micro_store
+    measure, tmp_path, micro, micro_store
 ) -> None:
     shutil.rmtree(tmp_path / "run")
     cfg = replace(RETRIEVER, late=LateConfig(width=24))
     save_retriever(cfg, tmp_path / "run", micro, micro_store)
-    first = world()
+    first = measure()
     queries, database = micro_store.standard_test(), micro_store.database()
     frames = FrameReader(micro_store, 96)
     model = embedder.load_trained(cfg, "fp32", tmp_path / "run" / "retriever")
@@ -142,41 +142,41 @@ def test_a_multi_vector_retriever_is_measured_by_late_interaction(
     assert "MiB" in (tmp_path / "one" / "report.txt").read_text()
     (tmp_path / "run" / "retriever" / "config.json").unlink()
     (tmp_path / "run" / "untrained" / "config.json").unlink()
-    assert world("two") == first
+    assert measure("two") == first
 
 
-def test_widths_beyond_the_models_embeddings_are_refused(world, tmp_path) -> None:
+def test_widths_beyond_the_models_embeddings_are_refused(measure, tmp_path) -> None:
     config = OmegaConf.load(tmp_path / "run" / "config.yaml")
     config.retriever.widths = [4096, 64, 32]
     OmegaConf.save(config, tmp_path / "run" / "config.yaml")
     with raises_user_error("too-wide", contains="retriever.widths=[64,32]"):
-        world()
+        measure()
 
 
-def test_a_batch_beyond_memory_is_named(world, monkeypatch) -> None:
+def test_a_batch_beyond_memory_is_named(measure, monkeypatch) -> None:
     def run_out(*_: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(joint_encoder.JointEncoder, "queries", run_out)
     with raises_user_error("out-of-memory", contains="batch"):
-        world()
+        measure()
 
 
-def test_another_pooling_is_refused(world, tmp_path) -> None:
+def test_another_pooling_is_refused(measure, tmp_path) -> None:
     config = tmp_path / "run" / "retriever" / "1_Pooling" / "config.json"
     config.write_text(json.dumps({**json.loads(config.read_text()), "pooling_mode": "mean"}))
     with raises_user_error("unsupported-model", contains="mean pooling"):
-        world()
+        measure()
     modules = tmp_path / "run" / "retriever" / "modules.json"
     modules.write_text(json.dumps(json.loads(modules.read_text())[:1]))
     with raises_user_error("unsupported-model", contains="without pooling"):
-        world()
+        measure()
     modules.write_text("[")
     with raises_user_error("damaged-file"):
-        world()
+        measure()
 
 
-def test_broken_weights_are_named_with_the_first_query(world, tmp_path, micro_store) -> None:
+def test_broken_weights_are_named_with_the_first_query(measure, tmp_path, micro_store) -> None:
     path = tmp_path / "run" / "retriever" / "model.safetensors"
     weights = load_file(path)
     name = next(k for k in weights if k.endswith("language_model.norm.weight"))
@@ -184,7 +184,7 @@ def test_broken_weights_are_named_with_the_first_query(world, tmp_path, micro_st
     save_file(weights, path, metadata={"format": "pt"})
     others = len(micro_store.standard_test()) - 1
     with raises_user_error("non-finite-embedding", contains=f"and {others} more"):
-        world()
+        measure()
 
 
 def test_the_key_of_embeddings_depends_on_all_of_their_inputs(

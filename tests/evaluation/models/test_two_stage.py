@@ -166,10 +166,10 @@ def test_a_matcher_without_a_text_tower_is_refused(clip, tmp_path) -> None:
 
 
 @pytest.fixture
-def world(tmp_path, micro, store, clip) -> Callable[..., tuple[dict, dict]]:
+def measure(tmp_path, micro, store, clip) -> Callable[..., tuple[dict, dict]]:
     """Runs the command; returns its metrics and its report, without the times."""
 
-    def measure(name: str = "one", *overrides: str, **settings) -> tuple[dict, dict]:
+    def run_command(name: str = "one", *overrides: str, **settings) -> tuple[dict, dict]:
         run = new_run(tmp_path / name, *overrides)
         cfg = TwoStageCommand(
             benchmark=micro, student=SERVED, store=str(store.folder.parent),
@@ -180,7 +180,7 @@ def world(tmp_path, micro, store, clip) -> Callable[..., tuple[dict, dict]]:
         assert all(row.pop("seconds") is not None for row in report["rows"])
         return metrics, report
 
-    return measure
+    return run_command
 
 
 def log_of(store: Store) -> Path:
@@ -190,7 +190,7 @@ def log_of(store: Store) -> Path:
 
 @pytest.mark.slow
 def test_a_students_texts_serve_every_matcher(
-    world, store, trained_student, clip, tmp_path
+    measure, store, trained_student, clip, tmp_path
 ) -> None:
     folder = Path(shutil.copytree(trained_student, tmp_path / "sft"))
     routes = ["cot_text", "predict_caption", "predict_image"]
@@ -200,7 +200,7 @@ def test_a_students_texts_serve_every_matcher(
         "model": str(folder), "routes": routes,
         "student": replace(STUDENT, temperature=1.0, top_k=50),
     }  # fmt: skip
-    metrics, report = world("one", *overrides, **settings)
+    metrics, report = measure("one", *overrides, **settings)
     queries, database = load_standard_test(store)
     measures = ("recall@1", "recall@10", "recall@50", "mrr", "median_rank")
     assert set(metrics) == {f"{route}_{measure}" for route in routes for measure in measures}
@@ -220,42 +220,42 @@ def test_a_students_texts_serve_every_matcher(
     # A killed run generates the missing texts again, in batches of any size.
     log = log_of(store)
     complete, torn = tear(log)
-    assert world("two", *overrides, **settings, batch=5) == (metrics, report)
+    assert measure("two", *overrides, **settings, batch=5) == (metrics, report)
     check_resumed(log, complete, torn)
 
     # Another matcher loads no student: without its configuration none could be loaded.
     (folder / "student" / "config.json").unlink()
     other = MatcherConfig(retriever=replace(clip, name="narrow", widths=[12]))
-    again, _ = world("three", *overrides, **settings, matcher=other)
+    again, _ = measure("three", *overrides, **settings, matcher=other)
     assert set(again) == set(metrics)
 
 
 @pytest.mark.slow
-def test_texts_of_a_server_are_requested_once(world, store, start_server) -> None:
+def test_texts_of_a_server_are_requested_once(measure, store, start_server) -> None:
     server = start_server(lambda _: 500 if len(server.requests) == 6 else RATIONALE)
     served = ServerConfig(
         url=server.url, model="served", concurrency=1, unreachable_timeout=0.2, timeout=10.0
     )
     settings = {"server": served, "routes": ["cot_text", "predict_image"]}
     queries, _ = load_standard_test(store)
-    _, report = world(**settings)
+    _, report = measure(**settings)
     assert report["texts"]["rationale"]["  prediction and outcome alone"] == len(queries)
     # A text is requested once, except for the request that failed.
     requests = len(server.requests)
-    assert world("two", **settings)[1] == report
+    assert measure("two", **settings)[1] == report
     assert len(server.requests) == requests
 
 
-def test_a_late_interaction_matcher_is_refused(world) -> None:
+def test_a_late_interaction_matcher_is_refused(measure) -> None:
     late = RetrieverConfig(name="late", model="unused", late=LateConfig(width=24))
     with raises_user_error("unsupported-matcher", contains="retriever.late"):
-        world(matcher=MatcherConfig(retriever=late))
+        measure(matcher=MatcherConfig(retriever=late))
 
 
-def test_a_student_without_rationales_is_refused(world, trained_student, tmp_path) -> None:
+def test_a_student_without_rationales_is_refused(measure, trained_student, tmp_path) -> None:
     shutil.copytree(trained_student, tmp_path / "sft")
     config = OmegaConf.load(tmp_path / "sft" / "config.yaml")
     config.train.regime = "answer_only"
     OmegaConf.save(config, tmp_path / "sft" / "config.yaml")
     with raises_user_error("unsupported-route", contains="cot_text"):
-        world(model=str(tmp_path / "sft"))
+        measure(model=str(tmp_path / "sft"))

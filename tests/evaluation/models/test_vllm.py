@@ -87,14 +87,6 @@ def server(base, adapters, tmp_path_factory):
     serving.stop()
 
 
-@pytest.fixture
-def server_of_merged(merged, tmp_path):
-    serving = VllmServer(merged, tmp_path, "frames=true", "dtype=float32")
-    serving.start()
-    yield serving
-    serving.stop()
-
-
 @pytest.mark.parametrize("control", [None, "shuffled_prefix", "candidate_only"])
 def test_requests_become_the_token_ids_of_a_local_model(
     server, cfg, base, micro_store, control
@@ -168,14 +160,6 @@ def test_a_server_with_adapters_responds_as_the_student(
     assert served == pytest.approx(local_scores(merged, *inputs)[tokens], abs=1e-3)
     # Without the adapters the probabilities differ.
     assert served != pytest.approx(local_scores(base, *inputs)[tokens], abs=0.1)
-
-
-def test_a_server_of_a_merged_student_responds_as_the_student(
-    server_of_merged, cfg, merged, micro_store
-) -> None:
-    inputs = cfg, micro_store, micro_store.selection("test")[0]
-    tokens, served = served_scores(server_of_merged, "tiny", *inputs)
-    assert served == pytest.approx(local_scores(merged, *inputs)[tokens], abs=1e-3)
 
 
 def served_scores(server, model, cfg, store, item) -> tuple[list[int], list[float]]:

@@ -37,13 +37,6 @@ def test_another_version_is_refused(path) -> None:
         storage.open_study(path)
 
 
-def test_another_applications_database_is_refused(tmp_path) -> None:
-    path = tmp_path / storage.DATABASE
-    modify(path, "CREATE TABLE bookmarks (address TEXT)")
-    with raises_user_error("unknown-version"):
-        storage.open_study(path)
-
-
 @pytest.mark.parametrize("content", [b"not a database" * 100, None])
 def test_a_damaged_study_is_refused(path, content) -> None:
     if content is None:
