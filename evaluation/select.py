@@ -42,7 +42,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     frames = FrameReader(store, student.image_size)
     model = base.open_generator(cfg, folder, trained)
     answers, keys, runs = {}, {}, Path(cfg.checkpoints, "select")
-    # The effect of a control needs the same items without it.
+    # To measure a control's effect, the unchanged items are needed too.
     for control in dict.fromkeys([None, cfg.control]):
         settings = {
             mode: base.response_settings(
@@ -51,7 +51,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
             for mode in modes
         }
         responses = response_log.ResponseLog(run.folder / "answers.jsonl", settings, items)
-        if cfg.control and (count := responses.take_over(sorted(runs.glob("**/answers.jsonl")))):
+        if cfg.control and (count := responses.add_from(sorted(runs.glob("**/answers.jsonl")))):
             log.info("reusing %d answers from other runs of this model", count)
         for mode in modes:
             log.info("measuring %s in %s mode, control %s", model.name, mode, control or "none")
@@ -60,13 +60,20 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
             answers[mode, control] = response_log.collect_responses(items, mode, respond, responses)
             keys[mode, control] = responses.keys[mode]
 
-    about = {"build": store.identity, "asked": [[*group, key] for group, key in keys.items()]}
+    variants = [[*variant, key] for variant, key in keys.items()]
     choices = [
-        selection_report.Choices.from_answers(model.name, *variant, of_variant)
-        for variant, of_variant in answers.items()
+        selection_report.Choices.from_answers(model.name, *variant, responses)
+        for variant, responses in answers.items()
     ]
     results = selection_report.write_report(
-        choices, items, store.name, cfg.seed, run.folder, cfg.suite, **about
+        choices,
+        items,
+        store.name,
+        cfg.seed,
+        run.folder,
+        cfg.suite,
+        build=store.identity,
+        asked=variants,
     )
     return {
         f"{r.mode}_{name}": value

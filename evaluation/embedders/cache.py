@@ -2,9 +2,9 @@
 
     store/<name>/embeddings/<kind>-<key>.sqlite
 
-A file holds the embeddings of one kind of input. Its key is the hash of the settings that they all
-depend on, which the file records too. Each batch is committed, so that a killed evaluation resumes
-after the last one. All files can be deleted at any time.
+A file holds the embeddings of one kind of input under the same settings, which it records and whose
+hash is its key. Each batch is committed, so that a killed evaluation resumes after the last one.
+All files can be deleted at any time.
 """
 
 from __future__ import annotations

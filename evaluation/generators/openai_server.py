@@ -99,7 +99,7 @@ class ServedModel:
         cfg, server = self._student, self._server
         loop = asyncio.get_running_loop()
         # A response that is a record from its first token on holds no thought.
-        opened = cfg.thinking and mode != "constrained"
+        starts_in_thought = cfg.thinking and mode != "constrained"
         # The frame cache is not thread-safe, so one thread prepares all samples.
         with ThreadPoolExecutor(1) as preparer:
 
@@ -124,7 +124,7 @@ class ServedModel:
                             "in its log",
                             code="no-response",
                         ) from error
-                    save([(subject, restore_thought(response, opened))])
+                    save([(subject, restore_thought(response, starts_in_thought))])
 
                 await run_limited(subjects, server.concurrency, respond)
 
@@ -195,17 +195,17 @@ def request_fields(cfg: StudentConfig, mode: str, clip: Clip | None) -> RequestF
     return request
 
 
-def restore_thought(response: Response, opened: bool) -> GeneratedText:
+def restore_thought(response: Response, starts_in_thought: bool) -> GeneratedText:
     """Return a response's text with its thought inside `<think>` tags.
 
     Args:
-        opened: Whether the prompt ends with `<think>`, so that the response lacks it. A server's
-            reasoning parser removes it as well.
+        starts_in_thought: Whether the prompt ends with `<think>`, so that the response lacks this
+            tag, which a server's reasoning parser removes as well.
     """
     text = response.text
     if response.reasoning:
         text = f"{THOUGHT}{response.reasoning}" + (f"</think>{text}" if text else "")
-    elif opened and THOUGHT not in text:
+    elif starts_in_thought and THOUGHT not in text:
         text = f"{THOUGHT}{text}"
     return GeneratedText(text, response.flaw == TRUNCATED)
 

@@ -21,7 +21,7 @@ from models.student.generation import GeneratedText
 from models.student.prompts import Sample
 
 Subject = SelectionItem | RetrievalQuery | FrameRef
-"""What a response is about."""
+"""The item, query or frame that a response is about."""
 SampleOf = Callable[[Subject], Sample]
 """Builds the prompt about a subject."""
 SaveResponses = Callable[[list[tuple[Subject, GeneratedText]]], None]
@@ -82,12 +82,12 @@ def score_response(subject: Subject, mode: str, generated: GeneratedText) -> Mod
 
 
 class ResponseLog:
-    """Responses in a file, one JSON line each, under keys of the settings that they depend on.
+    """Responses in a file of JSON lines, each with the key (hash) of the settings of its mode.
 
-    `settings` has these by mode, as JSON: the model's revision, the benchmark, the prompt, the
-    sampling, the seed. A line of the file records them once, with their key. Responses under other
-    keys stay in the file and are not used. Only a response's text is read back; it is parsed and
-    scored again.
+    `settings` has, by mode, all that a response depends on: the model's revision, the benchmark,
+    the prompt, the sampling and the seed. One line of the file records them with their key.
+    Responses under other keys stay in the file and are not used. A response's text is parsed and
+    scored again when it is read.
     """
 
     def __init__(
@@ -99,17 +99,17 @@ class ResponseLog:
         rows = list(read_json_lines(path)) if path.exists() else []
         self.responses = self._score(rows)
         recorded = {row.get("key") for row in rows if "asked" in row}
-        heads = [
+        headers = [
             {"key": key, "mode": mode, "asked": settings[mode]}
             for mode, key in self.keys.items()
             if key not in recorded
         ]
         # A kill may have left an incomplete last line: end it.
         torn = path.exists() and path.read_bytes()[-1:] not in (b"", b"\n")
-        self._write([*([""] if torn else []), *map(json.dumps, heads)])
+        self._write([*([""] if torn else []), *map(json.dumps, headers)])
 
-    def take_over(self, others: Iterable[Path]) -> int:
-        """Add other files' responses under the same keys; return their number."""
+    def add_from(self, others: Iterable[Path]) -> int:
+        """Add the responses of other logs under the same keys, and return their number."""
         before = len(self.responses)
         for path in others:
             found = self._score(read_json_lines(path))
@@ -117,7 +117,7 @@ class ResponseLog:
         return len(self.responses) - before
 
     def _score(self, rows: Iterable[dict[str, Any]]) -> dict[tuple[str, str], ModelResponse]:
-        """Score the rows under this log's keys; damaged ones are left out and generated again."""
+        """Score the responses under this log's keys; a damaged one counts as missing."""
         responses = {}
         for row in rows:
             try:

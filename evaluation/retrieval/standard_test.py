@@ -1,4 +1,4 @@
-"""Open, rank and report the standard test, for the commands that measure retrieval."""
+"""The standard test of retrieval: its queries and database, the ranks, and the report."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def write_ranks(
     """Write ranks.jsonl: for each retriever and query, the frames `before` the target and the other
     frames `tied` with it, at each width; null for a miss."""
     rows = []
-    for name, of_retriever in ranks.items():
+    for name, retriever_ranks in ranks.items():
         for k, query in enumerate(queries):
-            row = {"by": name, "query_id": query.query_id, "widths": of_retriever.widths}
-            for key, of in (("before", of_retriever.greater), ("tied", of_retriever.tied)):
-                missing = [None] * len(of_retriever.widths)
-                row[key] = of[:, k].tolist() if of_retriever.found[k] else missing
+            row = {"by": name, "query_id": query.query_id, "widths": retriever_ranks.widths}
+            for key, of in (("before", retriever_ranks.greater), ("tied", retriever_ranks.tied)):
+                missing = [None] * len(retriever_ranks.widths)
+                row[key] = of[:, k].tolist() if retriever_ranks.found[k] else missing
             rows.append(row)
     write_json_lines(folder / "ranks.jsonl", rows)
 

@@ -15,9 +15,9 @@ from data.render.frame_cache import FrameReader
 
 VIDEO, IMAGE = "video/mp4", "image/png"
 PREFIX = -1
-"""Slot of an item's prefix; its candidates have 0 to 3, in the item's order."""
+"""Slot of an item's prefix; the candidates have slots 0 to 3, in the item's order."""
 CRF = "12"
-"""Constant rate factor of x264 without visible loss."""
+"""Constant rate factor (quality) of x264, without visible loss."""
 SEI = "6"
 """Type of the H.264 units in which x264 writes its version and settings."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 import socket
 import sqlite3
@@ -79,7 +78,7 @@ class Pages:
         return self._render(page, stage=stage, question=question)
 
     async def link(self, request: Request) -> Response:
-        # Only the form below uses the link: mail programs open links, too.
+        # The link is used only when the form is sent, because mail programs open links too.
         link = request.path_params["link"]
         if not auth.is_unused(self._db, link):
             raise HTTPException(410)
@@ -94,7 +93,7 @@ class Pages:
         try:
             self._on_sign_in()
         except OSError as error:
-            # The link is used: without the session its owner would be locked out.
+            # The link is already used, so that a failed request would lock its owner out.
             log.warning("the file of links still holds the used link of %s: %s", name, error)
         response = RedirectResponse("/", 303)
         response.set_cookie(
@@ -190,15 +189,14 @@ def _parse_seconds(text: str) -> float | None:
 def listen(host: str, port: int) -> socket.socket:
     """Open a listening socket; raise UserError if the address is in use or not this machine's."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    reasons = {
-        errno.EADDRINUSE: f"port={port} is in use: stop the server there, or choose another port=",
-        errno.EACCES: f"port={port} needs more rights: choose a port above 1023",
-    }
     try:
         return socket.create_server((host, port), family=family, backlog=BACKLOG)
     except OSError as error:
-        reason = reasons.get(error.errno, f"host={host} is not an address of this machine")
-        raise UserError(f"cannot serve the study: {reason}", code="invalid-address") from error
+        raise UserError(
+            f"cannot serve the study at host={host} and port={port} ({error.strerror}): choose a "
+            "free port above 1023, and an address of this machine",
+            code="invalid-address",
+        ) from error
 
 
 def serve(app: Starlette, listener: socket.socket) -> None:

@@ -17,7 +17,7 @@ from evaluation.study.media import PREFIX
 from evaluation.study.storage import transaction
 
 ABANDONED_SECONDS = 3600.0
-"""Age of an open, unanswered item after which it does not count as a vote to come."""
+"""Age from which an open, unanswered item no longer counts as a vote."""
 TURN = "SELECT * FROM turn JOIN plan USING (annotator, item_id) JOIN item USING (item_id)"
 NEXT_ITEM = """
 WITH
@@ -39,9 +39,9 @@ WHERE prefix_stop = earliest ORDER BY share, coalesce(votes, 0), rank LIMIT 1
 """
 """The item that an annotator opens next.
 
-The families advance evenly, so that an annotator who stops early has answered each in proportion;
-within a family the item with the fewest votes comes first, so that depth grows evenly. Within a
-scene the earliest prefix comes first: a later one reveals its outcome.
+An annotator progresses evenly through the families, so that the answers of one who stops early
+represent each in proportion. Within a family, the items with the fewest votes come first. Within a
+scene, the earliest prefix comes first, because a later one shows what follows it.
 """
 
 
@@ -51,8 +51,9 @@ class Stage:
 
     Attributes:
         page: consent, practice, feedback, ready, item, rest or done.
-        key: Identifies this step in its form; nobody else can guess that of an item.
-        number, total: Items answered or on the page, and all of them.
+        key: Value of the form field that identifies this step; an item's key cannot be guessed.
+        number: Number of the item on the page, or of the answered items.
+        total: Number of all items.
     """
 
     page: str
