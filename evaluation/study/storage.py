@@ -98,7 +98,6 @@ def open_study(path: Path) -> sqlite3.Connection | None:
     """
     if not path.exists():
         return None
-    remedy = "delete its folder, or start another study with run=NAME"
     try:
         db = _connect(path)
         if not db.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]:
@@ -111,9 +110,12 @@ def open_study(path: Path) -> sqlite3.Connection | None:
                 code="unknown-version",
             )
         if (damage := db.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
-            raise UserError(f"{path} is damaged ({damage}): {remedy}", code="damaged-file")
+            raise sqlite3.DatabaseError(damage)
     except sqlite3.DatabaseError as error:
-        raise UserError(f"{path} is damaged ({error}): {remedy}", code="damaged-file") from error
+        raise UserError(
+            f"{path} is damaged ({error}): delete its folder, or start another study with run=NAME",
+            code="damaged-file",
+        ) from error
     return db
 
 

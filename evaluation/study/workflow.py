@@ -159,12 +159,8 @@ def load_question(db: sqlite3.Connection, token: str) -> dict[str, Any]:
 
 
 def load_medium(db: sqlite3.Connection, name: str, token: str, place: str) -> sqlite3.Row | None:
-    """Return the kind and content of a medium on the annotator's current page, or None.
-
-    Args:
-        token: The item's.
-        place: prefix, or a candidate's letter.
-    """
+    """Return the kind and content of a medium of the annotator's current page, or None. `place` is
+    prefix, or a candidate's letter."""
     query = f"{TURN} WHERE token = ? AND annotator = ? AND NOT closed"
     turn = db.execute(query, (token, name)).fetchone()
     if turn is None or place not in ("prefix", *LETTERS):

@@ -9,6 +9,7 @@ import jsonschema
 import pytest
 
 from conf.entry import Run
+from conf.runs import read_json_lines
 from conf.schema import SelectCommand
 from evaluation import select
 from evaluation.generators.response_log import ResponseLog
@@ -28,7 +29,7 @@ def test_constrained_decoding_yields_records_only(
     )
     metrics = select.main.__wrapped__(cfg, Run("constrained", tmp_path))
     assert metrics["constrained_parse_rate"] == 1 > metrics["record_parse_rate"]
-    rows = [json.loads(line) for line in (tmp_path / "answers.jsonl").read_text().splitlines()]
+    rows = list(read_json_lines(tmp_path / "answers.jsonl"))
     constrained = [row for row in rows if row["mode"] == "constrained" and "text" in row]
     assert len(constrained) == 4
     for row in constrained:

@@ -17,6 +17,7 @@ from transformers import AutoModel, AutoProcessor, CLIPModel, Qwen2VLForConditio
 
 from conf.entry import Run
 from conf.errors import UserError
+from conf.runs import read_json_lines
 from conf.schema import (
     ContrastiveTrainConfig,
     LoraConfig,
@@ -155,28 +156,23 @@ def test_vlm2vec_reads_bare_media_tokens_at_text_positions(presets, frames, micr
     prefix = sample_prefix_frames(query.prefix_start, query.prefix_stop, preset.frames)
     clip = torch.from_numpy(frames.stack(query.scene_id, prefix)).permute(0, 3, 1, 2)
     times = {"fps": float(FPS), "total_num_frames": FRAMES, "frames_indices": prefix}
-    inputs = processor(
+    video = processor(
         text=[f"<|video_pad|> {INSTRUCTIONS['query_instruction']} {query.question}"], videos=[clip],
         do_sample_frames=False, video_metadata=[times], return_tensors="pt",
         videos_kwargs={"size": {"shortest_edge": 28 * 28, "longest_edge": 8 * released.SIZE**2}},
     )  # fmt: skip
-    flat = torch.arange(inputs["input_ids"].shape[1]).expand(3, 1, -1)
-    with torch.no_grad():
-        found = model(**inputs, position_ids=flat, output_hidden_states=True)
-    last = unit_rows(found.hidden_states[-1][:, -1].numpy())
-    encoder = load(preset)
-    np.testing.assert_allclose(encoder.queries([query], frames), last, atol=1e-4)
-
     image = processor(
         text=[f"<|image_pad|> {INSTRUCTIONS['frame_instruction']}"],
         images=[frames.image(query.scene_id, prefix[0])], return_tensors="pt",
     )  # fmt: skip
-    flat = torch.arange(image["input_ids"].shape[1]).expand(3, 1, -1)
-    with torch.no_grad():
-        found = model(**image, position_ids=flat, output_hidden_states=True)
-    last = unit_rows(found.hidden_states[-1][:, -1].numpy())
-    frame = FrameRef(query.scene_id, prefix[0])
-    np.testing.assert_allclose(encoder.frames([frame], frames), last, atol=1e-4)
+    encoder, frame = load(preset), FrameRef(query.scene_id, prefix[0])
+    embedded = encoder.queries([query], frames), encoder.frames([frame], frames)
+    for inputs, embedding in zip((video, image), embedded, strict=True):
+        flat = torch.arange(inputs["input_ids"].shape[1]).expand(3, 1, -1)
+        with torch.no_grad():
+            found = model(**inputs, position_ids=flat, output_hidden_states=True)
+        last = unit_rows(found.hidden_states[-1][:, -1].numpy())
+        np.testing.assert_allclose(embedding, last, atol=1e-4)
 
 
 @pytest.fixture
@@ -221,8 +217,7 @@ def test_the_nearest_candidate_is_chosen_and_embeddings_are_computed_once(
     assert set(report["subtypes"]["clip"]) == {f"{i.family}/{i.subtype}" for i in items}
     chosen = report["positions"]["clip"]["chosen"]
     assert chosen == {x: int((scores.argmax(1) == k).sum()) for k, x in enumerate(LETTERS)}
-    lines = (tmp_path / "first" / "scores.jsonl").read_text().splitlines()
-    stored = [json.loads(line) for line in lines]
+    stored = list(read_json_lines(tmp_path / "first" / "scores.jsonl"))
     assert [row["item_id"] for row in stored] == [item.item_id for item in items]
     assert np.array([row["scores"] for row in stored]) == pytest.approx(scores, abs=1e-5)
     text = (tmp_path / "first" / "report.txt").read_text()

@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 from safetensors.torch import load_file, save_file
 from sentence_transformers import SentenceTransformer
 
+from conf.runs import read_json_lines
 from conf.schema import ContrastiveTrainConfig, LateConfig, RetrieveCommand, RetrieverConfig
 from data.render.frame_cache import FrameReader
 from data.store import open_store
@@ -88,8 +89,7 @@ def test_ranks_follow_the_definition_and_embeddings_are_computed_once(
         assert worst - 1e-9 <= row["mrr"]["value"] <= best + 1e-9
     # Differences are those of the rows, and the rows follow from the written ranks.
     overall = {(r["name"], r["width"]): r for r in first["rows"] if r["builder"] is None}
-    lines = (tmp_path / "one" / "ranks.jsonl").read_text().splitlines()
-    ranks = [json.loads(line) for line in lines]
+    ranks = list(read_json_lines(tmp_path / "one" / "ranks.jsonl"))
     assert [r["query_id"] for r in ranks] == 2 * [q.query_id for q in queries]
     for k, pair in enumerate(first["differences"]):
         left, right = (overall[pair[side], pair["width"]] for side in ("left", "right"))

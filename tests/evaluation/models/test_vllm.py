@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +11,7 @@ import torch
 from transformers import AutoModelForImageTextToText, AutoProcessor
 
 from conf.entry import Run
+from conf.runs import read_json_lines
 from conf.schema import ArchitectureConfig, LoraConfig, SelectCommand, ServerConfig, StudentConfig
 from data.render.frame_cache import FrameReader
 from evaluation import select
@@ -116,7 +116,7 @@ def test_constrained_responses_of_a_served_model_are_records(
         modes=["answer", "constrained"], server=ServerConfig(url=server.url, model="tiny"),
     )  # fmt: skip
     metrics = select.main.__wrapped__(settings, Run("served", tmp_path))
-    rows = [json.loads(line) for line in (tmp_path / "answers.jsonl").read_text().splitlines()]
+    rows = list(read_json_lines(tmp_path / "answers.jsonl"))
     assert rows[0]["asked"]["model"]["root"] == cfg.model
     # A random model may fill the texts up to the token limit; the choice precedes them.
     assert metrics["constrained_parse_rate"] == 1
@@ -141,7 +141,7 @@ def test_concurrent_sampled_responses_depend_on_their_own_seeds(
         folder = tmp_path / name
         folder.mkdir()
         select.main.__wrapped__(replace(command, **settings), Run(name, folder))
-        rows = [json.loads(line) for line in (folder / "answers.jsonl").read_text().splitlines()]
+        rows = list(read_json_lines(folder / "answers.jsonl"))
         return {row["item_id"]: row["text"] for row in rows if "item_id" in row}
 
     texts = answers("first")
