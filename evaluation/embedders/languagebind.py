@@ -99,10 +99,14 @@ def load_tower(
         config = CLIPConfig.from_dict(CLIPConfig.get_config_dict(source, revision=revision)[0])
         is_video = getattr(config.vision_config, "add_time_attn", False)
         if is_video != (kind is LanguageBindVideo):
-            example, needed = ("Image", "without") if is_video else ("Video_FT", "with")
+            has, needed, example = (
+                ("has", "an image model", "Image")
+                if is_video
+                else ("has no", "a fully fine-tuned video model", "Video_FT")
+            )
             raise UserError(
-                f"retriever.{key}={source} is not a LanguageBind model {needed} attention over "
-                f"time: set one, such as LanguageBind/LanguageBind_{example}",
+                f"retriever.{key}={source} {has} attention over time: set {needed} of "
+                f"LanguageBind, such as LanguageBind/LanguageBind_{example}",
                 code="wrong-model-type",
             )
         if is_video and (times := config.vision_config.num_frames) != preset.frames:
