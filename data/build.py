@@ -127,7 +127,7 @@ def check_names(cfg: BenchmarkConfig) -> None:
     """Raises SettingsError where a quota names an unknown family, subtype or builder."""
     families = item_families(cfg)
     quotas = {f"selection.{family}": named for family, named in family_quotas(cfg).items()}
-    known = {f"selection.{family}": list(module.CELLS) for family, module in families.items()}
+    known = {f"selection.{name}": list(family.cells) for name, family in families.items()}
     quotas["retrieval.builders"] = cfg.retrieval.builders
     known["retrieval.builders"] = [str(b) for b in future.BUILDERS]
     problems = [

@@ -25,10 +25,10 @@ from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
 from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.retrieval import counterfactual, future
 from data.tracks.selection import event, time, window
-from data.tracks.selection.distractors import BUILDERS_VERSION
+from data.tracks.selection.distractors import BUILDERS_VERSION, Family
 from data.world.physics import GENERATOR_VERSION
 
-DYNAPIX_FAMILIES = {"event": event, "time": time, "window": window}
+DYNAPIX_FAMILIES = {"event": event.FAMILY, "time": time.FAMILY, "window": window.FAMILY}
 COUNTERFACTUAL = "counterfactual"
 CACHED_SCENES = 20_000
 """Scenes that a worker keeps in memory, at about 50 KB each."""
@@ -81,8 +81,8 @@ def make_items_and_queries(
     return items, queries, dict(dropped)
 
 
-def item_families(cfg: BenchmarkConfig) -> Mapping[str, Any]:
-    """The families of a benchmark's suite; see `data.tracks.selection.distractors`."""
+def item_families(cfg: BenchmarkConfig) -> Mapping[str, Family]:
+    """The families of a benchmark's suite."""
     return TRANSFER_SUITES.get(suite_name(cfg), DYNAPIX_FAMILIES)
 
 
@@ -155,7 +155,6 @@ def _run_job(
     elif _is_query_cell(group):
         made, dropped = future.make_queries(int(group.split()[1]), cell)
     else:
-        family = item_families(cfg)[group]
-        made, dropped = fill_quota(subtype, family.timings, family.make_item, cell)
+        made, dropped = fill_quota(subtype, item_families(cfg)[group], cell)
     part: dict[str, Any] = {"rows": [row.to_row() for row in made], "dropped": dropped}
     write_atomically(path, json.dumps(part).encode())

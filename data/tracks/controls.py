@@ -16,7 +16,7 @@ import numpy as np
 from data.records import SELECTION_SECOND, Scene, SelectionItem, sample_prefix_frames
 from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.selection import event, time
-from data.tracks.selection.distractors import Timing
+from data.tracks.selection.distractors import Family, Timing
 from data.world.events import collision_frames, collisions_in
 
 MATCHED_ANCHOR = "matched_anchor"
@@ -42,7 +42,7 @@ def timings(subtype: str, scene: Scene) -> list[Timing]:
 
 def fill_pairs(cell: CellInputs) -> tuple[list[SelectionItem], int]:
     """Make pairs up to the quota, as two items in a row; see `data.tracks.quota.fill_quota`."""
-    items, dropped = fill_quota(MATCHED_ANCHOR, timings, time.make_item, cell)
+    items, dropped = fill_quota(MATCHED_ANCHOR, Family({}, timings, time.make_item), cell)
     return [each for item in items for each in _pair(item)], dropped
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from conf.schema import Quota
 from data.records import SPLITS, Scene, SelectionItem
-from data.tracks.selection.distractors import DistractorPicker
+from data.tracks.selection.distractors import DistractorPicker, Family
 
 Element = TypeVar("Element")
 
@@ -37,14 +37,10 @@ class CellInputs:
     hard_negatives: int = 0
 
 
-def fill_quota(
-    subtype: str, timings: Callable, make_item: Callable, cell: CellInputs
-) -> tuple[list[SelectionItem], int]:
-    """Make the items of one cell, at most one a scene, from scenes in a seeded order.
+def fill_quota(subtype: str, family: Family, cell: CellInputs) -> tuple[list[SelectionItem], int]:
+    """Make the items of one cell, at most one per scene, from scenes in a seeded order.
 
-    Args:
-        timings: As in a family; see `data.tracks.selection.distractors`.
-        make_item: The same. The timings of a scene are tried in a random order.
+    The timings of a scene are tried in a random order.
 
     Returns:
         Items of each split up to its quota, and the number of targets that were dropped because
@@ -60,9 +56,9 @@ def fill_quota(
             if len(made) == getattr(cell.quota, split):
                 break
             scene = cell.scene_of(scene_ids[index])
-            places = timings(subtype, scene)
-            order = rng.permutation(len(places))
-            attempts = (make_item(subtype, scene, places[k], rng, picker) for k in order)
+            timings = family.timings(subtype, scene)
+            order = rng.permutation(len(timings))
+            attempts = (family.make_item(subtype, scene, timings[k], rng, picker) for k in order)
             made += islice(filter(None, attempts), 1)
         # Each letter is the answer equally often. The remainder starts at a random letter, because
         # otherwise the last letter would be right in fewer cells than the first.

@@ -1,14 +1,8 @@
-"""Selection items with distractors that differ visibly from the target.
-
-A family is a module (or an object) with `CELLS`, its cells by subtype, and two functions:
-
-    timings(subtype, scene) -> list[Timing]                          where an item of a cell may lie
-    make_item(subtype, scene, timing, rng, picker) -> item or None   the item at one of these
-"""
+"""Selection items with distractors that differ visibly from the target."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -41,6 +35,21 @@ class Timing:
     def outside_prefix(self, frames: Iterable[int]) -> list[int]:
         """The frames that are not in the prefix: a frame of it is recognisable by comparison."""
         return [int(f) for f in frames if not self.start <= f <= self.stop]
+
+
+@dataclass(frozen=True)
+class Family:
+    """How the items of a family are made.
+
+    Attributes:
+        cells: Construction cells by subtype.
+        timings: Returns the timings that items of a subtype can have in a scene.
+        make_item: Makes the item of a subtype at one of these timings, or returns None.
+    """
+
+    cells: Mapping[str, Any]
+    timings: Callable[[str, Scene], list[Timing]]
+    make_item: Callable[..., SelectionItem | None]
 
 
 @dataclass

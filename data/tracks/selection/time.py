@@ -7,6 +7,7 @@ import numpy as np
 from data.records import SELECTION_SECOND, Scene, SelectionItem
 from data.tracks.selection.distractors import (
     DistractorPicker,
+    Family,
     Timing,
     balance_in_time,
     scene_candidates,
@@ -52,3 +53,6 @@ def make_item(
         distractors="same_time",
         horizon=horizon,
     )
+
+
+FAMILY = Family(CELLS, timings, make_item)
