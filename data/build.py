@@ -125,24 +125,22 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
 
 def check_names(cfg: BenchmarkConfig) -> None:
     """Raises SettingsError where a quota names an unknown family, subtype or builder."""
-    families = item_families(cfg)
-    quotas = {f"selection.{family}": named for family, named in family_quotas(cfg).items()}
-    known = {f"selection.{name}": list(family.cells) for name, family in families.items()}
-    quotas["retrieval.builders"] = cfg.retrieval.builders
+    known = {f"selection.{name}": list(f.cells) for name, f in item_families(cfg).items()}
     known["retrieval.builders"] = [str(b) for b in future.BUILDERS]
-    problems = [
-        f"benchmark.{key}.{name}: unknown name, did you mean "
-        f"{nearest_key(name, known[key]) or known[key][0]}? "
-        f"The options are {', '.join(known[key])}"
-        for key, named in quotas.items()
-        for name in named
-        if key in known and name not in known[key]
-    ]
-    problems += [
-        f"benchmark.{key}: suite {suite_name(cfg)} has no items of this family; remove it"
-        for key, named in quotas.items()
-        if named and key not in known
-    ]
+    quotas = {f"selection.{family}": named for family, named in family_quotas(cfg).items()}
+    problems = []
+    for key, named in {**quotas, "retrieval.builders": cfg.retrieval.builders}.items():
+        options = known.get(key, [])
+        if named and not options:
+            problems.append(
+                f"benchmark.{key}: suite {suite_name(cfg)} has no items of this family; remove it"
+            )
+        problems += [
+            f"benchmark.{key}.{name}: unknown name, did you mean "
+            f"{nearest_key(name, options) or options[0]}? The options are {', '.join(options)}"
+            for name in named
+            if options and name not in options
+        ]
     if problems:
         raise SettingsError("\n".join(problems), code="unknown-option")
 

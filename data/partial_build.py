@@ -18,16 +18,10 @@ from data.store import PLAN, write_atomically
 from data.world.standins import generator_version
 
 SCENE_SETTINGS = (
-    "simulator",
-    "standin",
-    "seed",
-    "test_share",
-    "min_objects",
-    "max_objects",
-    "max_collisions",
+    "simulator", "standin", "seed", "test_share", "min_objects", "max_objects", "max_collisions",
     "fps",
-)
-"""Settings that scenes depend on. Other parts have a name that depends on their settings."""
+)  # fmt: skip
+"""Settings that determine the scenes. The file name of any other part is a hash of its settings."""
 
 
 @contextmanager

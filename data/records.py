@@ -33,17 +33,16 @@ FAMILIES = ("event", "time", "window")
 
 @dataclass(frozen=True)
 class SceneObject:
-    """The appearance of an object.
+    """The appearance of an object. No two objects of our own scenes are equal.
 
-    No two objects of a simulated scene are equal; those of a transfer suite may be. An attribute
-    that a simulator's record lacks is empty.
+    An attribute that another simulator does not record is empty.
     """
 
     shape: str
     material: str = ""
     color: str = ""
     size: str = ""
-    """small or large for a simulator with several object sizes."""
+    """small or large in MoVi-A, whose objects have two sizes."""
 
     @property
     def phrase(self) -> str:
@@ -109,26 +108,18 @@ class Scene:
     footage: str | None = None
 
     ARRAYS = (
-        "positions",
-        "quaternions",
-        "velocities",
-        "angular_velocities",
-        "image_positions",
-        "in_view",
-        "visible_fraction",
-    )
+        "positions", "quaternions", "velocities", "angular_velocities", "image_positions",
+        "in_view", "visible_fraction",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
-        frames, count = self.positions.shape[:2]
         shapes = {name: getattr(self, name).shape for name in self.ARRAYS}
-        if any(shape[:2] != (frames, count) for shape in shapes.values()):
-            raise ValueError(f"scene {self.scene_id}: the shapes of its arrays differ: {shapes}")
-        if len(self.objects) != count:
+        if any(shape[:2] != (self.frames, len(self.objects)) for shape in shapes.values()):
             raise ValueError(
-                f"scene {self.scene_id}: {len(self.objects)} objects, but states of {count}"
+                f"scene {self.scene_id}: expected arrays of "
+                f"{self.frames} frames and {len(self.objects)} objects, but they have the shapes "
+                f"{shapes}"
             )
-        if self.footage is None and len(set(self.objects)) != count:
-            raise ValueError(f"scene {self.scene_id}: two objects share shape, material and color")
 
     @property
     def frames(self) -> int:
@@ -183,8 +174,8 @@ def _adapter(record: type[Record]) -> TypeAdapter:
 class SelectionItem(Record):
     """A question with four candidate frames, one of which is the target.
 
-    `prefix_start` and `prefix_stop` are inclusive. A construction axis that does not apply is None.
-    `min_displacement` is the smallest displacement between two candidates, px at 336 x 336.
+    `prefix_start` and `prefix_stop` are inclusive. `min_displacement` is the smallest displacement
+    between two candidates, px at 336 x 336. A construction axis that does not apply is None.
     """
 
     item_id: str
@@ -215,15 +206,12 @@ class SelectionItem(Record):
                 f"item {self.item_id}: prefix {self.prefix_start} to {self.prefix_stop} "
                 f"does not end before target {self.target_frame}"
             )
-        target = [
-            i
-            for i, c in enumerate(self.candidates)
-            if (c.scene_id, c.frame) == (self.scene_id, self.target_frame)
-        ]
-        if len(self.candidates) != 4 or target != [self.answer]:
+        target = (self.scene_id, self.target_frame)
+        is_target = [(c.scene_id, c.frame) == target for c in self.candidates]
+        if is_target != [k == self.answer for k in range(4)]:
             raise ValueError(
-                f"item {self.item_id}: expected four candidates with the target at index "
-                f"{self.answer}, but the target is at {target} of {len(self.candidates)}"
+                f"item {self.item_id}: expected four candidates, the target only at index "
+                f"{self.answer}"
             )
 
     @property

@@ -69,17 +69,16 @@ SCENES = {
 def items_of(
     suite: str, family: str, subtype: str, scenes: dict[str, Scene]
 ) -> list[SelectionItem]:
-    recipe = TRANSFER_SUITES[suite][family]
     scene_ids = {"train": [], "test": list(scenes)}
     cell = CellInputs(scene_ids, scenes.__getitem__, Quota(0, 24), seed=0, least=LEAST)
-    return fill_quota(subtype, recipe.timings, recipe.make_item, cell)[0]
+    return fill_quota(subtype, TRANSFER_SUITES[suite][family], cell)[0]
 
 
 CELLS = [
     (suite, family, subtype)
     for suite, families in TRANSFER_SUITES.items()
     for family, recipe in families.items()
-    for subtype in recipe.CELLS
+    for subtype in recipe.cells
 ]
 
 

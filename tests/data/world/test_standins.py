@@ -14,7 +14,7 @@ from data.build import check_names, ensure_items
 from data.parallel import Workers
 from data.records import Scene, SceneObject
 from data.render.bullet import OVERSAMPLING, BulletRenderer
-from data.render.frame_cache import FrameCache
+from data.render.frame_cache import render_frames
 from data.store import Store
 from data.world.events import find_motion_onsets
 from data.world.physics import Body, Physics, shared_simulator
@@ -133,11 +133,11 @@ def test_standin_has_its_own_suite_and_only_test_items(store: Store) -> None:
 
 
 def test_standin_frames_have_its_own_view(store: Store) -> None:
-    cache, name = FrameCache.of(store), store.scene_ids("test")[0]
-    own = cache.render(name, [3])[3]
+    scene, config = store.scene(store.scene_ids("test")[0]), store.manifest["config"]
+    own = render_frames(scene, [3], config)[3]
     view = STANDINS[store.suite.removeprefix("standin_")].view
-    np.testing.assert_array_equal(own, BulletRenderer(192, 128, view).render(store.scene(name), 3))
-    standard = replace(cache, config=cache.config | {"standin": None}).render(name, [3])[3]
+    np.testing.assert_array_equal(own, BulletRenderer(192, 128, view).render(scene, 3))
+    standard = render_frames(scene, [3], config | {"standin": None})[3]
     floor, other = (np.median(pixels, axis=(0, 1)) for pixels in (own, standard))
     assert np.abs(floor - other).max() > 20
 
