@@ -12,8 +12,8 @@ import numpy as np
 
 from data.records import FPS, FrameRef, RetrievalQuery, Scene
 from data.tracks.quota import CellInputs, named_rng
-from data.tracks.retrieval.future import spell_seconds
-from data.tracks.retrieval.queries import fill_quota
+from data.tracks.retrieval.queries import fill_query_quota
+from data.tracks.selection.time import spell_seconds
 from data.world.displacement import DIAGONAL, on_screen_positions
 
 LONGEST = 2 * FPS
@@ -59,7 +59,7 @@ def removal_displacement(scene: Scene, absent: Scene, removed: int) -> np.ndarra
 
 
 def make_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
-    """Make the counterfactual queries, and count the dropped ones; see `queries.fill_quota`.
+    """Make the counterfactual queries, and count the dropped ones; see `fill_query_quota`.
 
     The removal displaces another object in the target. The first hard negative is the factual scene
     at the target's frame; the others are wrong-time frames of the counterfactual scene.
@@ -93,4 +93,4 @@ def make_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
                     removed_object=phrase,
                 )
 
-    return fill_quota("counterfactual", cell, queries_of)
+    return fill_query_quota("counterfactual", cell, queries_of)

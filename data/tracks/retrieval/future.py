@@ -11,7 +11,8 @@ from functools import partial
 
 from data.records import FPS, FrameRef, RetrievalQuery, Scene
 from data.tracks.quota import CellInputs
-from data.tracks.retrieval.queries import fill_quota
+from data.tracks.retrieval.queries import fill_query_quota
+from data.tracks.selection.time import spell_seconds
 from data.world.events import collision_frames
 
 EVENTS_PER_SCENE = 3
@@ -56,10 +57,6 @@ def _is_next(scene: Scene, stop: int, event: int) -> bool:
     return min((c.frame for c in scene.collisions if c.frame > stop), default=None) == event
 
 
-def spell_seconds(count: int) -> str:
-    return "1 second" if count == 1 else f"{count} seconds"
-
-
 BUILDERS: dict[int, Callable[[Scene], Iterator[Choice]]] = {
     1: _clip_end,
     2: _clock,
@@ -81,7 +78,7 @@ BUILDERS: dict[int, Callable[[Scene], Iterator[Choice]]] = {
 
 
 def make_queries(builder: int, cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
-    """Make the queries of one builder, and count the dropped ones; see `queries.fill_quota`."""
+    """Make the queries of one builder, and count the dropped ones; see `fill_query_quota`."""
 
     def queries_of(scene: Scene) -> Iterator[RetrievalQuery]:
         for question, start, stop, target in BUILDERS[builder](scene):
@@ -98,4 +95,4 @@ def make_queries(builder: int, cell: CellInputs) -> tuple[list[RetrievalQuery], 
                 target=FrameRef(scene.scene_id, target),
             )
 
-    return fill_quota(str(builder), cell, queries_of, builder in ONE_PER_SCENE)
+    return fill_query_quota(str(builder), cell, queries_of, builder in ONE_PER_SCENE)

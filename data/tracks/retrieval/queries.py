@@ -17,7 +17,7 @@ DENSE_STEP = 4
 """Step in frames of the denser grid for targets whose preferred offsets do not suffice."""
 
 
-def fill_quota(
+def fill_query_quota(
     builder: str,
     cell: CellInputs,
     queries_of: Callable[[Scene], Iterable[RetrievalQuery]],

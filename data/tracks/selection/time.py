@@ -18,11 +18,14 @@ CELLS = {"in_1s": 1, "in_2s": 2}
 """Seconds from the observation's end to the target, by subtype."""
 
 
+def spell_seconds(count: int) -> str:
+    return "1 second" if count == 1 else f"{count} seconds"
+
+
 def question(seconds: int) -> str:
-    spelled = "1 second" if seconds == 1 else f"{seconds} seconds"
     return (
         "Watch the 1-second observation video. Which image best shows what the scene will look "
-        f"like {spelled} after the observation ends?"
+        f"like {spell_seconds(seconds)} after the observation ends?"
     )
 
 
