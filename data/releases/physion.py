@@ -17,7 +17,8 @@ accumulates.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,8 +27,13 @@ import numpy as np
 from PIL import Image
 
 from data.records import Collision, Landing, Scene, SceneObject
-from data.releases.hdf5 import get_dataset, get_group, locate, open_hdf5, read_array
-from data.releases.validation import RecordError, check_unique_scenes, decode_image, scene_id
+from data.releases.validation import (
+    RecordError,
+    check_unique_scenes,
+    decode_image,
+    finite_array,
+    scene_id,
+)
 from data.world.events import first_contacts
 
 if TYPE_CHECKING:
@@ -78,25 +84,25 @@ def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
     An object's shape is the name of its model. Visible fractions are unknown (NaN); an object is in
     view if the segmentation image contains its colour.
     """
-    with open_hdf5(path) as file:
-        static, frames = get_group(file, "static"), _list_frames(file)
-        ids = read_array(static, "object_ids", (-1,), np.int64).tolist()
-        models = [_decode(name) for name in get_dataset(static, "model_names")[()]]
+    with _open(path) as file:
+        static, frames = _get_group(file, "static"), _list_frames(file)
+        ids = _read_array(static, "object_ids", (-1,), np.int64).tolist()
+        models = [_decode(name) for name in _get_dataset(static, "model_names")[()]]
         if len(models) != len(ids):
             raise RecordError(f"{path} names {len(models)} models of {len(ids)} objects")
-        colors = read_array(static, "object_segmentation_colors", (len(ids), 3))
-        objects = [get_group(frame, "objects") for frame in frames]
+        colors = _read_array(static, "object_segmentation_colors", (len(ids), 3))
+        objects = [_get_group(frame, "objects") for frame in frames]
         positions, rotations, velocities, angular_velocities = (
-            np.stack([read_array(group, key, (len(ids), size)) for group in objects])
+            np.stack([_read_array(group, key, (len(ids), size)) for group in objects])
             for key, size in VECTORS.items()
         )
         names = stimulus = _stimulus(path, folder)
         if "stimulus_name" in static:
-            names += f" {_decode(get_dataset(static, 'stimulus_name')[()])}"
+            names += f" {_decode(_get_dataset(static, 'stimulus_name')[()])}"
         scenario = _find_scenario(names, path)
         size = _read_image(frames[0], "_img").size
         for frame in frames:
-            get_dataset(get_group(frame, "images"), "_img")
+            _get_dataset(_get_group(frame, "images"), "_img")
         return Scene(
             scene_id=scene_id("physion", scenario, stimulus),
             split=split,
@@ -130,20 +136,20 @@ def _find_scenario(names: str, path: Path) -> str:
 
 def _list_frames(file: h5py.File) -> list[h5py.Group]:
     """The groups of all frames in order."""
-    frames = get_group(file, "frames")
+    frames = _get_group(file, "frames")
     names = sorted(frames)
     first = 1 if names[:1] == ["0001"] else 0
     for k, name in enumerate(names or [""], first):
         if name != f"{k:04d}":
-            raise RecordError(f"{locate(frames)} has frame {name!r}, expected '{k:04d}'")
-    return [get_group(frames, name) for name in names]
+            raise RecordError(f"{_locate(frames)} has frame {name!r}, expected '{k:04d}'")
+    return [_get_group(frames, name) for name in names]
 
 
 def _project(frame: h5py.Group, positions: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """(N, 2) px of the (N, 3) centres, in TDW's axes, by the frame's camera."""
-    cameras = get_group(frame, "camera_matrices")
+    cameras = _get_group(frame, "camera_matrices")
     projection, view = (
-        read_array(cameras, key, (4, 4), np.float64)
+        _read_array(cameras, key, (4, 4), np.float64)
         for key in ("projection_matrix", "camera_matrix")
     )
     homogeneous = np.concatenate([positions, np.ones((len(positions), 1))], axis=1)
@@ -179,13 +185,13 @@ def _find_collisions(frames: list[h5py.Group], ids: list[int]) -> tuple[Collisio
 
 def _read_pairs(frame: h5py.Group) -> list[tuple[list[int], bytes | None]]:
     """The pairs of object ids that a frame lists, each with its state, None if not recorded."""
-    collisions = get_group(frame, "collisions")
-    pairs = read_array(collisions, "object_ids", (-1, 2), np.int64).tolist()
+    collisions = _get_group(frame, "collisions")
+    pairs = _read_array(collisions, "object_ids", (-1, 2), np.int64).tolist()
     if "states" not in collisions:
         return [(pair, None) for pair in pairs]
-    states = [bytes(state) for state in get_dataset(collisions, "states")[()].reshape(-1)]
+    states = [bytes(state) for state in _get_dataset(collisions, "states")[()].reshape(-1)]
     if len(states) != len(pairs):
-        raise RecordError(f"{locate(collisions)} has {len(states)} states of {len(pairs)} pairs")
+        raise RecordError(f"{_locate(collisions)} has {len(states)} states of {len(pairs)} pairs")
     return list(zip(pairs, states, strict=True))
 
 
@@ -199,8 +205,8 @@ def _find_landings(
     in_air = np.zeros(len(ids), int)
     landed: dict[int, int] = {}
     for k, frame in enumerate(frames):
-        environment = get_group(frame, "env_collisions")
-        listed = read_array(environment, "object_ids", (-1,), np.int64)
+        environment = _get_group(frame, "env_collisions")
+        listed = _read_array(environment, "object_ids", (-1,), np.int64)
         touching = [n for n, name in enumerate(ids) if name in listed]
         for n in _find_on_floor(environment, touching, positions[k]):
             if in_air[n] >= AIR_FRAMES:
@@ -217,7 +223,7 @@ def _find_on_floor(environment: h5py.Group, touching: list[int], positions: np.n
 
     Points are not listed by object: each is assigned to the nearest object, seen from above.
     """
-    contacts = read_array(environment, "contacts", (-1, 2, 3))
+    contacts = _read_array(environment, "contacts", (-1, 2, 3))
     normals, points = contacts[:, 0], contacts[:, 1]
     floor = points[(normals[:, 1] > UPRIGHT) & (np.abs(points[:, 1]) < FLOOR)]
     if not touching:
@@ -229,7 +235,7 @@ def _find_on_floor(environment: h5py.Group, touching: list[int], positions: np.n
 def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
     """Return frames of a trial as RGB images, by frame index from 0 in every version."""
     path = folder / str(scene.footage)
-    with open_hdf5(path) as file:
+    with _open(path) as file:
         groups = _list_frames(file)
         if len(groups) != scene.frames:
             raise RecordError(f"{path} has {len(groups)} frames, expected {scene.frames}")
@@ -237,9 +243,65 @@ def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, 
 
 
 def _read_image(frame: h5py.Group, key: str) -> Image.Image:
-    dataset = get_dataset(get_group(frame, "images"), key)
-    return decode_image(dataset[()].tobytes(), locate(dataset))
+    dataset = _get_dataset(_get_group(frame, "images"), key)
+    return decode_image(dataset[()].tobytes(), _locate(dataset))
 
 
 def _decode(text: Any) -> str:
     return text.decode() if isinstance(text, bytes) else str(text)
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[h5py.File]:
+    """Open a trial. Raises RecordError if it is damaged, which may only show while it is read."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError) as error:
+        raise RecordError(
+            f"{path} is damaged, cut off or not HDF5: {error}", "damaged-file"
+        ) from error
+
+
+def _locate(parent: h5py.Group, *keys: str) -> str:
+    """The file and the path inside it, for error messages."""
+    return f"{parent.file.filename}: {'/'.join([parent.name.rstrip('/'), *keys])}"
+
+
+def _get_group(parent: h5py.Group, key: str) -> h5py.Group:
+    return _get_dataset(parent, key, "keys")
+
+
+def _get_dataset(parent: h5py.Group, key: str, attribute: str = "dtype") -> Any:
+    """A child of `parent`, with or without the suffix of later versions, that has an attribute.
+
+    Raises:
+        RecordError: The child is missing or damaged.
+    """
+    names = [name for name in (key, f"{key}_cam0") if name in parent]
+    for name in names:
+        # None if its header is damaged.
+        child = parent.get(name)
+        if hasattr(child, attribute):
+            return child
+    if names:
+        raise RecordError(f"{_locate(parent, key)} is damaged", "damaged-file")
+    raise RecordError(f"{_locate(parent, key)} is missing")
+
+
+def _read_array(
+    parent: h5py.Group, key: str, shape: tuple[int, ...], dtype: type = np.float32
+) -> np.ndarray:
+    """A dataset as an array of `shape`, in which -1 is any length.
+
+    Raises:
+        RecordError: The dataset is missing, or has as many axes as `shape` and other lengths.
+    """
+    dataset = _get_dataset(parent, key)
+    lengths = list(zip(dataset.shape, shape, strict=False))
+    # A matrix may be stored flat, and an empty list of contacts has one axis.
+    if dataset.ndim == len(shape) and any(-1 != wanted != found for found, wanted in lengths):
+        raise RecordError(f"{_locate(dataset)}: shape {dataset.shape}, expected {shape}")
+    return finite_array(dataset[()], shape, _locate(dataset), dtype)

@@ -13,9 +13,8 @@ import psutil
 import pytest
 
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
-from data.build import build, ensure_benchmark, ensure_items
+from data.build import build, ensure_benchmark, ensure_items, lock_partial_build
 from data.parallel import Workers
-from data.partial_build import lock_partial_build
 from data.store import MANIFEST, hash_file, hash_files, open_store, write_atomically
 from data.world.sampling import format_scene_id
 from data.world.scenes import split_scenes
