@@ -57,9 +57,6 @@ DEFECTS: dict[str, tuple[Callable[[dict], object], str]] = {
         lambda r: r["motion_trajectory"][3]["objects"][1].update(orientation=[0.0, 0.0, 0.0, 1.0]),
         "objects.1.orientation",
     ),
-    "no velocity": (
-        lambda r: r["motion_trajectory"][3]["objects"][1].pop("velocity"), "objects.1.velocity"
-    ),
     "a frame without an object": (
         lambda r: r["motion_trajectory"][9]["objects"].pop(0), "frame 9"
     ),

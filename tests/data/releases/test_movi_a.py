@@ -123,7 +123,6 @@ FOLDER_DEFECTS: dict[str, tuple[str, Callable[[dict], object], str]] = {
         "metadata.json", lambda r: r["instances"][1].pop("velocities"), "instances.1.velocities"
     ),
     "fewer frames": ("metadata.json", lambda r: r["metadata"].update(num_frames=12), "num_frames"),
-    "another rate": ("metadata.json", lambda r: r["metadata"].update(frame_rate=24), "frame_rate"),
     "an array of 23 frames": (
         "metadata.json", lambda r: [i["positions"].pop() for i in r["instances"]], "(3,24,3)"
     ),

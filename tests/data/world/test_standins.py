@@ -126,10 +126,6 @@ def test_standin_has_its_own_suite_and_only_test_items(store: Store) -> None:
     assert all(name.startswith(f"{store.suite}-") for name in store.scene_ids("test"))
     config = store.manifest["config"]["selection"]
     assert len(items) == 2 * (len(config["event"]) + len(config["time"]))
-    same = 1 if store.suite == "standin_movi_a" else 2
-    for item in items:
-        wrong = [c for c in item.candidates if c.source != "target"]
-        assert sum(c.scene_id == item.scene_id for c in wrong) == same
 
 
 def test_standin_frames_have_its_own_view(store: Store) -> None:
