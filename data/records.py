@@ -20,7 +20,7 @@ FRAMES = 128
 FPS = 25
 """Frames per second of a scene, and of the retrieval builders."""
 SELECTION_SECOND = 26
-"""Frames that the selection track's time builder counts as one second (128 frames in about 5 s)."""
+"""Frames per second in the time family of selection items (128 frames in about 5 s)."""
 LETTERS = "ABCD"
 
 SHAPES = ("cube", "sphere", "cylinder")
@@ -52,7 +52,8 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class Collision:
-    """The first contact of two objects: the first frame at or after it, and their indices."""
+    """The first contact of two objects: the first frame at or after the contact, and their
+    indices."""
 
     frame: int
     objects: tuple[int, int]
@@ -60,8 +61,8 @@ class Collision:
 
 @dataclass(frozen=True)
 class Landing:
-    """An object's first contact with the ground after a fall: the first frame at or after it, and
-    the object's index."""
+    """An object's first contact with the ground after a fall: the first frame at or after the
+    contact, and the object's index."""
 
     frame: int
     object: int
@@ -282,6 +283,8 @@ class Rationale(Record):
 
 
 def sample_prefix_frames(start: int, stop: int, count: int) -> list[int]:
-    """Sample `count` frames of the inclusive range [start, stop], evenly and with both ends; all
-    frames where the range has no more."""
+    """Sample `count` evenly spaced frames of the inclusive range [start, stop] with both ends.
+
+    A shorter range gives all its frames.
+    """
     return [int(f) for f in np.linspace(start, stop, min(count, stop - start + 1)).round()]
