@@ -45,7 +45,7 @@ class SceneObject:
     """small or large in MoVi-A, whose objects have two sizes."""
 
     @property
-    def phrase(self) -> str:
+    def noun_phrase(self) -> str:
         """The noun phrase that names the object, such as "blue metal cube"."""
         return " ".join(filter(None, (self.size, self.color, self.material, self.shape)))
 

@@ -140,7 +140,7 @@ class SheetRows:
         if query.removed_object is not None:
             scene = self._store.scene(query.scene_id)
             without = self._store.scene(query.target.scene_id)
-            removed = [o.phrase for o in scene.objects].index(query.removed_object)
+            removed = [o.noun_phrase for o in scene.objects].index(query.removed_object)
             shift = removal_displacement(scene, without, removed)[query.target.frame]
             caption = f"others differ by {shift:.0f} px"
             cells.insert(0, self._cell(negatives.pop(0), "factual", caption, ring_on=removed))

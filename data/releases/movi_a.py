@@ -3,12 +3,12 @@
     <folder>/00012/metadata.json events.json rgba_00000.png ...   Kubric's own, a folder per scene
     <folder>/movi_a-train.tfrecord-00000-of-00512 ...             that of TensorFlow Datasets
 
-Both are read into the same arrays. The physics starts at scene frame 0 and the rendering at scene
-frame 1: frame i of the video, and of every array, is scene frame i + 1. The time of a contact
-counts scene frames from 0. It is a float in Kubric's format; TensorFlow Datasets truncates it, so
-that the next frame is the first that is certainly at or after the contact.
+Both are read into the same arrays. The simulation starts one frame before the video: frame i of the
+video, and of every array, is simulated frame i + 1. The time of a contact counts simulated frames.
+It is a float in Kubric's format. TensorFlow Datasets truncates it, so that only the next simulated
+frame is certainly at or after the contact.
 
-Contacts are listed for every point and substep. An index of no object (-1, or 65535 if unsigned) is
+Every contact point is listed at every substep. An index of no object (-1, or 65535 if unsigned) is
 the floor, or an object that is never visible.
 """
 

@@ -29,7 +29,7 @@ SECONDS = (1, 2)
 
 
 def timings(subtype: str, scene: Scene) -> list[Timing]:
-    """Where the next collision is whole seconds after a one-second observation."""
+    """The timings whose target is the next collision, whole seconds after a 1-second prefix."""
     return [
         Timing(stop - SELECTION_SECOND + 1, stop, target, event=target)
         for target in collision_frames(scene)
@@ -73,17 +73,17 @@ def prefix_under_control(item: SelectionItem, count: int, control: str | None) -
     """Sample `count` frames of an item's prefix, in the order in which a model receives them.
 
     Args:
-        control: `candidate_only` gives no frames, `shuffled_prefix` another order than in time,
-            None the frames in time.
+        control: `candidate_only` for no frames, `shuffled_prefix` for an order other than in time,
+            None for the order in time.
     """
     if control == "candidate_only":
         return []
     frames = sample_prefix_frames(item.prefix_start, item.prefix_stop, count)
-    if control == "shuffled_prefix":
-        digest = hashlib.sha256(item.item_id.encode()).digest()
-        rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-        shuffled = frames
-        while shuffled == frames:
-            shuffled = [frames[k] for k in rng.permutation(len(frames))]
-        return shuffled
-    return frames
+    if control is None:
+        return frames
+    digest = hashlib.sha256(item.item_id.encode()).digest()
+    rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
+    shuffled = frames
+    while shuffled == frames:
+        shuffled = [frames[k] for k in rng.permutation(len(frames))]
+    return shuffled

@@ -179,7 +179,7 @@ def describe_truth(item: SelectionItem, store: Store) -> list[str]:
     ]
     for collision in scene.collisions:
         if item.prefix_stop < collision.frame <= item.target_frame:
-            one, other = (scene.objects[k].phrase for k in collision.objects)
+            one, other = (scene.objects[k].noun_phrase for k in collision.objects)
             sentences.append(f"The {one} and the {other} collide at frame {collision.frame}.")
     return sentences
 

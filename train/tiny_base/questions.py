@@ -254,7 +254,7 @@ class QuestionBuilder:
         rng: np.random.Generator,
     ) -> str:
         """A random visible object, if possible one whose place distinguishes candidates."""
-        names = sorted(visible) or [o.phrase for o in self.scene(item).objects]
+        names = sorted(visible) or [o.noun_phrase for o in self.scene(item).objects]
         names = [p for p in names if len({objects.get(p) for objects in places}) > 1] or names
         return names[rng.integers(len(names))]
 
@@ -306,7 +306,7 @@ def format_place(letter: str, phrase: str, place: str | None) -> str:
 def visible_regions(scene: Scene, frame: int) -> dict[str, str]:
     """The region of each visible object of a frame, by the object's phrase."""
     return {
-        o.phrase: object_region(scene, frame, k)
+        o.noun_phrase: object_region(scene, frame, k)
         for k, o in enumerate(scene.objects)
         if scene.in_view[frame, k] and scene.visible_fraction[frame, k] > HIDDEN
     }
@@ -327,7 +327,7 @@ def visible_objects(
     places = scene.image_positions[frame] / np.asarray(scene.image_size)
     visible = scene.in_view[frame] & (scene.visible_fraction[frame] > CLEAR)
     for k in np.flatnonzero(visible):
-        yield int(k), tuple(places[k].tolist()), tuple(scene.objects[k].phrase.split())
+        yield int(k), tuple(places[k].tolist()), tuple(scene.objects[k].noun_phrase.split())
 
 
 def find_moved_frames(scene: Scene, start: int) -> list[int]:

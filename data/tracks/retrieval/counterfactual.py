@@ -69,7 +69,7 @@ def make_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
         removed = removed_object(scene, cell.seed)
         if removed is None:
             return
-        absent, phrase = absent_id(scene.scene_id, removed), scene.objects[removed].phrase
+        absent, phrase = absent_id(scene.scene_id, removed), scene.objects[removed].noun_phrase
         displacement = removal_displacement(scene, cell.scene_of(absent), removed)
         stop = _prefix_stop(scene, removed)
         for seconds in HORIZONS:

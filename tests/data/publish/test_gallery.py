@@ -67,7 +67,7 @@ def test_a_counterfactual_row_shows_one_moment_with_and_without_the_object(micro
         assert np.array_equal(target.image, frames.array(query.target.scene_id, frame))
         assert (factual.is_answer, target.is_answer) == (False, True)
         scene = micro_store.scene(query.scene_id)
-        removed = [o.phrase for o in scene.objects].index(query.removed_object)
+        removed = [o.noun_phrase for o in scene.objects].index(query.removed_object)
         share = scene.image_positions[frame, removed] / scene.image_size
         assert factual.ring == pytest.approx(share * factual.image.size)
         assert target.ring is None

@@ -28,7 +28,7 @@ def test_a_scene_has_the_values_of_its_trial(tmp_path: Path) -> None:
     scene = read(tmp_path, physion_trial())
     assert (scene.scene_id, scene.scenario) == ("physion-Collide-Collide_box_0003", "Collide")
     assert (scene.frames, scene.fps, scene.image_size) == (60, 100, (48, 32))
-    assert [o.phrase for o in scene.objects] == ["bowl", "cone", "bowl"]
+    assert [o.noun_phrase for o in scene.objects] == ["bowl", "cone", "bowl"]
     assert np.isnan(scene.visible_fraction).all()
     assert scene.footage == "Collide/box/0003.hdf5"
     images = physion.load_images(scene, tmp_path, [59, 0])

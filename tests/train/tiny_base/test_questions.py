@@ -26,7 +26,7 @@ def kinds(micro_store, frames, student_cfg) -> dict[str, list[LazySample]]:
 def visible(store: Store, scene_id: str, frame: int) -> dict[str, str]:
     scene = store.scene(scene_id)
     return {
-        o.phrase: object_region(scene, frame, k)
+        o.noun_phrase: object_region(scene, frame, k)
         for k, o in enumerate(scene.objects)
         if scene.in_view[frame, k] and scene.visible_fraction[frame, k] > 0.05
     }
@@ -121,7 +121,7 @@ def test_motion_of_an_object_in_a_clip(micro_store, kinds) -> None:
         scene = micro_store.scene(item.scene_id)
         end = find_cut(scene, item.prefix_start, item.prefix_stop)
         phrase = re.fullmatch(r"How does the (.+) move\?", sample.content[-1]["text"])[1]
-        index = [o.phrase for o in scene.objects].index(phrase)
+        index = [o.noun_phrase for o in scene.objects].index(phrase)
         speed = np.linalg.norm(scene.velocities[end, index])
         stated = re.fullmatch(
             rf"[A-Z].+, the {phrase} is (near the [\w-]+) and (does not move|moves .+)\.",
@@ -150,7 +150,7 @@ def test_headings_of_objects_at_visual_tokens(micro_store, kinds) -> None:
         scene, frames = micro_store.scene(item.scene_id), sample.clip.indices
         assert {label.picture for label in sample.object_labels} <= set(range(sample.pictures))
         for label in sample.object_labels:
-            index = [tuple(o.phrase.split()) for o in scene.objects].index(label.words[:3])
+            index = [tuple(o.noun_phrase.split()) for o in scene.objects].index(label.words[:3])
             pair = [frames[2 * label.picture], frames[2 * label.picture + 1]]
             moves = np.linalg.norm(scene.velocities[pair[1], index]) >= 0.05
             assert (label.words[3] != "stationary") == moves
