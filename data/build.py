@@ -16,7 +16,7 @@ from typing import Any
 from conf.compose import nearest_key
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
-from conf.runs import flatten, wait_for_lock
+from conf.runs import setting_differences, wait_for_lock
 from conf.schema import BenchmarkConfig, BuildCommand
 from data.parallel import Workers
 from data.records import SPLITS
@@ -197,19 +197,13 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
 
 
 def check_same_settings(old: dict[str, Any], new: dict[str, Any], folder: Path) -> None:
-    """Raises UserError where a key differs between the nested settings of two builds."""
-    before, after = (
-        {key: value for key, value in flatten(settings).items() if value != {}}
-        for settings in (old, new)
-    )
-    for key in before | after:
-        if before.get(key) != after.get(key):
-            raise UserError(
-                f"{folder} was built with {key}={before.get(key)}, but the command has "
-                f"{after.get(key)}: use the earlier setting, choose another name with "
-                f"benchmark.name=NAME, or delete {folder}",
-                code="different-settings",
-            )
+    """Raises UserError where the nested settings of two builds differ."""
+    if differences := setting_differences(old, new):
+        raise UserError(
+            f"{folder} was built with another setting: {differences[0]}. Use the earlier setting, "
+            f"choose another name with benchmark.name=NAME, or delete {folder}",
+            code="different-settings",
+        )
 
 
 if __name__ == "__main__":

@@ -90,7 +90,7 @@ def test_partial_build_with_other_scenes_is_kept(tmp_path) -> None:
     with raises_user_error("empty-benchmark"):
         build(small(**nothing), tmp_path / "small", Workers(1))
     assert not (tmp_path / "small").exists()
-    with raises_user_error("different-settings", contains="benchmark.max_objects=6"):
+    with raises_user_error("different-settings", contains="benchmark.max_objects was 6"):
         build(small(max_objects=5), tmp_path / "small", Workers(1))
     scenes = tmp_path / ".small.partial" / "scenes"
     first = {p.name: p.stat().st_mtime_ns for p in scenes.iterdir()}
@@ -178,7 +178,7 @@ def test_damaged_or_old_manifest_is_refused(copy, damage, code, name) -> None:
 
 def test_different_settings_are_named(copy) -> None:
     cfg = small(selection=SelectionConfig(time={"in_1s": Quota(train=3, test=1)}))
-    key = "benchmark.selection.time.in_1s.train=2"
+    key = "benchmark.selection.time.in_1s.train was 2"
     with raises_user_error("different-settings", contains=key):
         ensure_benchmark(cfg, copy.parent, 1)
 
