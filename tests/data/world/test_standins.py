@@ -27,14 +27,14 @@ SUITES = list(STANDINS)
 COUNTERFACTUALS = RetrievalTrackConfig(counterfactual=Quota(test=4))
 
 
-def kind(suite: str) -> BenchmarkConfig:
-    return BenchmarkConfig(name="kind", standin=suite, min_objects=3, max_objects=5)
+def standin_config(suite: str) -> BenchmarkConfig:
+    return BenchmarkConfig(name="standin", standin=suite, min_objects=3, max_objects=5)
 
 
 @pytest.fixture(scope="module", params=SUITES)
 def scenes(request: pytest.FixtureRequest) -> tuple[str, list[Scene]]:
     """The suite of a stand-in and four of its scenes."""
-    cfg = kind(request.param)
+    cfg = standin_config(request.param)
     return request.param, [simulate_standin(f"{cfg.standin}-{k}", k, "test", cfg) for k in range(4)]
 
 
@@ -67,7 +67,7 @@ def test_rebound_height_grows_with_the_restitution_of_the_ground() -> None:
 
 def test_scene_is_a_function_of_seed_and_index(scenes: tuple[str, list[Scene]]) -> None:
     suite, simulated = scenes
-    again = simulate_standin("again", 2, "test", kind(suite))
+    again = simulate_standin("again", 2, "test", standin_config(suite))
     assert (again.objects, again.collisions) == (simulated[2].objects, simulated[2].collisions)
     np.testing.assert_array_equal(again.positions, simulated[2].positions)
     assert len({s.objects for s in simulated}) == len(simulated)
@@ -156,4 +156,4 @@ def test_invalid_standin_settings_are_refused(changes: dict[str, Any], key: str)
 def test_family_that_a_suite_lacks_is_refused() -> None:
     window = SelectionConfig(window={"G1_A_h8_easy": Quota(test=1)})
     with raises_user_error("unknown-option", contains="benchmark.selection.window"):
-        check_names(replace(kind("movi_a"), selection=window))
+        check_names(replace(standin_config("movi_a"), selection=window))
