@@ -80,11 +80,6 @@ def read_resolved(folder: Path) -> dict[str, str]:
         ) from error
 
 
-def resolved_precision(folder: Path, precision: str) -> str:
-    """Return the precision that a run resolved, or `precision` if the run has not resolved it."""
-    return read_resolved(folder).get("precision", precision)
-
-
 def pin_base(folder: Path, preset: Preset) -> Preset:
     """Return a run's preset with the commit of the hub's base that the run resolved."""
     name, _, commit = read_resolved(folder).get("base", "").rpartition("@")
@@ -106,7 +101,9 @@ def check_base(folder: Path, preset: Preset) -> None:
 
 def base_identity(preset: Preset) -> str:
     """Return NAME@COMMIT of a hub's base, or the digest of a local one."""
-    return model_id(preset) if is_hub_model(preset.model) else weights_digest(preset.model)
+    if is_hub_model(preset.model):
+        return model_id(preset.model, preset.revision)
+    return weights_digest(preset.model)
 
 
 def data_digest(store_identity: str, texts: Iterable[str]) -> str:

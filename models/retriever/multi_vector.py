@@ -7,7 +7,6 @@ frame's vectors (late interaction, ColBERT's MaxSim).
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import torch
@@ -16,17 +15,19 @@ from sentence_transformers.base.modules import Dense, Module, Normalize, Transfo
 from torch import nn
 
 from conf.schema import LateConfig
-from models import compat
 from models.retriever.scored_tokens import ScoredTokens
 
 MESSAGE_END = "<|im_end|>"
 
 # A saved model names its module by this path, and the library finds the file in the folder.
 ScoredTokens.__module__ = "scored_tokens"
-load_multi_vector = partial(
-    compat.load_multi_vector, classes={"scored_tokens.ScoredTokens": ScoredTokens}
-)
-"""Loads a saved retriever; its `ScoredTokens` is this project's class."""
+
+
+def load_multi_vector(folder: str, **options: Any) -> MultiVectorEncoder:
+    """Load a saved retriever with this project's `ScoredTokens`; code in the folder is not
+    executed."""
+    classes = {"scored_tokens.ScoredTokens": ScoredTokens}
+    return MultiVectorEncoder._load_with_module_classes(folder, classes, **options)
 
 
 def multi_vector_modules(backbone: Transformer, late: LateConfig) -> list[Module]:
