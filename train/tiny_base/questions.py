@@ -18,7 +18,14 @@ import numpy as np
 from data.records import LETTERS, Scene, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from data.store import Store
-from models.student.prompts import ObjectLabel, Sample, answer_line, conversation, load_clip
+from models.student.prompts import (
+    Clip,
+    ObjectLabel,
+    Sample,
+    answer_line,
+    conversation,
+    load_clip,
+)
 from teacher.narrator import write_description, write_match_lines
 from teacher.predicates import (
     REGIONS,
@@ -109,34 +116,33 @@ class QuestionBuilder:
         return ask(self, item, seeded_rng(self.seed, epoch, item.item_id, *keys))
 
     def render(self, item: SelectionItem, kind: str, repeat: int, epoch: int) -> Sample:
+        """Return the sample of a question: the clip, the pictures with their captions, the text."""
         question = self.ask(item, kind, repeat, epoch)
+        clip, labels = self.labelled_clip(item) if question.after_clip else (None, [])
+        pairs = (len(clip.indices) + 1) // 2 if clip else 0
         parts: list[str | np.ndarray] = []
-        for picture in question.pictures:
-            later = "Later: " if question.after_clip else ""
-            label = f"\nCandidate {picture.letter}: " if picture.letter else later
-            parts += [label] if label else []
+        for k, picture in enumerate(question.pictures, pairs):
+            if picture.letter:
+                parts.append(f"\nCandidate {picture.letter}: ")
+            elif clip:
+                parts.append("Later: ")
             parts.append(self.frames.array(picture.scene_id, picture.frame))
+            objects = visible_objects(self.store.scene(picture.scene_id), picture.frame)
+            labels += [ObjectLabel(k, at, (*words, *picture.letter)) for _, at, words in objects]
         parts.append(f"\n{question.text}" if question.pictures else question.text)
-        clip, labels, pairs = None, [], []
-        if question.after_clip:
-            indices = self.prefix_frames(item)
-            clip, scene = load_clip(item.scene_id, indices, self.frames), self.scene(item)
-            # A visual token of a clip covers two frames; objects are labelled as in the first.
-            pairs = list(zip(indices[::2], [*indices[1::2], indices[-1]], strict=False))
-            labels = [
-                ObjectLabel(k, place, (*words, object_heading(scene, index, *pair) or "stationary"))
-                for k, pair in enumerate(pairs)
-                for index, place, words in visible_objects(scene, pair[0])
-            ]
-        labels += [
-            ObjectLabel(k, place, (*words, *picture.letter))
-            for k, picture in enumerate(question.pictures, len(pairs))
-            for _, place, words in visible_objects(
-                self.store.scene(picture.scene_id), picture.frame
-            )
-        ]
         name = f"{item.item_id} ({kind} {repeat})"
         return conversation(name, parts, question.answer, clip, labels)
+
+    def labelled_clip(self, item: SelectionItem) -> tuple[Clip, list[ObjectLabel]]:
+        """Return the clip of an item's prefix, and its objects with their headings. A visual token
+        of a clip covers two frames; objects are labelled as in the first."""
+        indices, scene = self.prefix_frames(item), self.scene(item)
+        labels = []
+        for k, pair in enumerate(zip(indices[::2], [*indices[1::2], indices[-1]], strict=False)):
+            for index, place, words in visible_objects(scene, pair[0]):
+                heading = object_heading(scene, index, *pair) or "stationary"
+                labels.append(ObjectLabel(k, place, (*words, heading)))
+        return load_clip(item.scene_id, indices, self.frames), labels
 
     def frame(self, item: SelectionItem, rng: np.random.Generator) -> Question:
         """The objects of a frame and their places."""

@@ -52,7 +52,7 @@ def described(text: str) -> dict[str, str]:
 
 
 def samples_of(lazy: list[LazySample], epochs: int = 1) -> Iterator[Sample]:
-    return (one.load(epoch) for one in lazy for epoch in range(epochs))
+    return (one.render(epoch) for one in lazy for epoch in range(epochs))
 
 
 def test_a_frame_is_described_completely(regions, kinds) -> None:
@@ -194,13 +194,13 @@ def test_answer_is_the_later_frame(kinds) -> None:
 
 def test_clip_is_described_with_and_without_the_target(kinds) -> None:
     for lazy in kinds["clip"]:
-        samples = [lazy.load(epoch) for epoch in range(12)]
+        samples = [lazy.render(epoch) for epoch in range(12)]
         assert {len(sample.images) for sample in samples} == {0, 1}
         assert len({sample.response for sample in samples}) == 1
         assert samples[0].response.startswith("Scene parse: ")
 
 
 def test_frames_vary_by_epoch_reproducibly(kinds) -> None:
-    responses = [[lazy.load(epoch).response for lazy in kinds["frame"]] for epoch in (0, 1, 0)]
+    responses = [[lazy.render(epoch).response for lazy in kinds["frame"]] for epoch in (0, 1, 0)]
     assert responses[0] == responses[2]
     assert responses[0] != responses[1]
