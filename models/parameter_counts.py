@@ -58,8 +58,9 @@ def check_towers(towers: pd.DataFrame, preset: str, quantization: str, rank: int
         for kind, wanted in expected.items():
             if (counts[kind] > 0) != wanted:
                 problems.append(f"{name} has {'no' if wanted else 'some'} {kind} parameters")
-        if lora and not projection and counts["trainable"] != counts["LoRA"]:
-            problems.append(f"{name} trains {counts['trainable'] - counts['LoRA']} beside LoRA")
+        others = counts["trainable"] - counts["LoRA"]
+        if lora and not projection and others:
+            problems.append(f"{name} trains {others} parameters that are not LoRA")
     if problems:
         raise UserError(
             f"the loaded model differs from preset {preset}: {'; '.join(problems)}. Check the "

@@ -202,7 +202,7 @@ def _load_saved(folder: Path, cfg: RetrieverConfig, **options: Any) -> Retriever
 
 
 def tokenizer_texts(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list[str]:
-    """Texts to train a tokenizer on: questions, instructions, roles and timestamps."""
+    """Return texts to train a tokenizer on: questions, instructions, roles and timestamps."""
     questions = sorted({q.question for q in queries})
     clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
     roles = ["system", "user", "assistant"]
@@ -210,13 +210,14 @@ def tokenizer_texts(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list
 
 
 def longest_query(queries: list[RetrievalQuery], tokenizer: Any) -> RetrievalQuery:
-    """The query with the most tokens. All clips have the same length, so only texts differ."""
+    """Return the query with the most tokens. All clips have the same length; only texts differ."""
     encoded = tokenizer([q.question for q in queries], add_special_tokens=False).input_ids
     return queries[max(range(len(queries)), key=lambda k: len(encoded[k]))]
 
 
 def query_input(query: RetrievalQuery, frames: FrameReader, cfg: RetrieverConfig) -> dict[str, Any]:
-    """A query as sentence-transformers takes it: the prefix with its true times, then the text."""
+    """Return a query as sentence-transformers takes it: the prefix with its true times, and the
+    question."""
     indices = sample_prefix_frames(query.prefix_start, query.prefix_stop, cfg.frames)
     clip = load_clip(query.scene_id, indices, frames)
     array = torch.from_numpy(clip.pixels).permute(0, 3, 1, 2)
@@ -224,7 +225,7 @@ def query_input(query: RetrievalQuery, frames: FrameReader, cfg: RetrieverConfig
 
 
 def frame_input(frame: FrameRef, frames: FrameReader) -> Any:
-    """A database frame as sentence-transformers takes it: an image."""
+    """Return a frame as sentence-transformers takes it: an image."""
     return frames.image(frame.scene_id, frame.frame)
 
 

@@ -31,7 +31,7 @@ def load_multi_vector(folder: str, **options: Any) -> MultiVectorEncoder:
 
 
 def multi_vector_modules(backbone: Transformer, late: LateConfig) -> list[Module]:
-    """The backbone and the modules that compute vectors from its states. The projection is
+    """Return the backbone and the modules that compute vectors from its states. The projection is
     initialised from a fixed seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
@@ -57,10 +57,10 @@ def keep_head_fp32(model: MultiVectorEncoder) -> None:
 
 
 def cast_to_fp32(_: nn.Module, args: tuple[dict[str, Any]]) -> None:
-    """Before a module's forward: convert the token states."""
+    """Convert the token states to fp32. This is a hook that is called before a `forward`."""
     args[0]["token_embeddings"] = args[0]["token_embeddings"].float()
 
 
 def find_scored_tokens(model: MultiVectorEncoder) -> ScoredTokens:
-    """The module of a retriever that selects the scored tokens."""
+    """Return the module of a retriever that selects the scored tokens."""
     return next(module for module in model if isinstance(module, ScoredTokens))

@@ -69,10 +69,10 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True)
 class Question:
-    """A question after pictures, and its answer.
+    """A question about pictures or a clip, and its answer.
 
     Attributes:
-        after_clip: Whether the clip of the item's prefix is before the pictures.
+        after_clip: Whether the prompt begins with the clip of the item's prefix.
     """
 
     text: str
@@ -84,16 +84,17 @@ class Question:
 def build_questions(
     store: Store, items: list[SelectionItem], frame_count: int, frames: FrameReader, seed: int
 ) -> dict[str, list[LazySample]]:
-    """Samples by kind of question. Frames, candidates and their order are random in each epoch."""
+    """Return samples by kind of question. Frames, candidates and their order are random in each
+    epoch."""
     builder = QuestionBuilder(store, items, frame_count, frames, seed)
     return {kind: [s for item in items for s in builder.samples(item, kind)] for kind in KINDS}
 
 
 @dataclass(frozen=True)
 class QuestionBuilder:
-    """Asks questions about items; seed, epoch and item determine the random choices.
+    """Builds questions about items; seed, epoch and item determine the random choices.
 
-    Each kind of question has a method, which returns None if it cannot ask about the item.
+    Each kind of question has a method, which returns None for items that do not allow it.
     """
 
     store: Store
@@ -104,20 +105,20 @@ class QuestionBuilder:
 
     def samples(self, item: SelectionItem, kind: str) -> Iterator[LazySample]:
         """Return the samples of a kind; the first epoch's question estimates their length."""
-        if first := self.ask(item, kind, 0, epoch=0):
+        if first := self.build(item, kind, 0, epoch=0):
             media = len(first.pictures) + self.frame_count // 2 * first.after_clip
             for repeat in range(KINDS[kind][1]):
                 render = partial(self.render, item, kind, repeat)
                 yield LazySample(f"{first.text} {first.answer}", media, render)
 
-    def ask(self, item: SelectionItem, kind: str, repeat: int, epoch: int) -> Question | None:
-        ask, repeats = KINDS[kind]
+    def build(self, item: SelectionItem, kind: str, repeat: int, epoch: int) -> Question | None:
+        method, repeats = KINDS[kind]
         keys = (kind, repeat) if repeats > 1 else (kind,)
-        return ask(self, item, seeded_rng(self.seed, epoch, item.item_id, *keys))
+        return method(self, item, seeded_rng(self.seed, epoch, item.item_id, *keys))
 
     def render(self, item: SelectionItem, kind: str, repeat: int, epoch: int) -> Sample:
         """Return the sample of a question: the clip, the pictures with their captions, the text."""
-        question = self.ask(item, kind, repeat, epoch)
+        question = self.build(item, kind, repeat, epoch)
         clip, labels = self.labelled_clip(item) if question.after_clip else (None, [])
         pairs = (len(clip.indices) + 1) // 2 if clip else 0
         parts: list[str | np.ndarray] = []
