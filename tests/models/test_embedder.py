@@ -87,24 +87,6 @@ def test_the_embedding_is_the_last_tokens_state_normalised(
     np.testing.assert_allclose(encoded, last.numpy(), atol=1e-5)
 
 
-def test_a_saved_retriever_encodes_the_same_without_this_project(
-    micro_store, frames, retriever_cfg, tmp_path
-) -> None:
-    model = load(micro_store, retriever_cfg, tmp_path / "base")
-    model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
-    again = SentenceTransformer(str(tmp_path / "saved"), device="cpu")
-    query = micro_store.retrieval("train")[0]
-    for inputs in (
-        [query_input(query, frames, retriever_cfg)],
-        [frame_input(query.target, frames)],
-    ):
-        np.testing.assert_allclose(
-            model.encode(inputs, prompt_name="query"),
-            again.encode(inputs, prompt_name="query"),
-            atol=1e-6,
-        )
-
-
 @pytest.mark.parametrize("late", [None, LateConfig(width=24)], ids=["one", "many"])
 def test_adapters_are_loaded_over_the_4_bit_weights_they_were_trained_on(
     micro_store, frames, retriever_cfg, saved_base, tmp_path, late
