@@ -75,10 +75,10 @@ def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:
 
 
 def check_adapters(folder: Path, base: nn.Module, rank: int, model: str | None) -> None:
-    """Check that the adapters in a folder fit a base, with or without adapters, and a rank. A whole
-    model and FSDP's checkpoints have no such file and pass.
+    """Check that the adapters in a folder, if there are any, fit a base and a rank.
 
     Args:
+        base: The model itself, with or without adapters.
         rank: student.lora.rank.
         model: student.model.
 
@@ -104,7 +104,7 @@ def check_adapters(folder: Path, base: nn.Module, rank: int, model: str | None) 
         module = modules.get(adapted)
         actual = module and getattr(module, "in_features" if side[0] == "A" else "out_features")
         if actual != width:
-            difference = f"is {width} wide there and {actual} here" if module else "does not exist"
+            difference = f"has width {width}, not {actual}" if module else "does not exist"
             raise UserError(
                 f"{folder} has adapters of another base than {model} ({adapted} {difference}): "
                 "give the base that they were trained over with student.model=FOLDER, or train "

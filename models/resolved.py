@@ -27,19 +27,17 @@ RESOLVED = "resolved.yaml"
 
 
 def resolve_run(folder: Path, precision: str, preset: Preset, data: str) -> tuple[str, Preset]:
-    """Resolve a run's precision and base, and write them with the digest of its data.
+    """Resolve a run's precision and its base's commit, and write them with the digest of its data.
 
-    Several processes of a run call this one after the other (`models.distributed.main_first`): the
-    first one resolves and writes, the others read.
+    In `models.distributed.main_first`, the main rank resolves and writes; the others read.
 
     Args:
         folder: The run's folder.
-        precision: Of the passes: bf16, fp32 or auto.
-        preset: The student or retriever; its base may come from the hub.
+        precision: bf16, fp32 or auto.
         data: What `data_digest` returns for the run.
 
     Returns:
-        The precision, bf16 or fp32, and the preset with the commit of a hub's base.
+        The precision, bf16 or fp32, and the preset with the commit.
 
     Raises:
         UserError: the folder holds a run on other data or over another base.
