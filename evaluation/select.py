@@ -58,14 +58,14 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
             answers[mode, control] = response_log.collect_responses(items, mode, respond, responses)
             keys[mode, control] = responses.keys[mode]
 
-    about = {"build": store.identity, "asked": [[*group, key] for group, key in keys.items()]}
     choices = [
         selection_report.Choices.from_answers(model.name, *variant, of_variant)
         for variant, of_variant in answers.items()
     ]
     results = selection_report.write_report(
-        choices, items, store.name, cfg.seed, run.folder, cfg.suite, **about
-    )
+        choices, items, store.name, cfg.seed, run.folder, cfg.suite, build=store.identity,
+        asked=[(*variant, key) for variant, key in keys.items()],
+    )  # fmt: skip
     return {
         f"{r.mode}_{name}": value
         for r in results

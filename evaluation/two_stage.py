@@ -58,14 +58,13 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     # The matcher needs its memory.
     del model
 
-    rows, curves, matched, metrics = [], [], [], {}
+    rows, matched, metrics = [], [], {}
     for key, route in zip(routes, chosen, strict=True):
         log.info("matching %s with %s", route.title, matcher.name)
         ranks = text_matching.rank_by_text(route, matcher, texts, queries, database)
         title = f"{name} {route.title}, {matcher.name.removeprefix(results.UNTRAINED).strip()}"
         route_rows = results.retrieval_results(store.name, title, ranks, queries, cfg.seed)
         rows += route_rows
-        curves.append(results.recall_curve(title, ranks))
         matched += text_matching.matched_texts(key, queries, texts[route.mode], ranks)
         measures = route_rows[0].measures
         metrics |= {f"{key}_{m}": i.value for m, i in measures.items() if m != "tie_rate"}
@@ -74,7 +73,6 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     standard_test.write_report(
         run.folder,
         rows,
-        curves,
         [tables.parsing_table(counts)],
         "two_stage",
         build=store.identity,

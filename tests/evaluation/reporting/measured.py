@@ -32,7 +32,6 @@ from evaluation.generators.response_log import score_response
 from evaluation.metrics.results import (
     SIMILARITY,
     compare_retrievers,
-    recall_curve,
     retrieval_results,
 )
 from evaluation.reporting.selection_report import Choices, write_report
@@ -149,7 +148,7 @@ def retrieve_run(
     finish(root / "contrastive" / name, trained)
     queries = store.standard_test()
     rng = np.random.default_rng(0)
-    rows, curves, found = [], [], {}
+    rows, found = [], {}
     for title in (name, "untrained small"):
         greater = rng.integers(frames, size=(2, len(queries)))
         every = np.ones(greater.shape, bool)
@@ -157,8 +156,7 @@ def retrieve_run(
         ranks = Ranks((64, 32), greater, np.zeros_like(greater), every, frames, *sizes)
         found[title] = ranks
         rows += retrieval_results(store.name, title, ranks, queries, 0)
-        curves.append(recall_curve(title, ranks))
-    report = {"rows": rows, "build": store.identity, "curves": curves}
+    report = {"rows": rows, "build": store.identity}
     if kind == "retrieve":
         report["differences"] = compare_retrievers(found, queries, 0)
     settings = RetrieveCommand(
@@ -169,8 +167,8 @@ def retrieve_run(
     return root / kind / name
 
 
-def reported(root: Path, store: Path, **settings) -> Path:
-    """The folder of a report over what is below `root`."""
+def run_report(root: Path, store: Path, **settings) -> Path:
+    """Report the runs below `root`, and return the report's folder."""
     folder = root / "report" / "default"
     folder.mkdir(parents=True, exist_ok=True)
     cfg = ReportCommand(checkpoints=str(root), store=str(store), **settings)
