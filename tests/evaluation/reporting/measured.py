@@ -73,7 +73,7 @@ def trained_student(root: Path, benchmark, name: str, regime: str) -> None:
     )
     finish(folder, settings, None, {"answer_loss_at_start": 2.0, "answer_loss": 1.0})
     journal = [{"step": k, "loss": 2 - k / 9, "eval_answer_loss": 2 - k / 8} for k in range(5)]
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in journal))
+    write_json_lines(folder / "metrics.jsonl", journal)
 
 
 def select_run(
@@ -103,7 +103,7 @@ def select_run(
     keys = {"key": "k1", "mode": mode}
     lines = [{**keys, "asked": {"control": None, "seed": 0}}]
     lines += [{**keys, "item_id": i.item_id, "text": respond(i), "cut": False} for i in items]
-    (folder / "answers.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_json_lines(folder / "answers.jsonl", lines)
     return folder
 
 
