@@ -13,6 +13,7 @@ from evaluation.metrics.intervals import Interval
 from evaluation.metrics.results import (
     RECALLS,
     SIMILARITY,
+    Accuracy,
     RetrievalResult,
     RetrieverDifference,
     SelectionReport,
@@ -250,9 +251,8 @@ def human_row(name: str, accuracy: Mapping[str, Any]) -> Row:
     Args:
         accuracy: An entry of a study's summary.
     """
-    families = from_json(dict[str, Interval], accuracy["families"])
-    micro = from_json(Interval, accuracy["micro"])
-    row = accuracy_row(name, families, accuracy["macro"], micro)
+    of = from_json(Accuracy, accuracy)
+    row = accuracy_row(name, of.families, of.macro, of.micro)
     return {**row, "Parsed": None, "ranked": False}
 
 
@@ -291,18 +291,17 @@ def summary_table(name: str, rows: Sequence[Measurement], people: Sequence[Row] 
         name: A table of `reference.yaml`.
         people: Rows of a human study.
     """
-    first, items = rows[0].row, rows[0].items
     groups: dict[str, list[Row]] = {label: [] for label in GROUPS}
-    for m in rows:
-        groups[_group(m)] += (
-            selection_rows(m.label, m.row)
-            if isinstance(m.row, SelectionResult)
-            else [retrieval_row(m.name, m.row)]
-        )
+    if isinstance(rows[0].row, SelectionResult):
+        columns, notes = SELECTION_COLUMNS, (SELECTION_NOTE, BEST_NOTE)
+        for m in rows:
+            groups[_group(m)] += selection_rows(m.label, m.row)
+    else:
+        columns, notes = RETRIEVAL_COLUMNS, (*retrieval_notes(rows[0].row), BEST_NOTE)
+        for m in rows:
+            groups[_group(m)].append(retrieval_row(m.name, m.row))
     groups["people, on the items of their study"] = [*people]
-    selection = isinstance(first, SelectionResult)
-    columns = SELECTION_COLUMNS if selection else RETRIEVAL_COLUMNS
-    notes = (*((SELECTION_NOTE,) if selection else retrieval_notes(first)), BEST_NOTE)
+    items = rows[0].items
     table = table_with_paper(name, f"{name}-{items.replace(', ', '-')}", columns, groups, notes)
     return replace(table, caption=f"{table.caption}, on {items}", best=BEST)
 
