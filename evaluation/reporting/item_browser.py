@@ -88,7 +88,7 @@ def browse_items(
     by_run = {folder: read_responses(run) for folder, run in runs.items()}
 
     def responses_of(m: Measurement) -> Responses:
-        return by_run[m.run.folder].get(m.row.key, {})
+        return by_run[m.run.folder].get(m.result.key, {})
 
     first: dict[str, Measurement] = {}
     for m in selections:
@@ -96,11 +96,11 @@ def browse_items(
         names = (str(other.run.folder), str(m.run.folder))
         check_same_items(responses_of(other), responses_of(m), names)
     browser, kept = ItemBrowser(), deduplicate(selections)
-    for name in dict.fromkeys(m.row.benchmark for m in kept):
+    for name in dict.fromkeys(m.benchmark for m in kept):
         models = {
             ", ".join([m.label, *m.variants]): (m, responses_of(m))
             for m in kept
-            if m.row.benchmark == name
+            if m.benchmark == name
         }
         try:
             store = open_store(stores / name)

@@ -38,22 +38,26 @@ class Measurement:
         training: Settings of the training run; None for a released model, empty if unknown.
     """
 
-    row: SelectionResult | RetrievalResult
+    result: SelectionResult | RetrievalResult
     run: FinishedRun
     name: str
     training: dict[str, Any] | None
 
     @property
+    def benchmark(self) -> str:
+        return self.result.benchmark
+
+    @property
     def variants(self) -> list[str]:
         """The suite and the control of its items; empty for the benchmark's unchanged items."""
-        if isinstance(self.row, RetrievalResult):
+        if isinstance(self.result, RetrievalResult):
             return []
-        return [variant for variant in (self.row.suite, self.row.control) if variant is not None]
+        return [x for x in (self.result.suite, self.result.control) if x is not None]
 
     @property
     def items(self) -> str:
         """The name of its item set: benchmark, suite and control."""
-        return ", ".join([self.row.benchmark, *self.variants])
+        return ", ".join([self.benchmark, *self.variants])
 
     @property
     def trained(self) -> bool:
@@ -64,7 +68,7 @@ class Measurement:
         return (self.training or {}).get("train", {}).get("regime")
 
     @property
-    def home(self) -> str | None:
+    def training_benchmark(self) -> str | None:
         """The benchmark that the model was trained on, if known."""
         return (self.training or {}).get("benchmark", {}).get("name")
 
@@ -81,7 +85,7 @@ class Measurement:
 
     @property
     def label(self) -> str:
-        return f"{self.name} ({self.row.mode})"
+        return f"{self.name} ({self.result.mode})"
 
     @property
     def is_transfer_suite(self) -> bool:
@@ -92,9 +96,9 @@ class Measurement:
     @property
     def line(self) -> tuple:
         """Identifies the line of a table: results with equal lines have equal names."""
-        row = self.row
-        variant = row.mode if isinstance(row, SelectionResult) else (row.width, row.builder)
-        return self.run.kind, self.items, row.name, variant
+        of = self.result
+        variant = of.mode if isinstance(of, SelectionResult) else (of.width, of.builder)
+        return self.run.kind, self.items, of.name, variant
 
 
 def read_measurements(
@@ -119,11 +123,11 @@ def deduplicate(measurements: Iterable[Measurement]) -> list[Measurement]:
     """
     kept: list[Measurement] = []
     for m in measurements:
-        if all(m.row != other.row for other in kept):
+        if all(m.result != other.result for other in kept):
             kept.append(m)
     counts = Counter(m.line for m in kept)
     return [
-        replace(m, name=f"{m.row.name}, {m.run.name}") if counts[m.line] > 1 else m for m in kept
+        replace(m, name=f"{m.result.name}, {m.run.name}") if counts[m.line] > 1 else m for m in kept
     ]
 
 
@@ -135,7 +139,7 @@ def shared_names(measurements: Iterable[Measurement]) -> list[str]:
     used: set[tuple] = set()
     names = []
     for m in measurements:
-        names.append(m.name if m.line[1:] in used else m.row.name)
+        names.append(m.name if m.line[1:] in used else m.result.name)
         used.add(m.line[1:])
     return names
 
@@ -153,9 +157,9 @@ def transfer_benchmarks(measurements: Sequence[Measurement]) -> set[str]:
 
     No model was trained on them, and they are transfer suites or measure a trained model.
     """
-    homes = {m.home for m in measurements if m.home}
-    measured = {m.row.benchmark for m in measurements if m.is_transfer_suite or m.home}
-    return measured - homes
+    trained_on = {m.training_benchmark for m in measurements if m.training_benchmark}
+    measured = {m.benchmark for m in measurements if m.is_transfer_suite or m.training_benchmark}
+    return measured - trained_on
 
 
 def widest_results(measurements: Iterable[Measurement]) -> list[Measurement]:
@@ -163,7 +167,7 @@ def widest_results(measurements: Iterable[Measurement]) -> list[Measurement]:
     widest: dict[tuple[Path, str], Measurement] = {}
     for m in measurements:
         # A report has the widest first.
-        if m.row.builder is None:
+        if m.result.builder is None:
             widest.setdefault((m.run.folder, m.name), m)
     return sorted(widest.values(), key=lambda m: m.trained)
 
@@ -175,11 +179,11 @@ def check_builds(measurements: Iterable[Measurement]) -> None:
     """
     builds: dict[str, Measurement] = {}
     for m in measurements:
-        other = builds.setdefault(m.row.benchmark, m)
+        other = builds.setdefault(m.benchmark, m)
         if m.run.report.build != other.run.report.build:
             raise UserError(
                 f"{other.run.folder} and {m.run.folder} measured different builds of benchmark "
-                f"{m.row.benchmark}: measure one of them again (run=NAME), or leave it out with "
+                f"{m.benchmark}: measure one of them again (run=NAME), or leave it out with "
                 "runs=[...]",
                 code="different-builds",
             )
@@ -199,7 +203,7 @@ def compare_models(
     """
     comparisons: list[PairedComparison] = []
     for pair in permutations(models, 2):
-        if not _is_claim(*(models[label][0] for label in pair)):
+        if not _is_paper_comparison(*(models[label][0] for label in pair)):
             continue
         credits = [
             {k: r.credit(items[k].letter) for k, r in models[label][1].items()} for label in pair
@@ -210,7 +214,7 @@ def compare_models(
     return comparisons
 
 
-def _is_claim(m: Measurement, other: Measurement) -> bool:
+def _is_paper_comparison(m: Measurement, other: Measurement) -> bool:
     """Whether the paper compares such models. These are:
 
     - a student and its base in the same mode,
@@ -220,10 +224,10 @@ def _is_claim(m: Measurement, other: Measurement) -> bool:
     """
     if m.run.kind == "similarity":
         # The row of a common base is kept once, under the run that measured it first.
-        return m.trained and not other.trained and other.row in m.run.report.rows
+        return m.trained and not other.trained and other.result in m.run.report.rows
     if m.regime not in REGIMES or other.base != m.base:
         return False
-    same_mode = other.row.mode == m.row.mode
+    same_mode = other.result.mode == m.result.mode
     if not other.trained:
         return same_mode
     if other.seed != m.seed:

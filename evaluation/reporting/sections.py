@@ -75,18 +75,18 @@ def build_sections(
     """
     unchanged = [m for m in selections if not m.variants]
     transfers = transfer_benchmarks(unchanged)
-    at_home = [m for m in unchanged if m.row.benchmark not in transfers]
+    in_domain = [m for m in unchanged if m.benchmark not in transfers]
     studies = [run for run in runs if run.kind in STUDY_KINDS]
     widest = widest_results(retrievals)
     sections = [
-        zero_shot([m for m in at_home if not m.trained], widest, studies),
-        distillation(at_home, widest, browser),
+        zero_shot([m for m in in_domain if not m.trained], widest, studies),
+        distillation(in_domain, widest, browser),
         ablation(unchanged),
         transfer(unchanged, transfers, browser),
         controls([m for m in selections if m.variants], runs),
         Section("Human study", [_study_table(study) for study in studies]),
         selection_details(unchanged, transfers),
-        retrieval_details([m for m in retrievals if m.row.builder is None]),
+        retrieval_details([m for m in retrievals if m.result.builder is None]),
         training([run for run in runs if run.kind in TRAINING_KINDS]),
     ]
     return [section for section in sections if section.tables or section.figures]
@@ -108,7 +108,7 @@ def _majority_rows(study: FinishedRun, m: Measurement) -> list[Row]:
     with reading(study.folder):
         build = (study.report["benchmark"], study.report.get("build"))
         votes = study.report["majority"]
-        if votes is None or build != (m.row.benchmark, m.run.report.build):
+        if votes is None or build != (m.benchmark, m.run.report.build):
             return []
         return [tables.human_row(f"Majority vote, {study.name}", votes)]
 
@@ -132,7 +132,7 @@ def distillation(selections: Rows, retrievals: Rows, browser: ItemBrowser) -> Se
 
 def ablation(selections: Rows) -> Section:
     """The regimes with rationales, in reasoning mode."""
-    rows = [m for m in selections if m.row.mode == "reasoning" and m.regime in REGIMES]
+    rows = [m for m in selections if m.result.mode == "reasoning" and m.regime in REGIMES]
     if not any(m.regime in ABLATED_REGIMES for m in rows):
         return Section("Ablation")
     rows.sort(key=lambda m: list(REGIMES).index(m.regime))
@@ -143,10 +143,10 @@ def ablation(selections: Rows) -> Section:
 def transfer(selections: Rows, transfers: Container[str], browser: ItemBrowser) -> Section:
     """Students on benchmarks that they were not trained on, and their bases."""
     section = Section("Transfer")
-    models = {(m.row.name, m.row.mode) for m in selections if m.row.benchmark in transfers}
-    if of_models := [m for m in selections if (m.row.name, m.row.mode) in models]:
+    models = {(m.result.name, m.result.mode) for m in selections if m.benchmark in transfers}
+    if measured := [m for m in selections if (m.result.name, m.result.mode) in models]:
         table = tables.overall_table(
-            "transfer", of_models, lambda m, name: f"{name} ({m.row.mode})"
+            "transfer", measured, lambda m, name: f"{name} ({m.result.mode})"
         )
         section.tables.append(table)
     for benchmark, rows in group_by_items(selections).items():
@@ -190,11 +190,11 @@ def _study_table(run: FinishedRun) -> Table:
 def selection_details(selections: Rows, transfers: Container[str]) -> Section:
     section = Section("Selection in detail")
     for benchmark, rows in group_by_items(selections).items():
-        if horizons := {m.label: m.row.horizons for m in rows if m.row.horizons}:
+        if horizons := {m.label: m.result.horizons for m in rows if m.result.horizons}:
             plot = partial(figures.accuracy_figure, with_paper=benchmark not in transfers)
             caption = f"Accuracy by horizon on {benchmark}."
             section.figures.append(Figure(f"horizons-{benchmark}", caption, plot, horizons))
-        details = tables.detail_tables({m.label: (m.row.key, m.run.report) for m in rows})
+        details = tables.detail_tables({m.label: (m.result.key, m.run.report) for m in rows})
         section.tables += [_name_table(replace(t, folded=True), benchmark) for t in details]
     return section
 
@@ -202,11 +202,11 @@ def selection_details(selections: Rows, transfers: Container[str]) -> Section:
 def retrieval_details(retrievals: Rows) -> Section:
     section = Section("Retrieval in detail")
     for benchmark, rows in group_by_items(retrievals).items():
-        ordered = sorted(rows, key=lambda m: (-(m.row.width or 0), not m.row.untrained))
+        ordered = sorted(rows, key=lambda m: (-(m.result.width or 0), not m.result.untrained))
         section.tables.append(replace(tables.summary_table("widths", ordered), folded=True))
-        if any(m.row.width for m in rows):
+        if any(m.result.width for m in rows):
             plot, caption = figures.retrieval_figure, f"Recall by width on {benchmark}."
-            results = [(m.name, m.row) for m in rows]
+            results = [(m.name, m.result) for m in rows]
             section.figures.append(Figure(f"widths-{benchmark}", caption, plot, results))
     return section
 
@@ -231,5 +231,5 @@ def _name_table(table: Table, name: str, title: str = "") -> Table:
 def _family_figure(name: str, rows: Rows, with_paper: bool = True) -> Figure:
     plot = partial(figures.accuracy_figure, with_paper=with_paper)
     caption = f"Accuracy by family on {rows[0].items}, with 95% intervals."
-    shares = {m.label: m.row.families for m in rows}
+    shares = {m.label: m.result.families for m in rows}
     return Figure(f"{name}-{rows[0].items}", caption, plot, shares)

@@ -292,14 +292,14 @@ def summary_table(name: str, rows: Sequence[Measurement], people: Sequence[Row] 
         people: Rows of a human study.
     """
     groups: dict[str, list[Row]] = {label: [] for label in GROUPS}
-    if isinstance(rows[0].row, SelectionResult):
+    if isinstance(rows[0].result, SelectionResult):
         columns, notes = SELECTION_COLUMNS, (SELECTION_NOTE, BEST_NOTE)
         for m in rows:
-            groups[_group(m)] += selection_rows(m.label, m.row)
+            groups[_group(m)] += selection_rows(m.label, m.result)
     else:
-        columns, notes = RETRIEVAL_COLUMNS, (*retrieval_notes(rows[0].row), BEST_NOTE)
+        columns, notes = RETRIEVAL_COLUMNS, (*retrieval_notes(rows[0].result), BEST_NOTE)
         for m in rows:
-            groups[_group(m)].append(retrieval_row(m.name, m.row))
+            groups[_group(m)].append(retrieval_row(m.name, m.result))
     groups["people, on the items of their study"] = [*people]
     items = rows[0].items
     table = table_with_paper(name, f"{name}-{items.replace(', ', '-')}", columns, groups, notes)
@@ -307,12 +307,12 @@ def summary_table(name: str, rows: Sequence[Measurement], people: Sequence[Row] 
 
 
 def _group(m: Measurement) -> str:
-    if isinstance(m.row, RetrievalResult):
+    if isinstance(m.result, RetrievalResult):
         two_stage = m.run.kind == "two_stage"
         return "two-stage predict-then-match" if two_stage else "direct embedders"
     if m.trained:
         return "trained"
-    return "similarity scorers" if m.row.mode == SIMILARITY else "generative models"
+    return "similarity scorers" if m.result.mode == SIMILARITY else "generative models"
 
 
 def overall_table(
@@ -330,7 +330,7 @@ def overall_table(
     lines: dict[str, dict[str, Any]] = {}
     for m, model, column in zip(rows, names, benchmarks, strict=True):
         empty = {"name": label(m, model), **dict.fromkeys(columns)}
-        lines.setdefault(empty["name"], empty)[column] = m.row.micro
+        lines.setdefault(empty["name"], empty)[column] = m.result.micro
     notes = ("Wilson 95% intervals over items.", BEST_NOTE)
     table = table_with_paper(name, name, columns, {"": [*lines.values()]}, notes)
     return replace(table, best=dict.fromkeys(columns, max))
@@ -341,17 +341,17 @@ def _benchmark_columns(rows: Sequence[Measurement]) -> list[str]:
 
     A column that several benchmarks would share is divided, and also names the benchmark.
     """
-    homes = {m.home for m in rows if m.home}
+    trained_on = {m.training_benchmark for m in rows if m.training_benchmark}
 
     def column(m: Measurement) -> str:
         # A released model has no training benchmark: it is in domain where some student is.
-        if m.row.benchmark == m.home or (not m.trained and m.row.benchmark in homes):
+        if m.benchmark in ({m.training_benchmark} if m.trained else trained_on):
             return "In domain"
         simulator = m.run.config.get("benchmark", {}).get("simulator")
-        return TRANSFER_SUITES.get(simulator, m.row.benchmark)
+        return TRANSFER_SUITES.get(simulator, m.benchmark)
 
-    benchmarks = Counter(name for name, _ in {(column(m), m.row.benchmark) for m in rows})
+    benchmarks = Counter(name for name, _ in {(column(m), m.benchmark) for m in rows})
     return [
-        f"{name} ({m.row.benchmark})" if benchmarks[name] > 1 else name
+        f"{name} ({m.benchmark})" if benchmarks[name] > 1 else name
         for m, name in zip(rows, map(column, rows), strict=True)
     ]
