@@ -175,15 +175,14 @@ def test_responses_to_a_suite_are_shown_beside_those_to_all_items(runs, micro, m
 
 def test_the_report_has_controls_and_their_differences(runs, report):
     path = runs / "select" / "cot" / "report.json"
-    report = json.loads(path.read_text())
-    report["rows"].append(dict(report["rows"][0], control="candidate_only"))
-    report["controls"] = [
+    [row] = json.loads(path.read_text())["rows"]
+    controls = [
         {"mode": "reasoning", "left": "unchanged", "right": "candidate_only", "n": 63,
          "of": "all", "left_accuracy": 0.75, "right_accuracy": 0.5, "difference": 0.25,
          "low": 0.1, "high": 0.375, "p": 0.001, "only_left": 20,
          "only_right": 4},
     ]  # fmt: skip
-    path.write_text(json.dumps(report))
+    update_report(path, rows=[row, row | {"control": "candidate_only"}], controls=controls)
     folder = report(items=1)
     row = "| all | 75.0 | 50.0 | +25.0 | +10.0 to +37.5 | 20 | 4 | 0.001 | 63 |"
     assert row in read_table(folder, "paired-select-cot")
