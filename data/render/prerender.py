@@ -13,14 +13,7 @@ from typing import Any
 from data.parallel import Workers
 from data.records import POOLS, sample_prefix_frames
 from data.render.frame_cache import frames_path, load_frames, render_frames, save_frames
-from data.store import (
-    DATABASES,
-    FRAMES_FOLDER,
-    Store,
-    load_scene,
-    scene_path,
-    write_atomically,
-)
+from data.store import DATABASES, FRAMES_FOLDER, Store, load_scene, scene_path, write_atomically
 from data.tracks.controls import MATCHED_ANCHOR
 
 log = logging.getLogger(__name__)

@@ -14,13 +14,7 @@ import numpy as np
 from conf.schema import BenchmarkConfig
 from data.records import COLORS, FPS, MATERIALS, SHAPES, Scene, SceneObject
 from data.world.camera import STANDARD_CAMERA, Camera
-from data.world.physics import (
-    STANDARD_PHYSICS,
-    Body,
-    Motion,
-    Physics,
-    shared_simulator,
-)
+from data.world.physics import STANDARD_PHYSICS, Body, Motion, Physics, shared_simulator
 from data.world.shapes import BOUNDING_RADIUS, RADIUS
 from data.world.visibility import compute_visibility
 

@@ -20,6 +20,11 @@ EVENTS_PER_SCENE = 3
 ONE_PER_SCENE = (4, 5, 6)
 """Builders that use one event of a scene (paper, retrieval construction)."""
 NEXT_COLLISION = "Which frame shows the scene at the moment of the next collision?"
+AFTER_COLLISION = (
+    "The observation ends at a collision. Which frame shows the scene 1 second after that "
+    "collision?"
+)
+AFTER_NEXT_COLLISION = "Which frame shows the scene half a second after the next collision?"
 
 Choice = tuple[str, int, int, int]
 """A question about a scene, the first and last frame of its prefix, and its target frame."""
@@ -61,18 +66,9 @@ BUILDERS: dict[int, Callable[[Scene], Iterator[Choice]]] = {
     1: _clip_end,
     2: _clock,
     3: _next_event,
-    4: partial(
-        _around_event,
-        0,
-        "The observation ends at a collision. Which frame shows the scene 1 second after that "
-        "collision?",
-    ),
+    4: partial(_around_event, 0, AFTER_COLLISION),
     5: partial(_around_event, FPS, NEXT_COLLISION),
-    6: partial(
-        _around_event,
-        FPS // 2,
-        "Which frame shows the scene half a second after the next collision?",
-    ),
+    6: partial(_around_event, FPS // 2, AFTER_NEXT_COLLISION),
 }
 """Each builder yields all questions that it can ask about a scene."""
 
