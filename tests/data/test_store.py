@@ -152,6 +152,9 @@ def test_damaged_or_missing_file_is_named(copy, part) -> None:
         open_store(copy)
 
 
+VERSION_KEYS = {name: f'"{name}": "'.encode() for name in ("generator", "renderer", "builders")}
+
+
 @pytest.mark.parametrize(
     ("damage", "code", "name"),
     [
@@ -159,13 +162,10 @@ def test_damaged_or_missing_file_is_named(copy, part) -> None:
         (lambda whole: b"[]", "damaged-file", MANIFEST),
         (lambda whole: b"\xff" + whole, "damaged-file", MANIFEST),
         (lambda whole: whole.replace(b'"scenes": 6', b'"scenes": 7'), "damaged-file", MANIFEST),
+        # The first key of this name is the version; the settings follow.
         *(
-            (
-                lambda whole, k=key: whole.replace(b'"%s": "' % k, b'"%s": "0' % k),
-                "different-version",
-                key.decode(),
-            )
-            for key in (b"generator", b"renderer", b"builders")
+            (lambda whole, key=key: whole.replace(key, key + b"0", 1), "different-version", name)
+            for name, key in VERSION_KEYS.items()
         ),
     ],
 )
