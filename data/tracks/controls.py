@@ -41,7 +41,7 @@ def timings(subtype: str, scene: Scene) -> list[Timing]:
 
 
 def fill_pairs(cell: CellInputs) -> tuple[list[SelectionItem], int]:
-    """Make pairs up to the quota, as two items in a row; see `data.tracks.quota.fill_quota`."""
+    """Make pairs up to the quota. The two items of a pair follow each other."""
     items, dropped = fill_quota(MATCHED_ANCHOR, Family({}, timings, time.make_item), cell)
     return [each for item in items for each in _pair(item)], dropped
 

@@ -23,11 +23,8 @@ HORIZONS = (1, 2, 3)
 
 
 def removed_object(scene: Scene, seed: int) -> int | None:
-    """Sample the object to remove, among those whose first contact follows the prefix.
-
-    The object must be on screen at the prefix's end, and the prefix at least a second long. None
-    where no object qualifies.
-    """
+    """Sample the object to remove, among those whose first contact follows a prefix of at least a
+    second and that are on screen at its end. None where there is no such object."""
     stops = {k: _prefix_stop(scene, k) for k in range(len(scene.objects))}
     on_screen = on_screen_positions(scene)[1]
     eligible = [k for k, stop in stops.items() if stop is not None and on_screen[stop, k]]
