@@ -16,7 +16,6 @@ from transformers.trainer_callback import TrainerState
 
 from conf.errors import UserError
 from conf.runs import Run, rank, run_id
-from models.compat import load_checkpoint
 from models.distributed import is_sharded
 from models.memory import explain_out_of_memory
 from train.common.arguments import PROJECT
@@ -153,7 +152,7 @@ def load_weights(trainer: Trainer, checkpoint: Path) -> None:
         # A sharded checkpoint needs a sharded model, and accelerate shards it with its optimizer.
         trainer.create_optimizer()
         trainer.accelerator.prepare(trainer.model, trainer.optimizer)
-    load_checkpoint(trainer, checkpoint)
+    trainer._load_from_checkpoint(str(checkpoint))
 
 
 def gather_weights(trainer: Trainer) -> dict[str, torch.Tensor] | None:
