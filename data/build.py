@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from conf.compose import nearest_key
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
+from conf.runs import setting_differences, wait_for_lock
 from conf.schema import BenchmarkConfig, BuildCommand
 from data.parallel import Workers
-from data.partial_build import check_same_settings, lock_partial_build
+from data.records import SPLITS
 from data.render.prerender import RECORD, prerender_frames
 from data.store import (
     FRAMES_FOLDER,
@@ -36,8 +41,15 @@ from data.tracks.retrieval import future
 from data.tracks.retrieval.database import make_databases
 from data.tracks.shortfalls import count_records, find_shortfalls, summarize_store
 from data.world.scenes import make_scenes
+from data.world.standins import generator_version
 
 log = logging.getLogger(__name__)
+
+SCENE_SETTINGS = (
+    "simulator", "standin", "seed", "test_share", "min_objects", "max_objects", "max_collisions",
+    "fps",
+)  # fmt: skip
+"""Settings that determine the scenes. The file name of any other part is a hash of its settings."""
 
 
 @command("data.build", BuildCommand)
@@ -125,26 +137,73 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
 
 def check_names(cfg: BenchmarkConfig) -> None:
     """Raises SettingsError where a quota names an unknown family, subtype or builder."""
-    families = item_families(cfg)
-    quotas = {f"selection.{family}": named for family, named in family_quotas(cfg).items()}
-    known = {f"selection.{family}": list(module.CELLS) for family, module in families.items()}
-    quotas["retrieval.builders"] = cfg.retrieval.builders
+    known = {f"selection.{name}": list(f.cells) for name, f in item_families(cfg).items()}
     known["retrieval.builders"] = [str(b) for b in future.BUILDERS]
-    problems = [
-        f"benchmark.{key}.{name}: unknown name, did you mean "
-        f"{nearest_key(name, known[key]) or known[key][0]}? "
-        f"The options are {', '.join(known[key])}"
-        for key, named in quotas.items()
-        for name in named
-        if key in known and name not in known[key]
-    ]
-    problems += [
-        f"benchmark.{key}: suite {suite_name(cfg)} has no items of this family; remove it"
-        for key, named in quotas.items()
-        if named and key not in known
-    ]
+    quotas = {f"selection.{family}": named for family, named in family_quotas(cfg).items()}
+    problems = []
+    for key, named in {**quotas, "retrieval.builders": cfg.retrieval.builders}.items():
+        options = known.get(key, [])
+        if named and not options:
+            problems.append(
+                f"benchmark.{key}: suite {suite_name(cfg)} has no items of this family; remove it"
+            )
+        problems += [
+            f"benchmark.{key}.{name}: unknown name, did you mean "
+            f"{nearest_key(name, options) or options[0]}? The options are {', '.join(options)}"
+            for name in named
+            if options and name not in options
+        ]
     if problems:
         raise SettingsError("\n".join(problems), code="unknown-option")
+
+
+@contextmanager
+def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | None]:
+    """Lock the folder beside `folder` that a build writes to; wait while another process holds it.
+
+    A killed build resumes from the parts in that folder.
+
+    Yields:
+        The folder, or None if the other process has completed `folder` meanwhile.
+
+    Raises:
+        UserError: the folder holds an unfinished build with other settings.
+    """
+    partial = folder.with_name(f".{folder.name}.partial")
+    partial.mkdir(parents=True, exist_ok=True)
+    plan = {
+        "generator": generator_version(cfg.standin),
+        "benchmark": {key: getattr(cfg, key) for key in SCENE_SETTINGS},
+        "counterfactual scenes": {
+            split: getattr(cfg.retrieval.counterfactual, split) > 0 for split in SPLITS
+        },
+    }
+    handle = os.open(partial, os.O_RDONLY)
+    try:
+        wait_for_lock(handle, f"{folder} is being built by another process")
+        if folder.exists():
+            shutil.rmtree(partial, ignore_errors=True)
+            yield None
+            return
+        if (partial / PLAN).exists():
+            # Scenes take hours to simulate, so a changed setting does not discard them silently.
+            check_same_settings(json.loads((partial / PLAN).read_text()), plan, partial)
+        for leftover in partial.rglob(".*.partial"):
+            leftover.unlink()
+        write_atomically(partial / PLAN, json.dumps(plan).encode())
+        yield partial
+    finally:
+        os.close(handle)
+
+
+def check_same_settings(old: dict[str, Any], new: dict[str, Any], folder: Path) -> None:
+    """Raises UserError where the nested settings of two builds differ."""
+    if differences := setting_differences(old, new):
+        raise UserError(
+            f"{folder} was built with another setting: {differences[0]}. Use the earlier setting, "
+            f"choose another name with benchmark.name=NAME, or delete {folder}",
+            code="different-settings",
+        )
 
 
 if __name__ == "__main__":

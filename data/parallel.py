@@ -26,9 +26,9 @@ log = logging.getLogger(__name__)
 Element = TypeVar("Element")
 Job = Callable[[], Any]
 CHUNK = 32
-"""Jobs per worker in one batch; workers wait for each other between batches."""
+"""Jobs per worker in one batch; all workers finish a batch before the next one starts."""
 MAX_DEATHS = 3
-"""Number of workers that may die in a row before a job finishes."""
+"""Worker deaths in a row, without a finished job between them, that `run` tolerates."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ FRAMES = 128
 FPS = 25
 """Frames per second of a scene, and of the retrieval builders."""
 SELECTION_SECOND = 26
-"""Frames that the selection track's time builder counts as one second (128 frames in about 5 s)."""
+"""Frames per second in the time family of selection items (128 frames in about 5 s)."""
 LETTERS = "ABCD"
 
 SHAPES = ("cube", "sphere", "cylinder")
@@ -33,27 +33,27 @@ FAMILIES = ("event", "time", "window")
 
 @dataclass(frozen=True)
 class SceneObject:
-    """The appearance of an object.
+    """The appearance of an object. No two objects of our own scenes are equal.
 
-    No two objects of a simulated scene are equal; those of a transfer suite may be. An attribute
-    that a simulator's record lacks is empty.
+    An attribute that another simulator does not record is empty.
     """
 
     shape: str
     material: str = ""
     color: str = ""
     size: str = ""
-    """small or large for a simulator with several object sizes."""
+    """small or large in MoVi-A, whose objects have two sizes."""
 
     @property
-    def phrase(self) -> str:
+    def noun_phrase(self) -> str:
         """The noun phrase that names the object, such as "blue metal cube"."""
         return " ".join(filter(None, (self.size, self.color, self.material, self.shape)))
 
 
 @dataclass(frozen=True)
 class Collision:
-    """The first contact of two objects: the first frame at or after it, and their indices."""
+    """The first contact of two objects: the first frame at or after the contact, and their
+    indices."""
 
     frame: int
     objects: tuple[int, int]
@@ -61,8 +61,8 @@ class Collision:
 
 @dataclass(frozen=True)
 class Landing:
-    """An object's first contact with the ground after a fall: the first frame at or after it, and
-    the object's index."""
+    """An object's first contact with the ground after a fall: the first frame at or after the
+    contact, and the object's index."""
 
     frame: int
     object: int
@@ -109,26 +109,18 @@ class Scene:
     footage: str | None = None
 
     ARRAYS = (
-        "positions",
-        "quaternions",
-        "velocities",
-        "angular_velocities",
-        "image_positions",
-        "in_view",
-        "visible_fraction",
-    )
+        "positions", "quaternions", "velocities", "angular_velocities", "image_positions",
+        "in_view", "visible_fraction",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
-        frames, count = self.positions.shape[:2]
         shapes = {name: getattr(self, name).shape for name in self.ARRAYS}
-        if any(shape[:2] != (frames, count) for shape in shapes.values()):
-            raise ValueError(f"scene {self.scene_id}: the shapes of its arrays differ: {shapes}")
-        if len(self.objects) != count:
+        if any(shape[:2] != (self.frames, len(self.objects)) for shape in shapes.values()):
             raise ValueError(
-                f"scene {self.scene_id}: {len(self.objects)} objects, but states of {count}"
+                f"scene {self.scene_id}: expected arrays of "
+                f"{self.frames} frames and {len(self.objects)} objects, but they have the shapes "
+                f"{shapes}"
             )
-        if self.footage is None and len(set(self.objects)) != count:
-            raise ValueError(f"scene {self.scene_id}: two objects share shape, material and color")
 
     @property
     def frames(self) -> int:
@@ -183,8 +175,8 @@ def _adapter(record: type[Record]) -> TypeAdapter:
 class SelectionItem(Record):
     """A question with four candidate frames, one of which is the target.
 
-    `prefix_start` and `prefix_stop` are inclusive. A construction axis that does not apply is None.
-    `min_displacement` is the smallest displacement between two candidates, px at 336 x 336.
+    `prefix_start` and `prefix_stop` are inclusive. `min_displacement` is the smallest displacement
+    between two candidates, px at 336 x 336. A construction axis that does not apply is None.
     """
 
     item_id: str
@@ -215,15 +207,12 @@ class SelectionItem(Record):
                 f"item {self.item_id}: prefix {self.prefix_start} to {self.prefix_stop} "
                 f"does not end before target {self.target_frame}"
             )
-        target = [
-            i
-            for i, c in enumerate(self.candidates)
-            if (c.scene_id, c.frame) == (self.scene_id, self.target_frame)
-        ]
-        if len(self.candidates) != 4 or target != [self.answer]:
+        target = (self.scene_id, self.target_frame)
+        is_target = [(c.scene_id, c.frame) == target for c in self.candidates]
+        if is_target != [k == self.answer for k in range(4)]:
             raise ValueError(
-                f"item {self.item_id}: expected four candidates with the target at index "
-                f"{self.answer}, but the target is at {target} of {len(self.candidates)}"
+                f"item {self.item_id}: expected four candidates, the target only at index "
+                f"{self.answer}"
             )
 
     @property
@@ -294,6 +283,8 @@ class Rationale(Record):
 
 
 def sample_prefix_frames(start: int, stop: int, count: int) -> list[int]:
-    """Sample `count` frames of the inclusive range [start, stop], evenly and with both ends; all
-    frames where the range has no more."""
+    """Sample `count` evenly spaced frames of the inclusive range [start, stop] with both ends.
+
+    A shorter range gives all its frames.
+    """
     return [int(f) for f in np.linspace(start, stop, min(count, stop - start + 1)).round()]

@@ -2,7 +2,7 @@
 
     store/<name>/
         manifest.json        config, versions, counts, and the SHA-256 of every file below
-        scenes/<id>.npz      the oracle of a scene; <id>-without-<k> lacks object k
+        scenes/<id>.npz      the oracle of a scene; <id>-without-<k> is simulated without object k
         selection.parquet retrieval.parquet database.parquet
         frames/<id>.zip      cache of a scene's rendered frames; not in the manifest
         embeddings/          cache of embeddings of frames and queries; not in the manifest
@@ -10,8 +10,8 @@
         rationales.parquet   accepted rationales of the last narration; not in the manifest
 
 A build writes to a folder beside the store and renames it when it is complete. Every part is
-written atomically, so that a killed build resumes with the parts it has. Frames follow from the
-oracle and the renderer, so they can be rendered later, or deleted.
+written atomically, so that a killed build resumes with the complete parts. Frames are a function of
+the oracle and the renderer, so they can be deleted, and rendered later.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     preset, store, embedders = open_retriever(cfg, run)
     queries, database = standard_test.load_standard_test(store)
     names = [f.name for f in database]
-    rows, curves, ranks = [], [], {}
+    rows, ranks = [], {}
     for embedder in embedders:
         query_embeddings = embedder.embed_queries(queries)
         embeddings = embedder.embed_frames(database)
@@ -33,13 +33,12 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
             embeddings.parts(names),
         )
         rows += results.retrieval_results(store.name, name, ranks[name], queries, cfg.seed)
-        curves.append(results.recall_curve(name, ranks[name]))
 
     differences = results.compare_retrievers(ranks, queries, cfg.seed)
     extra = [tables.rank_differences_table(differences)] if differences else []
     standard_test.write_ranks(run.folder, ranks, queries)
     entries = {"build": store.identity, "differences": differences}
-    standard_test.write_report(run.folder, rows, curves, extra, **entries)
+    standard_test.write_report(run.folder, rows, extra, **entries)
     return {name: of.value for name, of in rows[0].measures.items() if name != "tie_rate"}
 
 

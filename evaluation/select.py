@@ -60,21 +60,14 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
             answers[mode, control] = response_log.collect_responses(items, mode, respond, responses)
             keys[mode, control] = responses.keys[mode]
 
-    variants = [[*variant, key] for variant, key in keys.items()]
     choices = [
         selection_report.Choices.from_answers(model.name, *variant, responses)
         for variant, responses in answers.items()
     ]
     results = selection_report.write_report(
-        choices,
-        items,
-        store.name,
-        cfg.seed,
-        run.folder,
-        cfg.suite,
-        build=store.identity,
-        asked=variants,
-    )
+        choices, items, store.name, cfg.seed, run.folder, cfg.suite, build=store.identity,
+        asked=[(*variant, key) for variant, key in keys.items()],
+    )  # fmt: skip
     return {
         f"{r.mode}_{name}": value
         for r in results

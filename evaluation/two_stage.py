@@ -61,14 +61,13 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     # Free the memory for the matcher.
     del model
 
-    rows, curves, matched, metrics = [], [], [], {}
+    rows, matched, metrics = [], [], {}
     for key, route in zip(routes, chosen, strict=True):
         log.info("matching %s with %s", route.title, matcher.name)
         ranks = text_matching.rank_by_text(route, matcher, texts, queries, database)
         title = f"{name} {route.title}, {matcher.name.removeprefix(results.UNTRAINED).strip()}"
         route_rows = results.retrieval_results(store.name, title, ranks, queries, cfg.seed)
         rows += route_rows
-        curves.append(results.recall_curve(title, ranks))
         # At the widest width; a miss has the last rank.
         counts = ranks.greater[0], ranks.tied[0], ranks.found
         places = query_metrics(*counts, ranks.frames, ())["median_rank"].tolist()
@@ -83,7 +82,6 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     standard_test.write_report(
         run.folder,
         rows,
-        curves,
         [tables.parsing_table(counts)],
         "two_stage",
         build=store.identity,

@@ -1,7 +1,8 @@
-"""Checks that a base, its processor and its adapters fit together."""
+"""Checks that a base, its processor and the parts that were trained over it fit together."""
 
 from __future__ import annotations
 
+import json
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from safetensors import safe_open
 
 from conf.errors import UserError
+from conf.schema import RetrieverConfig
 
 if TYPE_CHECKING:
     from torch import nn
@@ -25,6 +27,10 @@ PROCESSOR_FIELDS = {
     "video_token_id": "video_token_id",
 }
 """Fields of a processor, and what they equal in the configuration of its model."""
+SINGLE_VECTOR_MODULES = ("Transformer", "Pooling", "Normalize")
+"""Modules of a retriever with one vector, of which only the first is trained."""
+POOLING = "lasttoken"
+"""The library's name for the pooling of a retriever with one vector."""
 
 
 def check_tower(model: str, config: PreTrainedConfig) -> None:
@@ -69,10 +75,10 @@ def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:
 
 
 def check_adapters(folder: Path, base: nn.Module, rank: int, model: str | None) -> None:
-    """Check that the adapters in a folder fit a base, with or without adapters, and a rank. A whole
-    model and FSDP's checkpoints have no such file and pass.
+    """Check that the adapters in a folder, if there are any, fit a base and a rank.
 
     Args:
+        base: The model itself, with or without adapters.
         rank: student.lora.rank.
         model: student.model.
 
@@ -98,10 +104,75 @@ def check_adapters(folder: Path, base: nn.Module, rank: int, model: str | None) 
         module = modules.get(adapted)
         actual = module and getattr(module, "in_features" if side[0] == "A" else "out_features")
         if actual != width:
-            difference = f"is {width} wide there and {actual} here" if module else "does not exist"
+            difference = f"has width {width}, not {actual}" if module else "does not exist"
             raise UserError(
                 f"{folder} has adapters of another base than {model} ({adapted} {difference}): "
                 "give the base that they were trained over with student.model=FOLDER, or train "
                 "again",
                 code="other-base",
             )
+
+
+def check_family(model: str, config: PreTrainedConfig) -> None:
+    """Raise UserError if a retriever's base is not a Qwen3-VL, whose masks, positions and features
+    the trainer relies on."""
+    if config.model_type != "qwen3_vl":
+        raise UserError(
+            f"retriever.model={model} is a {config.model_type}; retriever.encoder=qwen3_vl loads "
+            "and trains Qwen3-VL models only, such as Qwen3-VL-Embedding",
+            code="unsupported-model",
+        )
+
+
+def check_modules(saved: str | Path, revision: str | None = None, late: bool = False) -> None:
+    """Check the modules after the backbone of a saved retriever.
+
+    Args:
+        late: Whether it is the base of a retriever with many vectors, whose pooling is not used.
+
+    Raises:
+        UserError: they have trained weights, which a retriever trained over this one would lose; or
+            they do not pool the last token; or the list of the modules is damaged.
+    """
+    from sentence_transformers.sentence_transformer.modules import Pooling
+    from sentence_transformers.util import load_file_path
+
+    try:
+        path = load_file_path(str(saved), "modules.json", revision=revision)
+        modules = json.loads(Path(path).read_text())
+        paths = {module["type"].rpartition(".")[2]: module["path"] for module in modules}
+        pooling = None
+        if "Pooling" in paths:
+            config = Pooling.load_config(str(saved), paths["Pooling"], revision=revision)
+            pooling = config.get("pooling_mode")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{saved} is damaged: its list of modules cannot be read ({error}); train or download "
+            "it again",
+            code="damaged-file",
+        ) from error
+    if lost := [kind for kind in paths if kind not in SINGLE_VECTOR_MODULES]:
+        raise UserError(
+            f"{saved} has modules after its backbone that a retriever trained over it would lose "
+            f"({', '.join(lost)}): give a base, or measure it as the run that trained it "
+            "(model=RUN)",
+            code="unsupported-model",
+        )
+    if not late and pooling != POOLING:
+        actual = f"with {pooling} pooling" if pooling else "without pooling"
+        raise UserError(
+            f"{saved} was saved {actual}, but embeddings are taken from the last token "
+            f"({POOLING}): give a run of train.contrastive or a Qwen3-VL-Embedding",
+            code="unsupported-model",
+        )
+
+
+def check_widths(cfg: RetrieverConfig, entries: int) -> None:
+    """Raise UserError if a retriever's widest width exceeds the entries of its embeddings."""
+    if cfg.widths[0] > entries:
+        fitting = ",".join(str(w) for w in cfg.widths if w <= entries) or entries
+        raise UserError(
+            f"retriever.widths has {cfg.widths[0]}, but the embeddings of {cfg.name} have "
+            f"{entries} entries: set retriever.widths=[{fitting}]",
+            code="too-wide",
+        )

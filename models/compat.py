@@ -11,6 +11,9 @@ Hooks that are used through subclasses or inputs, outside of this file:
   `LoraVariant` in their `lora_variant`, and overrides `_cast_input_dtype`.
 - `models.attention` registers a function whose name contains "flash": Qwen3-VL's vision tower
   passes all frames at once, with `cu_seq_lens_q` and `max_length_q`, only to those.
+- `train.common.training_loop` calls `Trainer._load_from_checkpoint`, which also reads the parts of
+  an FSDP checkpoint.
+- `models.retriever.multi_vector` loads with `MultiVectorEncoder._load_with_module_classes`.
 - `train.retriever.trainer` overrides `_load_from_checkpoint`, `_load_best_model`,
   `get_batch_sampler` and `collect_features`.
 - `train.retriever.inputs` adds a model's input in a forward pre-hook, which
@@ -24,15 +27,13 @@ import ctypes
 import sys
 from collections.abc import Iterable
 from dataclasses import fields
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
-from transformers import PreTrainedModel, Trainer, TrainingArguments
+from transformers import PreTrainedModel, TrainingArguments
 
 if TYPE_CHECKING:
-    from sentence_transformers import MultiVectorEncoder
     from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
 
 
@@ -72,20 +73,6 @@ def encoder_outputs(layers: Iterable[torch.Tensor]) -> BaseModelOutputWithDeepst
     return BaseModelOutputWithDeepstackFeatures(
         pooler_output=(merged,), deepstack_features=[(layer,) for layer in deepstack]
     )
-
-
-def load_multi_vector(folder: str, classes: dict[str, type], **options: Any) -> MultiVectorEncoder:
-    """Load a saved multi-vector retriever by the private `_load_with_module_classes`: modules that
-    its folder names are those of `classes`, and code in the folder is not executed."""
-    from sentence_transformers import MultiVectorEncoder
-
-    return MultiVectorEncoder._load_with_module_classes(folder, classes, **options)
-
-
-def load_checkpoint(trainer: Trainer, checkpoint: Path) -> None:
-    """Load a checkpoint's weights into a trainer's model by the private `_load_from_checkpoint`,
-    which also reads the parts of an FSDP checkpoint."""
-    trainer._load_from_checkpoint(str(checkpoint))
 
 
 def keep_differentiable(model: nn.Module) -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 from conf.errors import UserError
 from conf.runs import rank, world_size
@@ -14,45 +14,26 @@ from conf.runs import rank, world_size
 if TYPE_CHECKING:
     import torch
 
-T = TypeVar("T")
-
 
 @contextmanager
 def main_first() -> Iterator[None]:
     """Run a block on the main rank first; the others wait as long as it takes, then run it too.
 
-    Work that is kept on disk is thus done once, and every rank reads the result from there.
+    Work whose result is kept on disk is thus done once.
     """
     if world_size() == 1:
         yield
         return
-    with _waiting_group() as (distributed, group):
-        if rank() > 0:
-            distributed.barrier(group)
-        yield
-        if rank() == 0:
-            distributed.barrier(group)
-
-
-def from_main(function: Callable[[], T]) -> T:
-    """Return, on every rank, what `function` returns on the main rank; the others wait for it."""
-    if world_size() == 1:
-        return function()
-    with _waiting_group() as (distributed, group):
-        result = [function() if rank() == 0 else None]
-        distributed.broadcast_object_list(result, src=0, group=group)
-    return result[0]
-
-
-@contextmanager
-def _waiting_group() -> Iterator[tuple[Any, Any]]:
-    """Yield torch.distributed and a group of all ranks whose timeout covers any preparation. In the
-    default group, a rank that waits that long has lost another."""
     from torch import distributed
 
     rank_device()
+    # The default group has a timeout for the steps of training, which preparations may exceed.
     group = distributed.new_group(backend="gloo", timeout=timedelta(days=30))
-    yield distributed, group
+    if rank() > 0:
+        distributed.barrier(group)
+    yield
+    if rank() == 0:
+        distributed.barrier(group)
     distributed.destroy_process_group(group)
 
 

@@ -130,15 +130,6 @@ def is_hub_model(model: str | None) -> bool:
     return model is not None and not Path(model).is_dir()
 
 
-def model_id(cfg: Preset) -> str | None:
-    """Return a preset's model: its folder, or NAME@COMMIT of the hub."""
-    return _id(cfg.model, cfg.revision)
-
-
-def image_model_id(cfg: RetrieverConfig) -> str | None:
-    """Return the same for the model that embeds frames, where a retriever has a separate one."""
-    return _id(cfg.image_model, cfg.image_revision)
-
-
-def _id(model: str | None, revision: str | None) -> str | None:
+def model_id(model: str | None, revision: str | None) -> str | None:
+    """Return the folder of a model, or NAME@COMMIT of the hub."""
     return f"{model}@{revision}" if is_hub_model(model) and revision else model

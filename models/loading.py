@@ -277,7 +277,12 @@ def write_model(
     try:
         model.save_pretrained(folder, state_dict=weights)
     except SafetensorError as error:
-        raise unwritable_error(folder.parent, str(error)) from error
+        # Unlike the OSError of a full disk, this one names no file.
+        raise UserError(
+            f"the weights cannot be written to {folder.parent} ({error}); correct this, then run "
+            "the same command again",
+            code="cannot-write",
+        ) from error
     processor.save_pretrained(folder)
 
 
@@ -334,16 +339,6 @@ def explain_damage(folder: Path) -> Iterator[None]:
             f"{'delete it and export' if exported else 'delete the run and train'} again",
             code="damaged-file",
         ) from error
-
-
-def unwritable_error(folder: Path, why: str) -> UserError:
-    """Return the error for weights that cannot be written. Unlike the OSError of a full disk, those
-    of the libraries name no file, and the disk may have space again by now."""
-    return UserError(
-        f"the weights cannot be written to {folder} ({why}); correct this, then run the same "
-        "command again",
-        code="cannot-write",
-    )
 
 
 def _first_line(error: Exception) -> str:

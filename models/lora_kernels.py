@@ -29,16 +29,6 @@ def fuse(model: nn.Module) -> None:
                     module.lora_variant[name] = AddedInPlace()
 
 
-def unfuse(model: nn.Module) -> None:
-    """Undo `fuse` in place."""
-    for module in list(model.modules()):
-        if type(module) in FUSED.values():
-            module.__class__ = type(module).__base__
-            for name, variant in list(getattr(module, "lora_variant", {}).items()):
-                if isinstance(variant, AddedInPlace):
-                    del module.lora_variant[name]
-
-
 class PatchProduct(nn.Conv3d):
     """A convolution over patches of the size of its kernel: (N, C, T, H, W) to
     (N, channels, 1, 1, 1)."""

@@ -28,13 +28,6 @@ def available_cpu_bytes() -> int:
     return free
 
 
-def is_out_of_memory(error: RuntimeError) -> bool:
-    """Whether the memory of a GPU or of the machine ran out."""
-    return isinstance(error, torch.OutOfMemoryError) or any(
-        message in str(error) for message in OUT_OF_MEMORY
-    )
-
-
 @contextmanager
 def explain_out_of_memory(when: str, lower: str) -> Iterator[None]:
     """Turn a lack of memory into a UserError.
@@ -46,6 +39,7 @@ def explain_out_of_memory(when: str, lower: str) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        if not is_out_of_memory(error):
+        known = any(message in str(error) for message in OUT_OF_MEMORY)
+        if not known and not isinstance(error, torch.OutOfMemoryError):
             raise
         raise UserError(f"out of memory {when}: {lower}", code="out-of-memory") from error

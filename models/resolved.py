@@ -27,19 +27,17 @@ RESOLVED = "resolved.yaml"
 
 
 def resolve_run(folder: Path, precision: str, preset: Preset, data: str) -> tuple[str, Preset]:
-    """Resolve a run's precision and base, and write them with the digest of its data.
+    """Resolve a run's precision and its base's commit, and write them with the digest of its data.
 
-    Several processes of a run call this one after the other (`models.distributed.main_first`): the
-    first one resolves and writes, the others read.
+    In `models.distributed.main_first`, the main rank resolves and writes; the others read.
 
     Args:
         folder: The run's folder.
-        precision: Of the passes: bf16, fp32 or auto.
-        preset: The student or retriever; its base may come from the hub.
+        precision: bf16, fp32 or auto.
         data: What `data_digest` returns for the run.
 
     Returns:
-        The precision, bf16 or fp32, and the preset with the commit of a hub's base.
+        The precision, bf16 or fp32, and the preset with the commit.
 
     Raises:
         UserError: the folder holds a run on other data or over another base.
@@ -80,11 +78,6 @@ def read_resolved(folder: Path) -> dict[str, str]:
         ) from error
 
 
-def resolved_precision(folder: Path, precision: str) -> str:
-    """Return the precision that a run resolved, or `precision` if the run has not resolved it."""
-    return read_resolved(folder).get("precision", precision)
-
-
 def pin_base(folder: Path, preset: Preset) -> Preset:
     """Return a run's preset with the commit of the hub's base that the run resolved."""
     name, _, commit = read_resolved(folder).get("base", "").rpartition("@")
@@ -106,7 +99,9 @@ def check_base(folder: Path, preset: Preset) -> None:
 
 def base_identity(preset: Preset) -> str:
     """Return NAME@COMMIT of a hub's base, or the digest of a local one."""
-    return model_id(preset) if is_hub_model(preset.model) else weights_digest(preset.model)
+    if is_hub_model(preset.model):
+        return model_id(preset.model, preset.revision)
+    return weights_digest(preset.model)
 
 
 def data_digest(store_identity: str, texts: Iterable[str]) -> str:

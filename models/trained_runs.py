@@ -13,7 +13,7 @@ from yaml import YAMLError
 
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig
-from models.resolved import pin_base, resolved_precision
+from models.resolved import pin_base, read_resolved
 
 EXPORT = "export.json"
 """A file that only folders of `train.export` have."""
@@ -104,7 +104,7 @@ def trained_settings(
             code="damaged-file",
         ) from error
     setattr(settings, product, pin_base(folder, getattr(settings, product)))
-    settings.train.precision = resolved_precision(folder, settings.train.precision)
+    settings.train.precision = read_resolved(folder).get("precision", settings.train.precision)
     return settings
 
 

@@ -271,7 +271,7 @@ def _meeting(scene: Scene, pair: tuple[int, int], cut: int) -> Meeting:
         closing = scene.velocities[-1, j, :2] - scene.velocities[-1, i, :2]
         approaches = np.dot(gap, closing) < -STATIONARY * np.linalg.norm(gap)
         when = "unseen" if approaches else None
-    return Meeting((scene.objects[i].phrase, scene.objects[j].phrase), when)
+    return Meeting((scene.objects[i].noun_phrase, scene.objects[j].noun_phrase), when)
 
 
 def compass_direction(delta: np.ndarray) -> str | None:
@@ -323,7 +323,7 @@ def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFact
         extent = "shifts slightly" if distance < SHIFTS else "moves across"
         travel = compass_direction(shift)
     return ObjectFacts(
-        object=scene.objects[index].phrase,
+        object=scene.objects[index].noun_phrase,
         region=object_region(scene, cut, index),
         sight=sight,
         speed=speed,
@@ -356,7 +356,7 @@ def _close_pairs(scene: Scene, target: int) -> tuple[Closeness, ...]:
     seen = [i for i in range(len(scene.objects)) if scene.in_view[target, i]]
     return tuple(
         Closeness(
-            (scene.objects[i].phrase, scene.objects[j].phrase),
+            (scene.objects[i].noun_phrase, scene.objects[j].noun_phrase),
             _cell(scene, (places[i] + places[j]) / 2),
         )
         for i, j in combinations(seen, 2)
@@ -373,8 +373,8 @@ def _candidate_facts(
 ) -> CandidateFacts:
     other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
     frame = candidate.frame
-    in_target = {o.phrase: i for i, o in enumerate(scene.objects)}
-    in_candidate = {o.phrase: i for i, o in enumerate(other.objects)}
+    in_target = {o.noun_phrase: i for i, o in enumerate(scene.objects)}
+    in_candidate = {o.noun_phrase: i for i, o in enumerate(other.objects)}
     large: list[tuple[float, Difference]] = []
     small: list[tuple[bool, float, Difference]] = []
     for name in {**in_target, **in_candidate}:

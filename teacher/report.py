@@ -194,17 +194,17 @@ def write_report(
     """Write report.json, report.txt, and report.html with `count` random accepted rationales."""
     import jinja2
 
-    from data.publish.contact_sheets import ExampleRows, draw_sheet
+    from data.publish.contact_sheets import SheetRows, draw_sheet
     from data.store import write_atomically
 
     text = format_figures(figures)
     write_json(folder / "report.json", figures)
     write_text(folder / "report.txt", text + "\n")
     items = {item.item_id: item for item in store.selection("train")}
-    rows, examples = ExampleRows(store), []
+    rows, examples = SheetRows(store), []
     for k in sorted(np.random.default_rng(seed).permutation(len(accepted))[:count].tolist()):
         item = items[accepted[k].item_id]
-        write_atomically(folder / "images" / f"{item.item_id}.png", draw_sheet([rows.item(item)]))
+        write_atomically(folder / "images" / f"{item.item_id}.png", draw_sheet([rows.make(item)]))
         predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
         examples.append((accepted[k], json.dumps(predicates and predicates.to_dict(), indent=1)))
     template = (files("teacher") / "templates" / "report.html").read_text()

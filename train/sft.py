@@ -37,7 +37,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from train.common.checkpoints import newest_checkpoint
     from train.common.journal import run_metrics
     from train.student.dataset import load_datasets, tokenizer_corpus
-    from train.student.run import build_trainer, training_arguments
+    from train.student.run import build_trainer
 
     compat.keep_freed_memory()
     # Before the benchmark is built, which may take long.
@@ -68,8 +68,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     if checkpoint is not None:
         check_adapters(checkpoint, model, student.lora.rank, student.model)
 
-    arguments = training_arguments(cfg, run, checkpoint)
-    trainer = build_trainer(cfg, arguments, model, processor, training, validation)
+    trainer = build_trainer(cfg, run, model, processor, training, validation, checkpoint)
     memory_settings = "train.micro_batch, or student.image_size or student.frames"
     best_step = training_loop.run_training(trainer, run, checkpoint, memory_settings)
 

@@ -23,8 +23,8 @@ import psutil
 
 from conf.compose import compose
 from conf.schema import BenchmarkConfig, BuildCommand, Quota
+from data.build import lock_partial_build
 from data.parallel import Workers
-from data.partial_build import lock_partial_build
 from data.store import load_scene, scene_path
 from data.tracks.build_items import family_quotas, make_items_and_queries
 from data.tracks.retrieval.database import make_databases

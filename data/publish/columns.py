@@ -1,7 +1,7 @@
-"""The columns of an exported benchmark, which `columns.yaml` lists, and a record's row.
+"""The columns of an exported benchmark, which `columns.yaml` lists, and the rows of its records.
 
-Columns have the names of the records' fields. With images, frames follow their references as
-encoded PNGs.
+Columns have the names of the records' fields. With images, a row also has the frames that it refers
+to, as PNGs.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class RowBuilder:
     """Turns a store's records into rows, with their frames if `images` is set."""
 
     def __init__(self, store: Store, images: bool) -> None:
-        self._images = images
+        self.images = images
         self._frames = FrameReader(store)
         self._prefix_frames = store.manifest["config"]["prefix_frames"]
         # Items of one scene share many frames, and encoding takes most of an export's time.
@@ -71,16 +71,16 @@ class RowBuilder:
     def images_per_row(self, configuration: str) -> int:
         """Return the largest number of images in a row of a configuration."""
         counts = {"selection": self._prefix_frames + 4, "retrieval": self._prefix_frames + 1}
-        return counts.get(configuration, 1) if self._images else 0
+        return counts.get(configuration, 1) if self.images else 0
 
     def row(self, record: Record, split: str) -> dict[str, Any]:
         """Return a record's values by column; `split` names the database of a frame."""
         if isinstance(record, FrameRef):
             row = {**asdict(record), "database": split}
-            return row | ({"image": self._encode(record)} if self._images else {})
+            return row | ({"image": self._encode(record)} if self.images else {})
         frames = sample_prefix_frames(record.prefix_start, record.prefix_stop, self._prefix_frames)
         row = asdict(record) | {"prefix_frames": frames}
-        if not self._images:
+        if not self.images:
             return row
         row["prefix_images"] = [self._encode(FrameRef(record.scene_id, f)) for f in frames]
         if isinstance(record, RetrievalQuery):

@@ -34,14 +34,7 @@ AXES = ("framing", "gap", "horizon", "group", "window_family", "difficulty")
 
 @dataclass(frozen=True)
 class Cell:
-    """A captioned frame.
-
-    Attributes:
-        image: The frame.
-        caption: Lines below the frame.
-        is_answer: Whether to mark the frame as the answer.
-        ring: Centre of a ring in px of the image.
-    """
+    """A frame with the lines of its caption, and the centre of a ring in px of the image."""
 
     image: Image.Image
     caption: tuple[str, ...]
@@ -51,7 +44,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """An item or a query: its heading, frames of its prefix, and the frames to choose from."""
+    """The heading of an item or query, frames of its prefix, and its candidates."""
 
     name: str
     details: str
@@ -107,23 +100,36 @@ def draw_cell(axes: Axes, cell: Cell) -> None:
         axes.plot(*cell.ring, "o", mfc="none", mec=PINK, markersize=RING, mew=3)
 
 
-class ExampleRows:
-    """Turns the items and queries of a store into rows of a contact sheet."""
+class SheetRows:
+    """Makes rows of a contact sheet from the items and queries of a store."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._frames = FrameReader(store)
 
-    def item(self, item: SelectionItem) -> Row:
-        """Return the prefix and the candidates of a selection item, with the answer marked."""
+    def make(self, record: SelectionItem | RetrievalQuery) -> Row:
+        """Return the row of an item or a query."""
+        return self._item(record) if isinstance(record, SelectionItem) else self._query(record)
+
+    def _item(self, item: SelectionItem) -> Row:
+        """The prefix and the candidates of an item, with the answer marked."""
         values = {name.replace("_", " "): getattr(item, name) for name in AXES}
         axes = [f"{name} {value}" for name, value in values.items() if value is not None]
         details = [item.split, *axes, f"least displacement {item.min_displacement:.0f} px"]
-        candidates = [self._candidate(item, k) for k in range(len(item.candidates))]
-        return Row(item.item_id, ", ".join(details), item.question, self._prefix(item), candidates)
+        cells = []
+        for letter, candidate in zip(LETTERS, item.candidates, strict=True):
+            distance, nearest = min(
+                (self._displacement(candidate, other), other_letter)
+                for other_letter, other in zip(LETTERS, item.candidates, strict=True)
+                if other != candidate
+            )
+            caption = f"{_describe_frame(item, candidate)}, {distance:.0f} px from {nearest}"
+            source, is_answer = f"{letter}: {candidate.source}", letter == item.letter
+            cells.append(self._cell(candidate, source, caption, is_answer=is_answer))
+        return Row(item.item_id, ", ".join(details), item.question, self._prefix(item), cells)
 
-    def query(self, query: RetrievalQuery) -> Row:
-        """Return the prefix, the target and the hard negatives of a query.
+    def _query(self, query: RetrievalQuery) -> Row:
+        """The prefix, the target and the hard negatives of a query.
 
         The first hard negative of a counterfactual query is the factual frame: the query's own
         scene at the target's moment. A ring marks the object that the counterfactual scene lacks.
@@ -134,7 +140,7 @@ class ExampleRows:
         if query.removed_object is not None:
             scene = self._store.scene(query.scene_id)
             without = self._store.scene(query.target.scene_id)
-            removed = [o.phrase for o in scene.objects].index(query.removed_object)
+            removed = [o.noun_phrase for o in scene.objects].index(query.removed_object)
             shift = removal_displacement(scene, without, removed)[query.target.frame]
             caption = f"others differ by {shift:.0f} px"
             cells.insert(0, self._cell(negatives.pop(0), "factual", caption, ring_on=removed))
@@ -152,20 +158,6 @@ class ExampleRows:
         return [
             self._cell(FrameRef(record.scene_id, f), f"frame {f}", ring_on=ring_on) for f in frames
         ]
-
-    def _candidate(self, item: SelectionItem, position: int) -> Cell:
-        candidate = item.candidates[position]
-        distance, nearest = min(
-            (self._displacement(candidate, other), letter)
-            for letter, other in zip(LETTERS, item.candidates, strict=True)
-            if other != candidate
-        )
-        return self._cell(
-            candidate,
-            f"{LETTERS[position]}: {candidate.source}",
-            f"{_describe_frame(item, candidate)}, {distance:.0f} px from {nearest}",
-            is_answer=position == item.answer,
-        )
 
     def _cell(
         self, frame: FrameRef, *caption: str, is_answer: bool = False, ring_on: int | None = None

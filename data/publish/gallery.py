@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
-from data.publish.contact_sheets import ExampleRows, Row, draw_sheet
+from data.publish.contact_sheets import SheetRows, draw_sheet
 from data.records import SPLITS
 from data.store import Store
 from data.tracks.controls import MATCHED_ANCHOR, pair_items
@@ -28,30 +27,32 @@ class Sheet:
 
 def draw_sheets(store: Store, examples: int, seed: int) -> Iterator[Sheet]:
     """Draw a sheet for each subtype, builder and control, with `examples` sampled by `seed`."""
-    rows = ExampleRows(store)
-    groups: dict[tuple[str, str, str], list[list[Callable[[], Row]]]] = defaultdict(list)
+    rows = SheetRows(store)
+    groups: dict[tuple[str, str, str], list[tuple]] = defaultdict(list)
     for item in store.selection():
         group = f"Selection: {item.family}", item.subtype, f"{item.family}-{item.subtype}"
-        groups[group].append([partial(rows.item, item)])
+        groups[group].append((item,))
     for query in sorted(store.retrieval(), key=lambda query: query.builder):
-        name = f"builder {query.builder}"
-        group = "Retrieval: future", name, f"retrieval-{name.replace(' ', '-')}"
-        groups[group].append([partial(rows.query, query)])
+        number = query.builder
+        group = "Retrieval: future", f"builder {number}", f"retrieval-builder-{number}"
+        groups[group].append((query,))
     for query in store.retrieval(pool="counterfactual"):
         group = "Retrieval: counterfactual", "with and without an object", "counterfactual"
-        groups[group].append([partial(rows.query, query)])
+        groups[group].append((query,))
     for pair in pair_items(store.selection(suite=MATCHED_ANCHOR)):
         group = "Controls", "differing only in the anchor", f"controls-{MATCHED_ANCHOR}"
-        groups[group].append([partial(rows.item, item) for item in pair])
-    for (section, title, name), records in groups.items():
-        order = named_rng(seed, "gallery", name).permutation(len(records))[:examples]
-        png = draw_sheet([make_row() for k in sorted(order) for make_row in records[k]])
-        yield Sheet(section, f"{title} ({len(records):,})", f"{name}.png", png)
+        groups[group].append(pair)
+    for (section, title, name), examples_of_group in groups.items():
+        count = len(examples_of_group)
+        order = named_rng(seed, "gallery", name).permutation(count)[:examples]
+        records = [record for k in sorted(order) for record in examples_of_group[k]]
+        png = draw_sheet([rows.make(record) for record in records])
+        yield Sheet(section, f"{title} ({count:,})", f"{name}.png", png)
 
 
 def render_page(store: Store, sheets: Sequence[Sheet]) -> str:
     """Return the HTML page of sheets that are in its folder."""
-    from jinja2 import Environment
+    from jinja2 import Template
 
     sections = defaultdict(list)
     for sheet in sheets:
@@ -59,13 +60,9 @@ def render_page(store: Store, sheets: Sequence[Sheet]) -> str:
         name = anchor.partition("-")[2] or anchor
         sections[sheet.section].append((anchor, name, sheet.title, sheet.file))
     text = (files("data.publish") / "templates/gallery.html").read_text()
-    return (
-        Environment(autoescape=True)
-        .from_string(text)
-        .render(
-            store=store,
-            sections=sections,
-            fps=store.scene(store.scene_ids("test")[0]).fps,
-            scenes=sum(len(store.scene_ids(split)) for split in SPLITS),
-        )
+    return Template(text, autoescape=True).render(
+        store=store,
+        sections=sections,
+        fps=store.scene(store.scene_ids("test")[0]).fps,
+        scenes=sum(len(store.scene_ids(split)) for split in SPLITS),
     )

@@ -32,7 +32,6 @@ from data.tracks.controls import MATCHED_ANCHOR
 
 if TYPE_CHECKING:
     import pandas as pd
-    import pyarrow as pa
 
 log = logging.getLogger(__name__)
 
@@ -67,13 +66,7 @@ def ensure_export(store: Store, folder: Path, images: bool) -> list[Shard]:
     if folder.exists():
         _verify(folder, plan)
         log.info("%s already holds this export", folder)
-    else:
-        write_export(store, folder, plan)
-    return _read_record(folder)["shards"]
-
-
-def write_export(store: Store, folder: Path, plan: dict[str, Any]) -> None:
-    """Write the dataset that `plan` describes, resuming what a killed export left."""
+        return _read_record(folder)["shards"]
     partial = folder.with_name(f".{folder.name}.partial")
     partial.mkdir(parents=True, exist_ok=True)
     busy = f"another process is writing {folder}: run this command again when it has finished"
@@ -82,18 +75,15 @@ def write_export(store: Store, folder: Path, plan: dict[str, Any]) -> None:
             for path in partial.iterdir():
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         _write_record(partial, plan)
-        columns = dataset_features(plan["images"])
-        builder = RowBuilder(store, plan["images"])
-        tables = list_tables(store)
+        builder, tables, shards = RowBuilder(store, images), list_tables(store), []
         rows = sum(map(len, tables.values()))
-        shards = []
         with tqdm(total=rows, desc="exporting", unit="row", mininterval=1.0) as bar:
             for (configuration, split), records in tables.items():
-                schema = columns[configuration].arrow_schema
-                shards += _write_table(partial, configuration, split, records, builder, schema, bar)
-        write_atomically(partial / CARD, render_card(store, shards, plan["images"]).encode())
+                shards += _write_table(partial, configuration, split, records, builder, bar)
+        write_atomically(partial / CARD, render_card(store, shards, images).encode())
         _write_record(partial, plan | {"shards": shards, "card": hash_file(partial / CARD)})
         partial.rename(folder)
+    return shards
 
 
 def list_tables(store: Store) -> dict[tuple[str, str], list[Record]]:
@@ -114,13 +104,13 @@ def _write_table(
     split: str,
     records: list[Record],
     builder: RowBuilder,
-    schema: pa.Schema,
     bar: tqdm,
 ) -> Iterator[Shard]:
-    """Write the shards of a table that do not exist yet, and describe all of them."""
+    """Write the missing shards of a table, and describe all of its shards."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    schema = dataset_features(builder.images)[configuration].arrow_schema
     images = builder.images_per_row(configuration)
     group = max(1, GROUP_IMAGES // images) if images else GROUP_ROWS
     size = group * SHARD_GROUPS

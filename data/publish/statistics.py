@@ -1,7 +1,7 @@
 """Statistics of a benchmark's scenes and selection items, and the accuracy of baselines.
 
-Baselines answer selection items from the oracle without predicting anything. A baseline of high
-accuracy reveals a shortcut in the construction of the items.
+Baselines answer selection items from the oracle without a prediction. A baseline with high accuracy
+reveals a shortcut in the construction of the items.
 """
 
 from __future__ import annotations

@@ -84,8 +84,8 @@ def _scene_id(path: Path) -> str:
 def read_scene(path: Path, folder: Path, split: str) -> Scene:
     """Return the scene of an annotation.
 
-    Visible fractions are computed from the poses; whether an object is in view is the annotation's
-    flag.
+    Visible fractions are computed from the poses. The annotation states whether an object is in
+    view.
     """
     from scipy.spatial.transform import Rotation
 

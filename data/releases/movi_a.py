@@ -3,22 +3,21 @@
     <folder>/00012/metadata.json events.json rgba_00000.png ...   Kubric's own, a folder per scene
     <folder>/movi_a-train.tfrecord-00000-of-00512 ...             that of TensorFlow Datasets
 
-Both are read into the same arrays. The physics starts at scene frame 0 and the rendering at scene
-frame 1: frame i of the video, and of every array, is scene frame i + 1. The time of a contact
-counts scene frames from 0. It is a float in Kubric's format; TensorFlow Datasets truncates it, so
-that the next frame is the first that is certainly at or after the contact.
+Both are read into the same arrays. The simulation starts one frame before the video: frame i of the
+video, and of every array, is simulated frame i + 1. The time of a contact counts simulated frames.
+It is a float in Kubric's format. TensorFlow Datasets truncates it, so that only the next simulated
+frame is certainly at or after the contact.
 
-Contacts are listed for every point and substep. An index of no object (-1, or 65535 if unsigned) is
+Every contact point is listed at every substep. An index of no object (-1, or 65535 if unsigned) is
 the floor, or an object that is never visible.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -107,15 +106,11 @@ class Events(Layout):
     collisions: list[Contact]
 
 
-@dataclass(frozen=True)
-class MoviExample:
-    """The content of a scene.
+class Arrays(NamedTuple):
+    """What both formats record of a scene.
 
-    Attributes:
-        states: Arrays by the names of `STATES`, each (objects, ...).
-        contacts: Arrays by the names of `CONTACTS`, each (contact points, ...). `instances` are
-            indices of the objects in contact; other indices are the floor or an object that is
-            never visible. `frame` is the first frame of the video at or after the contact.
+    `states` has the arrays of `STATES`, each (objects, ...), and `contacts` those of `CONTACTS`,
+    each (contact points, ...). A contact's `frame` is the first video frame at or after it.
     """
 
     objects: tuple[SceneObject, ...]
@@ -156,17 +151,17 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     """
     is_folder = path.name == "metadata.json"
     footage = path.parent if is_folder else path
-    example = _read_folder(footage) if is_folder else _read_record(footage)
+    record = _read_folder(footage) if is_folder else _read_record(footage)
     _list_images(footage)
-    count = len(example.objects)
-    pairs, frames = (example.contacts[key].astype(int) for key in ("instances", "frame"))
+    count = len(record.objects)
+    pairs, frames = (record.contacts[key].astype(int) for key in ("instances", "frame"))
     is_object = (pairs >= 0) & (pairs < count)
     collides = is_object.all(axis=1) & (frames < FRAMES)
-    states = {key: array.swapaxes(0, 1) for key, array in example.states.items()}
+    states = {key: array.swapaxes(0, 1) for key, array in record.states.items()}
     return Scene(
         scene_id=_scene_id(path, folder),
         split=split,
-        objects=example.objects,
+        objects=record.objects,
         collisions=first_contacts(
             zip(frames[collides].tolist(), pairs[collides].tolist(), strict=True)
         ),
@@ -175,17 +170,17 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
         quaternions=np.roll(states["quaternions"], -1, axis=-1),
         velocities=states["velocities"],
         angular_velocities=states["angular_velocities"],
-        image_positions=states["image_positions"] * np.float32(example.image_size),
+        image_positions=states["image_positions"] * np.float32(record.image_size),
         in_view=states["visibility"] > 0,
         visible_fraction=np.full((FRAMES, count), np.nan, np.float32),
-        image_size=example.image_size,
+        image_size=record.image_size,
         fps=FPS,
-        landings=_find_landings(example.contacts, pairs, frames, is_object),
+        landings=_find_landings(record.contacts, pairs, frames, is_object),
         footage=footage.relative_to(folder).as_posix(),
     )
 
 
-def _read_folder(folder: Path) -> MoviExample:
+def _read_folder(folder: Path) -> Arrays:
     """Read Kubric's format, a folder with metadata.json and events.json."""
     metadata = read_json(folder / "metadata.json", Metadata)
     events = read_json(folder / "events.json", Events)
@@ -196,7 +191,7 @@ def _read_folder(folder: Path) -> MoviExample:
 
     contacts = {key: array(events.collisions, key, *shape) for key, shape in CONTACTS.items()}
     contacts["frame"] = np.maximum(np.ceil(contacts["frame"]) - 1, 0)
-    return MoviExample(
+    return Arrays(
         tuple(SceneObject(i.shape, i.material, i.color, i.size) for i in metadata.instances),
         metadata.metadata.resolution,
         {key: array(metadata.instances, key, *shape) for key, shape in STATES.items()},
@@ -204,7 +199,7 @@ def _read_folder(folder: Path) -> MoviExample:
     )
 
 
-def _read_record(path: Path) -> MoviExample:
+def _read_record(path: Path) -> Arrays:
     """Read the format of TensorFlow Datasets; `path` is a shard's path and a record's number."""
     features = read_example(path.parent, int(path.name))
     where = f"{path.parent}: record {int(path.name)}"
@@ -226,7 +221,7 @@ def _read_record(path: Path) -> MoviExample:
             raise RecordError(f"{where}: {name}_label is {numbers}, expected 0 to {len(words) - 1}")
         appearances.append([words[n] for n in numbers])
     points = len(array("events/collisions/frame", -1))
-    return MoviExample(
+    return Arrays(
         tuple(map(SceneObject, *appearances)),
         (width, height),
         {key: array(f"instances/{key}", count, *shape) for key, shape in STATES.items()},

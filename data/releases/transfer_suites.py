@@ -1,18 +1,12 @@
 """Selection items of the transfer suites, which are built from scenes of MoVi-A and Physion.
 
-`TRANSFER_SUITES[suite][family]` has the interface of a family; see
-`data.tracks.selection.distractors`. Its questions are the same.
-
-The target of an event item is the frame of the event, and its prefix ends some frames earlier. The
-prefix of a time item is the scene's first second, and its target is one or two seconds after the
-prefix's last frame.
-
-CLEVRER needs no suite here: its scenes have the items of the dynapix suite.
+Their questions are those of the dynapix suite. CLEVRER needs no suite here: its scenes have the
+items of the dynapix suite.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 
@@ -20,7 +14,7 @@ import numpy as np
 
 from data.records import Candidate, Scene, SelectionItem
 from data.tracks.selection import event, time
-from data.tracks.selection.distractors import DistractorPicker, Timing, scene_candidates
+from data.tracks.selection.distractors import DistractorPicker, Family, Timing, scene_candidates
 from data.world.events import find_motion_onsets
 
 LEAST_PREFIX = 5
@@ -31,48 +25,66 @@ CROSS_SCENES = 8
 
 
 @dataclass(frozen=True)
-class TransferCell:
-    """A construction cell.
+class EventCell:
+    """A cell whose target is the frame of an event.
 
-    Attributes:
-        question: The question of its items.
-        timings: Returns the timings that an item can have in a scene, in chronological order.
+    The prefix ends `gap` frames before the event and starts `step` frames before its end.
     """
 
-    question: str
-    timings: Callable[[Scene], list[Timing]]
+    kind: str
+    step: int
+    gap: int
+    question = event.QUESTION
+
+    def timings(self, scene: Scene) -> list[Timing]:
+        stops = [frame - self.gap for frame in sorted(set(EVENTS[self.kind](scene)))]
+        return [
+            Timing(max(stop - self.step, 0), stop, stop + self.gap, event=stop + self.gap)
+            for stop in stops
+            if stop + 1 >= LEAST_PREFIX
+        ]
 
 
 @dataclass(frozen=True)
-class TransferFamily:
-    """A family of a suite's items.
+class TimeCell:
+    """A cell whose prefix is the scene's first second. The target is `seconds` later."""
 
-    Attributes:
+    seconds: int
+
+    @property
+    def question(self) -> str:
+        return time.question(self.seconds)
+
+    def timings(self, scene: Scene) -> list[Timing]:
+        second = round(scene.fps)
+        target = second - 1 + second * self.seconds
+        return [Timing(0, second - 1, target)] if target < scene.frames else []
+
+
+def transfer_family(
+    suite: str,
+    name: str,
+    cells: Mapping[str, EventCell | TimeCell],
+    same_scene: int,
+    after_target: bool,
+) -> Family:
+    """Return a family of a suite's items.
+
+    Args:
         same_scene: Number of distractors from the item's own scene, at frames after the prefix. The
             other distractors are targets from other scenes of the same scenario.
         after_target: Whether distractors from the item's own scene must also come after the target.
     """
 
-    suite: str
-    family: str
-    same_scene: int
-    after_target: bool
-    CELLS: dict[str, TransferCell]
-
-    def timings(self, subtype: str, scene: Scene) -> list[Timing]:
-        return self.CELLS[subtype].timings(scene)
-
     def make_item(
-        self,
         subtype: str,
         scene: Scene,
         timing: Timing,
         rng: np.random.Generator,
         picker: DistractorPicker,
     ) -> SelectionItem | None:
-        """Make an item of a cell at one of its timings."""
-        cell = self.CELLS[subtype]
-        frames = np.arange((timing.target if self.after_target else timing.stop) + 1, scene.frames)
+        cell = cells[subtype]
+        frames = np.arange((timing.target if after_target else timing.stop) + 1, scene.frames)
         wrong = rng.permutation(frames[frames != timing.target])
         gap = timing.target - timing.stop
         axes = {"framing": "future", "gap": gap} if timing.event is not None else {"horizon": gap}
@@ -80,20 +92,22 @@ class TransferFamily:
             scene,
             timing,
             [
-                (scene_candidates(scene, wrong, "same_time"), self.same_scene),
-                (cross_scene_candidates(cell, scene, rng, picker), 3 - self.same_scene),
+                (scene_candidates(scene, wrong, "same_time"), same_scene),
+                (cross_scene_candidates(cell, scene, rng, picker), 3 - same_scene),
             ],
-            family=self.family,
+            family=name,
             subtype=subtype,
-            suite=self.suite,
+            suite=suite,
             question=cell.question,
             distractors="mixed",
             **axes,
         )
 
+    return Family(cells, lambda subtype, scene: cells[subtype].timings(scene), make_item)
+
 
 def cross_scene_candidates(
-    cell: TransferCell, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
+    cell: EventCell | TimeCell, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
 ) -> Iterator[Candidate]:
     """Yield the first target of each of several other scenes of the same scenario.
 
@@ -117,60 +131,32 @@ EVENTS: dict[str, Callable[[Scene], list[int]]] = {
 """Frames of each kind of event in a scene."""
 
 
-def event_cell(event_name: str, step: int, gap: int) -> TransferCell:
-    """Return a cell whose target is the frame of an event.
-
-    The prefix ends `gap` frames before the event and starts `step` frames before its end.
-    """
-
-    def timings(scene: Scene) -> list[Timing]:
-        stops = [frame - gap for frame in sorted(set(EVENTS[event_name](scene)))]
-        return [
-            Timing(max(stop - step, 0), stop, stop + gap, event=stop + gap)
-            for stop in stops
-            if stop + 1 >= LEAST_PREFIX
-        ]
-
-    return TransferCell(event.QUESTION, timings)
-
-
-def time_cell(seconds: int) -> TransferCell:
-    """Return a cell whose prefix is the scene's first second. The target is `seconds` later."""
-
-    def timings(scene: Scene) -> list[Timing]:
-        second = round(scene.fps)
-        target = second - 1 + second * seconds
-        return [Timing(0, second - 1, target)] if target < scene.frames else []
-
-    return TransferCell(time.question(seconds), timings)
-
-
 CELLS = {
     # At MoVi-A's 12 fps, these steps and gaps last nearly as long as those of the dynapix suite at
     # 25 fps. A scene lasts two seconds, so there is no in_2s.
     "movi_a": {
-        "event": {"contact": event_cell("contact", step=10, gap=5)},
-        "time": {"in_1s": time_cell(1)},
+        "event": {"contact": EventCell("contact", step=10, gap=5)},
+        "time": {"in_1s": TimeCell(1)},
     },
     # Physion's steps and gaps are numbers of frames, whatever the frame rate.
     "physion": {
         "event": {
-            "A1_contact": event_cell("contact", step=20, gap=10),
-            "A2_motion": event_cell("motion", step=20, gap=10),
-            "A3_landing": event_cell("landing", step=20, gap=10),
+            "A1_contact": EventCell("contact", step=20, gap=10),
+            "A2_motion": EventCell("motion", step=20, gap=10),
+            "A3_landing": EventCell("landing", step=20, gap=10),
         },
-        "time": {"in_1s": time_cell(1), "in_2s": time_cell(2)},
+        "time": {"in_1s": TimeCell(1), "in_2s": TimeCell(2)},
     },
 }
 # The items of a stand-in are built as those of its suite, but name the stand-in as their suite.
 TRANSFER_SUITES = {
     f"{prefix}{suite}": {
-        family: TransferFamily(
+        family: transfer_family(
             f"{prefix}{suite}",
             family,
+            cells,
             same_scene=1 if suite == "movi_a" else 2,
             after_target=suite == "physion",
-            CELLS=cells,
         )
         for family, cells in families.items()
     }

@@ -67,7 +67,7 @@ def check_unique_scenes(
 
     Args:
         id_of: Returns the scene id of a path.
-        contents: The expected contents of the folder, in words for error messages.
+        contents: A description of the expected contents of the folder, for error messages.
 
     Raises:
         UserError: The folder does not exist, contains no scene, or contains a scene twice.

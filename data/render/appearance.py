@@ -75,8 +75,11 @@ def _cube() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def texture(material: str) -> np.ndarray:
-    """(64, 64, 3) uint8 texture that multiplies an object's colour: a reflection of a bright sky
-    over a dark horizon for metal, uniform for rubber."""
+    """(64, 64, 3) uint8 texture that multiplies an object's colour.
+
+    For metal it imitates the reflection of a bright sky over a dark horizon; for rubber it is
+    uniform.
+    """
     if material == "rubber":
         return np.full((64, 64, 3), 215, dtype=np.uint8)
     across, down = np.meshgrid(np.linspace(0, 1, 64), np.linspace(0, 1, 64))

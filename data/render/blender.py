@@ -24,9 +24,9 @@ from data.world.camera import STANDARD_VIEW, View
 from data.world.shapes import CUBE_HALF, RADIUS
 
 BPY = "4.2.23"
-"""Release of Blender's module in the extra `blender`; other releases give other pixels."""
+"""Release of Blender's Python module; other releases give other pixels."""
 SAMPLES = 32
-"""Largest number of light paths per pixel; a denoiser removes the remaining noise."""
+"""Maximum number of light paths per pixel; a denoiser removes the remaining noise."""
 VERSION = f"blender-1, bpy {BPY}, {SAMPLES} samples"
 
 WORKER = Path(__file__).with_name("blender_worker.py")
@@ -35,17 +35,13 @@ WORKER = Path(__file__).with_name("blender_worker.py")
 class BlenderRenderer:
     """Renders frames of any scene at one size, in one Blender process.
 
-    Lamps and ground are those of `blender_worker.py`, whatever the view.
+    It uses the view's camera. The lamps and the ground are those of `blender_worker.py`.
     """
 
     version = VERSION
 
     def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
-        """Start Blender.
-
-        Raises:
-            UserError: the right release of Blender's module is missing.
-        """
+        """Start Blender. Raises UserError if its module is missing or of another release."""
         try:
             installed = version("bpy")
         except PackageNotFoundError:
@@ -78,11 +74,7 @@ class BlenderRenderer:
         self._request(settings, "starting")
 
     def render(self, scene: Scene, frame: int) -> Image.Image:
-        """Render one frame as an RGB image.
-
-        Raises:
-            UserError: the Blender process ended.
-        """
+        """Render one frame as an RGB image. Raises UserError if the Blender process ended."""
         positions, quaternions = scene.positions[frame], scene.quaternions[frame]
         objects = [
             {

@@ -1,10 +1,9 @@
-"""The worker process of `data.render.blender`.
+"""The worker process of `data.render.blender`, which needs only `bpy` and the standard library.
 
 Blender has one global scene, prints to standard output and may crash, so it runs in a separate
 process. Each request is a line of JSON on standard input: first the settings (see `Studio`), then
-the objects of one frame after another (see `Studio.render`). Each response on standard output is a
-line with the path of a PNG, whose content is the frame's until the next request. The process exits
-when its input ends. It needs only `bpy` and the standard library.
+the objects of each frame (see `Studio.render`). Each response is a line on standard output with the
+path of a PNG, which the next request overwrites. The process exits when its input ends.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ GROUND = (0.36, 0.355, 0.34)
 BEVEL = 0.05
 """Rounding of edges, as a share of half the height; sharp edges would not reflect light."""
 LAMPS = {
-    "key": {"place": (3.5, -3.5, 5.5), "size": 2.0, "watts": 500},
-    "fill": {"place": (3.0, 4.5, 3.5), "size": 3.0, "watts": 170},
-    "back": {"place": (-4.5, 1.5, 4.5), "size": 2.0, "watts": 220},
+    "key": {"location": (3.5, -3.5, 5.5), "size": 2.0, "watts": 500},
+    "fill": {"location": (3.0, 4.5, 3.5), "size": 3.0, "watts": 170},
+    "back": {"location": (-4.5, 1.5, 4.5), "size": 2.0, "watts": 220},
 }
 """Square lamps that point at the origin, in simulator units; larger ones cast softer shadows."""
 AMBIENT = 0.1
@@ -48,7 +47,7 @@ SAMPLING = {
 
 
 def main() -> None:
-    # Blender prints to standard output, which must only have responses.
+    # Only responses may reach standard output, to which Blender prints too.
     responses = os.fdopen(os.dup(1), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     with tempfile.TemporaryDirectory(prefix="dynapix-blender-") as folder:
@@ -74,14 +73,14 @@ class Studio:
         import bpy
 
         bpy.ops.wm.read_factory_settings(use_empty=True)
-        self._scene = bpy.context.scene
-        self._scene.render.filepath = str(path)
-        self._meshes = {shape: _mesh(shape, h) for shape, h in settings["half_heights"].items()}
+        bpy.context.scene.render.filepath = str(path)
+        self._half_heights = settings["half_heights"]
         self._solids: dict[tuple[str, str, tuple[float, ...]], Any] = {}
-        _set_quality(self._scene, settings)
-        _set_camera(self._scene, settings)
-        _set_lamps(self._scene)
-        _set_ground(self._scene)
+        _set_quality(settings)
+        _add_camera(settings)
+        _add_lamps()
+        bpy.ops.mesh.primitive_plane_add(size=80)
+        bpy.context.object.data.materials.append(_material("ground", GROUND))
 
     def render(self, objects: list[dict[str, Any]]) -> None:
         """Render objects to the file.
@@ -106,40 +105,23 @@ class Studio:
     def _add(self, shape: str, material: str, color: tuple[float, ...]) -> Any:
         import bpy
 
-        solid = bpy.data.objects.new(f"{material} {shape}", self._meshes[shape])
+        half = self._half_heights[shape]
+        if shape == "sphere":
+            bpy.ops.mesh.primitive_uv_sphere_add(segments=96, ring_count=48, radius=half)
+        elif shape == "cylinder":
+            bpy.ops.mesh.primitive_cylinder_add(vertices=96, radius=half, depth=2 * half)
+        else:
+            bpy.ops.mesh.primitive_cube_add(size=2 * half)
+        bpy.ops.object.shade_smooth()
+        solid = bpy.context.object
         solid.rotation_mode = "QUATERNION"
-        solid.material_slots[0].link = "OBJECT"
-        solid.material_slots[0].material = _material(material, color)
+        solid.data.materials.append(_material(material, color))
         if shape != "sphere":
             bevel = solid.modifiers.new("edges", "BEVEL")
-            bevel.width, bevel.segments = BEVEL * solid.dimensions.z / 2, 3
+            bevel.width, bevel.segments = BEVEL * half, 3
             # Keeps faces flat between rounded edges.
             solid.modifiers.new("shading", "WEIGHTED_NORMAL")
-        self._scene.collection.objects.link(solid)
         return solid
-
-
-def _mesh(shape: str, half: float) -> Any:
-    """A mesh of half height `half` with an empty material slot."""
-    import bmesh
-    import bpy
-
-    form = bmesh.new()
-    if shape == "sphere":
-        bmesh.ops.create_uvsphere(form, u_segments=96, v_segments=48, radius=half)
-    elif shape == "cylinder":
-        bmesh.ops.create_cone(
-            form, cap_ends=True, segments=96, radius1=half, radius2=half, depth=2 * half
-        )
-    else:
-        bmesh.ops.create_cube(form, size=2 * half)
-    for face in form.faces:
-        face.smooth = True
-    mesh = bpy.data.meshes.new(shape)
-    form.to_mesh(mesh)
-    form.free()
-    mesh.materials.append(None)
-    return mesh
 
 
 def _material(name: str, color: tuple[float, ...]) -> Any:
@@ -154,7 +136,10 @@ def _material(name: str, color: tuple[float, ...]) -> Any:
     return material
 
 
-def _set_quality(scene: Any, settings: dict[str, Any]) -> None:
+def _set_quality(settings: dict[str, Any]) -> None:
+    import bpy
+
+    scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.render.resolution_x, scene.render.resolution_y = settings["width"], settings["height"]
     # Blender's default transform would desaturate the objects' colours.
@@ -164,13 +149,6 @@ def _set_quality(scene: Any, settings: dict[str, Any]) -> None:
     for group, values in ((scene.render.image_settings, IMAGE), (scene.cycles, SAMPLING)):
         for key, value in values.items():
             setattr(group, key, value)
-    _use_gpu(scene)
-
-
-def _use_gpu(scene: Any) -> None:
-    """Render on GPUs where available."""
-    import bpy
-
     preferences = bpy.context.preferences.addons["cycles"].preferences
     for kind in ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL"):
         try:
@@ -186,50 +164,35 @@ def _use_gpu(scene: Any) -> None:
             return
 
 
-def _set_camera(scene: Any, settings: dict[str, Any]) -> None:
+def _add_camera(settings: dict[str, Any]) -> None:
     import bpy
     from mathutils import Matrix
 
-    lens = bpy.data.cameras.new("camera")
+    bpy.ops.object.camera_add()
+    camera = bpy.context.scene.camera = bpy.context.object
+    lens = camera.data
     lens.sensor_fit, lens.sensor_width = "HORIZONTAL", 36.0
     lens.lens = settings["focal"] * lens.sensor_width / settings["width"]
-    camera = bpy.data.objects.new("camera", lens)
     right, down, forward = settings["axes"]
     # Blender's cameras look along their -z axis, with y up.
     turn = Matrix([right, [-v for v in down], [-v for v in forward]]).transposed()
     camera.matrix_world = Matrix.Translation(settings["eye"]) @ turn.to_4x4()
-    scene.collection.objects.link(camera)
-    scene.camera = camera
 
 
-def _set_lamps(scene: Any) -> None:
+def _add_lamps() -> None:
     import bpy
     from mathutils import Vector
 
-    for name, lamp in LAMPS.items():
-        light = bpy.data.lights.new(name, "AREA")
-        light.size, light.energy = lamp["size"], lamp["watts"]
-        solid = bpy.data.objects.new(name, light)
-        solid.location = lamp["place"]
+    for lamp in LAMPS.values():
         # Blender's lamps shine along their -z axis.
-        solid.rotation_euler = Vector(lamp["place"]).to_track_quat("Z", "Y").to_euler()
-        scene.collection.objects.link(solid)
-    world = bpy.data.worlds.new("ambient")
+        turn = Vector(lamp["location"]).to_track_quat("Z", "Y").to_euler()
+        bpy.ops.object.light_add(type="AREA", location=lamp["location"], rotation=turn)
+        light = bpy.context.object.data
+        light.size, light.energy = lamp["size"], lamp["watts"]
+    world = bpy.context.scene.world = bpy.data.worlds.new("ambient")
     world.use_nodes = True
     background = world.node_tree.nodes["Background"].inputs
     background["Color"].default_value, background["Strength"].default_value = (1, 1, 1, 1), AMBIENT
-    scene.world = world
-
-
-def _set_ground(scene: Any) -> None:
-    import bpy
-
-    mesh = bpy.data.meshes.new("ground")
-    far = 40.0
-    corners = [(-far, -far, 0), (far, -far, 0), (far, far, 0), (-far, far, 0)]
-    mesh.from_pydata(corners, [], [(0, 1, 2, 3)])
-    mesh.materials.append(_material("ground", GROUND))
-    scene.collection.objects.link(bpy.data.objects.new("ground", mesh))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """Renderer with Bullet's software rasteriser.
 
-TinyRenderer (no OpenGL) renders the objects from smooth meshes: metal with a reflection-like
-texture and a sharp highlight, rubber matt. It can neither clip a large floor nor soften a shadow,
-so this module adds the floor and contact shadows behind the objects' mask. Frames are rendered at
-twice the size and averaged, for anti-aliasing.
+Bullet's TinyRenderer draws the objects as smooth meshes without OpenGL: metal with a texture like a
+reflection and a sharp highlight, rubber matt. It can neither clip a large floor nor soften a
+shadow, so this module draws the floor and soft shadows wherever no object is. Objects are rendered
+at twice the size and averaged, for anti-aliasing.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Pixels of frames, from the store's cache or rendered on demand, with the same result.
 
 The cached frames of a scene are one archive. It holds the first frame, and the difference of each
-other frame from it (modulo 256), compressed with LZ4. Because most of a scene does not move, this
-is smaller than PNGs, and more than ten times as fast to read.
+other frame from it (modulo 256), compressed with LZ4. Because most of an image does not change,
+this is smaller than PNGs, and more than ten times as fast to read.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ import json
 import logging
 import zipfile
 from collections import OrderedDict
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from PIL import Image
 from data.records import Scene
 from data.releases.readers import READERS
 from data.render import get_renderer
-from data.store import FRAMES_FOLDER, Store, cached_scene, scene_path, write_atomically
+from data.store import FRAMES_FOLDER, Store, write_atomically
 from data.world.standins import standin_view
 
 log = logging.getLogger(__name__)
@@ -45,7 +44,7 @@ def save_frames(frames: dict[int, np.ndarray], path: Path) -> None:
             difference = frames[frame] - frames[first] if frame != first else frames[first]
             packed = pa.compress(np.ascontiguousarray(difference), codec=_CODEC, asbytes=True)
             # ZipInfo has a fixed date, so that the same frames give the same bytes.
-            archive.writestr(zipfile.ZipInfo(_member(frame)), packed)
+            archive.writestr(zipfile.ZipInfo(f"{frame:03d}"), packed)
     write_atomically(path, buffer.getvalue())
 
 
@@ -56,8 +55,8 @@ def load_frames(path: Path, wanted: Iterable[int] | None = None) -> dict[int, np
         wanted: Frame indices; all frames of the archive by default.
 
     Returns:
-        The wanted frames that the archive has; none if it is missing or damaged. The latter is
-        logged.
+        The wanted frames that the archive has; none if it is missing or, with a warning, if it is
+        damaged.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -83,47 +82,35 @@ def _warn_damaged(path: Path, reason: str) -> None:
     log.warning("%s is damaged (%s); rendering its frames again", path, reason)
 
 
-def _member(frame: int) -> str:
-    return f"{frame:03d}"
-
-
 def _unpack(archive: zipfile.ZipFile, frame: int, shape: list[int]) -> np.ndarray:
-    packed = archive.read(_member(frame))
-    raw = pa.decompress(packed, int(np.prod(shape)), codec=_CODEC)
+    raw = pa.decompress(archive.read(f"{frame:03d}"), int(np.prod(shape)), codec=_CODEC)
     return np.frombuffer(raw, np.uint8).reshape(shape)
 
 
-@dataclass(frozen=True)
-class FrameCache:
-    """Location of a store's rendered frames, and the means to render others.
+def frames_path(folder: Path, scene_id: str) -> Path:
+    """Path of the archive of a scene's frames in a store."""
+    return folder / FRAMES_FOLDER / f"{scene_id}.zip"
 
-    Attributes:
-        folder: Folder of the store.
+
+def render_frames(
+    scene: Scene, frames: list[int], config: Mapping[str, Any]
+) -> dict[int, np.ndarray]:
+    """Render frames of a scene, or read them from its release, by frame index.
+
+    Args:
         config: Settings of the benchmark.
+
+    Returns:
+        (height, width, 3) uint8 arrays.
     """
-
-    folder: Path
-    config: dict[str, Any]
-
-    @classmethod
-    def of(cls, store: Store) -> FrameCache:
-        return cls(store.folder, store.manifest["config"])
-
-    def path(self, scene_id: str) -> Path:
-        return self.folder / FRAMES_FOLDER / f"{scene_id}.zip"
-
-    def render(self, scene_id: str, frames: list[int]) -> dict[int, np.ndarray]:
-        """Render frames of a scene or read them from its release, (height, width, 3) uint8."""
-        if not frames:
-            return {}
-        scene, config = cached_scene(scene_path(self.folder, scene_id)), self.config
-        if scene.footage is not None:
-            reader = READERS[config["simulator"]]
-            images = reader.load_images(scene, Path(config["folder"]), frames)
-            return {frame: np.asarray(image) for frame, image in images.items()}
+    if scene.footage is not None:
+        reader = READERS[config["simulator"]]
+        images = reader.load_images(scene, Path(config["folder"]), frames)
+    else:
         view = standin_view(config["standin"])
         renderer = get_renderer(config["renderer"], config["width"], config["height"], view)
-        return {frame: np.asarray(renderer.render(scene, frame)) for frame in frames}
+        images = {frame: renderer.render(scene, frame) for frame in frames}
+    return {frame: np.asarray(image) for frame, image in images.items()}
 
 
 class FrameReader:
@@ -132,7 +119,6 @@ class FrameReader:
     def __init__(self, store: Store, size: int | None = None) -> None:
         """With `size`, frames are resized to size x size px, as model inputs."""
         self._store = store
-        self._cache = FrameCache.of(store)
         self._size = size
         self._decoded: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
         self._bytes = 0
@@ -163,8 +149,9 @@ class FrameReader:
         return Image.fromarray(self.array(scene_id, frame))
 
     def _load(self, scene_id: str, frames: list[int]) -> np.ndarray:
-        images = load_frames(self._cache.path(scene_id), frames)
-        images |= self._cache.render(scene_id, [f for f in frames if f not in images])
+        images = load_frames(frames_path(self._store.folder, scene_id), frames)
+        if missing := [f for f in frames if f not in images]:
+            images |= render_frames(self.scene(scene_id), missing, self._store.manifest["config"])
         pixels = np.stack([images[f] for f in frames])
         return pixels if self._size is None else resize_frames(pixels, self._size)
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import logging
 from collections import defaultdict
+from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 from data.parallel import Workers
 from data.records import POOLS, sample_prefix_frames
-from data.render.frame_cache import FrameCache, load_frames, save_frames
-from data.store import DATABASES, FRAMES_FOLDER, Store, write_atomically
+from data.render.frame_cache import frames_path, load_frames, render_frames, save_frames
+from data.store import DATABASES, FRAMES_FOLDER, Store, load_scene, scene_path, write_atomically
 from data.tracks.controls import MATCHED_ANCHOR
 
 log = logging.getLogger(__name__)
@@ -31,17 +34,17 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
     path = store.folder / FRAMES_FOLDER / RECORD
     if path.exists() and options.items() <= json.loads(path.read_text()).items():
         return
-    cache = FrameCache.of(store)
+    config = store.manifest["config"]
     jobs = {
-        scene: partial(_render_scene, cache, scene, frames)
+        scene: partial(_render_scene, store.folder, config, scene, frames)
         for scene, frames in frames_to_render(store, which).items()
     }
     total, rendered = 0.0, 0
     for scene, size in workers.run(jobs, "rendering scenes", "scene"):
         if limit_gb is not None and total + size > limit_gb * GB:
-            cache.path(scene).unlink()
+            frames_path(store.folder, scene).unlink()
             log.info(
-                "frames_gb=%g is enough for the frames of %d of %d scenes; the others are rendered "
+                "frames_gb=%g: the frames of %d of %d scenes are on disk; the others are rendered "
                 "on demand", limit_gb, rendered, len(jobs),
             )  # fmt: skip
             break
@@ -75,11 +78,11 @@ def frames_to_render(store: Store, which: str) -> dict[str, list[int]]:
     return {scene: sorted(frames[scene]) for scene in order}
 
 
-def _render_scene(cache: FrameCache, scene_id: str, frames: list[int]) -> int:
+def _render_scene(folder: Path, config: Mapping[str, Any], scene_id: str, frames: list[int]) -> int:
     """Render the frames that an archive lacks, and return its size in bytes."""
-    path = cache.path(scene_id)
+    path = frames_path(folder, scene_id)
     pixels = load_frames(path)
-    missing = cache.render(scene_id, [f for f in frames if f not in pixels])
-    if missing:
-        save_frames(pixels | missing, path)
+    if missing := [f for f in frames if f not in pixels]:
+        scene = load_scene(scene_path(folder, scene_id))
+        save_frames(pixels | render_frames(scene, missing, config), path)
     return path.stat().st_size

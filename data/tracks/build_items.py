@@ -11,7 +11,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -25,15 +25,15 @@ from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
 from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.retrieval import counterfactual, future
 from data.tracks.selection import event, time, window
-from data.tracks.selection.distractors import BUILDERS_VERSION
+from data.tracks.selection.distractors import BUILDERS_VERSION, Family
 from data.world.physics import GENERATOR_VERSION
 
-DYNAPIX_FAMILIES = {"event": event, "time": time, "window": window}
+DYNAPIX_FAMILIES = {"event": event.FAMILY, "time": time.FAMILY, "window": window.FAMILY}
 COUNTERFACTUAL = "counterfactual"
 CACHED_SCENES = 20_000
 """Scenes that a worker keeps in memory, at about 50 KB each."""
 QUERY_RESERVE = 1.3
-"""Queries made per query of a quota: a query whose target has a twin is dropped later."""
+"""Factor of the quotas of queries, because a query whose target has a twin is dropped later."""
 
 ScenesOfSplit = dict[str, list[str]]
 
@@ -47,10 +47,10 @@ def make_items_and_queries(
         Items; queries, more than the quotas by `QUERY_RESERVE`; and how many of each were dropped
         because too few candidates differ enough.
     """
-    quotas = {
-        name: _reserve(quota) if _is_query_cell(name) else quota
-        for name, quota in cell_quotas(cfg).items()
-    }
+    quotas = cell_quotas(cfg)
+    for name in filter(_is_query_cell, quotas):
+        train, test = (math.ceil(QUERY_RESERVE * n) for n in astuple(quotas[name]))
+        quotas[name] = Quota(train, test)
     inputs = {
         "versions": [GENERATOR_VERSION, BUILDERS_VERSION],
         "seed": cfg.seed,
@@ -62,10 +62,11 @@ def make_items_and_queries(
         name: part_path(folder, [inputs, name, asdict(quota)]) for name, quota in quotas.items()
     }
     # Largest quotas first, so that no single worker is left with a large job at the end.
-    jobs = {
-        paths[name]: partial(_run_job, cfg, folder, scene_ids, name, quota, paths[name])
-        for name, quota in sorted(quotas.items(), key=lambda job: -job[1].train)
-    }
+    jobs = {}
+    for name, quota in sorted(quotas.items(), key=lambda job: -job[1].train):
+        least, negatives = cfg.selection.min_displacement, cfg.retrieval.hard_negatives
+        cell = CellInputs(scene_ids, partial(_load, folder), quota, cfg.seed, least, negatives)
+        jobs[paths[name]] = partial(_run_job, cfg, name, cell, paths[name])
     workers.write_files(jobs, "making items and queries", "cell")
     items: list[SelectionItem] = []
     queries: list[RetrievalQuery] = []
@@ -81,8 +82,8 @@ def make_items_and_queries(
     return items, queries, dict(dropped)
 
 
-def item_families(cfg: BenchmarkConfig) -> Mapping[str, Any]:
-    """The families of a benchmark's suite; see `data.tracks.selection.distractors`."""
+def item_families(cfg: BenchmarkConfig) -> Mapping[str, Family]:
+    """The families of a benchmark's suite."""
     return TRANSFER_SUITES.get(suite_name(cfg), DYNAPIX_FAMILIES)
 
 
@@ -121,32 +122,12 @@ def _is_query_cell(name: str) -> bool:
     return name == COUNTERFACTUAL or name.startswith("builder ")
 
 
-def _reserve(quota: Quota) -> Quota:
-    return Quota(math.ceil(QUERY_RESERVE * quota.train), math.ceil(QUERY_RESERVE * quota.test))
+@lru_cache(maxsize=CACHED_SCENES)
+def _load(folder: Path, scene_id: str) -> Scene:
+    return load_scene(scene_path(folder, scene_id))
 
 
-_load = lru_cache(maxsize=CACHED_SCENES)(load_scene)
-
-
-def _run_job(
-    cfg: BenchmarkConfig,
-    folder: Path,
-    scene_ids: ScenesOfSplit,
-    name: str,
-    quota: Quota,
-    path: Path,
-) -> None:
-    def scene_of(scene_id: str) -> Scene:
-        return _load(scene_path(folder, scene_id))
-
-    cell = CellInputs(
-        scene_ids,
-        scene_of,
-        quota,
-        cfg.seed,
-        least=cfg.selection.min_displacement,
-        hard_negatives=cfg.retrieval.hard_negatives,
-    )
+def _run_job(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> None:
     group, _, subtype = name.partition("/")
     if group == MATCHED_ANCHOR:
         made, dropped = fill_pairs(cell)
@@ -155,7 +136,6 @@ def _run_job(
     elif _is_query_cell(group):
         made, dropped = future.make_queries(int(group.split()[1]), cell)
     else:
-        family = item_families(cfg)[group]
-        made, dropped = fill_quota(subtype, family.timings, family.make_item, cell)
+        made, dropped = fill_quota(subtype, item_families(cfg)[group], cell)
     part: dict[str, Any] = {"rows": [row.to_row() for row in made], "dropped": dropped}
     write_atomically(path, json.dumps(part).encode())

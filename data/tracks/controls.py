@@ -16,7 +16,7 @@ import numpy as np
 from data.records import SELECTION_SECOND, Scene, SelectionItem, sample_prefix_frames
 from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.selection import event, time
-from data.tracks.selection.distractors import Timing
+from data.tracks.selection.distractors import Family, Timing
 from data.world.events import collision_frames, collisions_in
 
 MATCHED_ANCHOR = "matched_anchor"
@@ -29,7 +29,7 @@ SECONDS = (1, 2)
 
 
 def timings(subtype: str, scene: Scene) -> list[Timing]:
-    """Where the next collision is whole seconds after a one-second observation."""
+    """The timings whose target is the next collision, whole seconds after a 1-second prefix."""
     return [
         Timing(stop - SELECTION_SECOND + 1, stop, target, event=target)
         for target in collision_frames(scene)
@@ -41,8 +41,8 @@ def timings(subtype: str, scene: Scene) -> list[Timing]:
 
 
 def fill_pairs(cell: CellInputs) -> tuple[list[SelectionItem], int]:
-    """Make pairs up to the quota, as two items in a row; see `data.tracks.quota.fill_quota`."""
-    items, dropped = fill_quota(MATCHED_ANCHOR, timings, time.make_item, cell)
+    """Make pairs up to the quota. The two items of a pair follow each other."""
+    items, dropped = fill_quota(MATCHED_ANCHOR, Family({}, timings, time.make_item), cell)
     return [each for item in items for each in _pair(item)], dropped
 
 
@@ -73,17 +73,17 @@ def prefix_under_control(item: SelectionItem, count: int, control: str | None) -
     """Sample `count` frames of an item's prefix, in the order in which a model receives them.
 
     Args:
-        control: `candidate_only` gives no frames, `shuffled_prefix` another order than in time,
-            None the frames in time.
+        control: `candidate_only` for no frames, `shuffled_prefix` for an order other than in time,
+            None for the order in time.
     """
     if control == "candidate_only":
         return []
     frames = sample_prefix_frames(item.prefix_start, item.prefix_stop, count)
-    if control == "shuffled_prefix":
-        digest = hashlib.sha256(item.item_id.encode()).digest()
-        rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-        shuffled = frames
-        while shuffled == frames:
-            shuffled = [frames[k] for k in rng.permutation(len(frames))]
-        return shuffled
-    return frames
+    if control is None:
+        return frames
+    digest = hashlib.sha256(item.item_id.encode()).digest()
+    rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
+    shuffled = frames
+    while shuffled == frames:
+        shuffled = [frames[k] for k in rng.permutation(len(frames))]
+    return shuffled

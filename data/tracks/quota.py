@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import count, islice
 from typing import TypeVar
 
 import numpy as np
 
 from conf.schema import Quota
 from data.records import SPLITS, Scene, SelectionItem
-from data.tracks.selection.distractors import DistractorPicker
+from data.tracks.selection.distractors import DistractorPicker, Family
 
 Element = TypeVar("Element")
 
 
 @dataclass(frozen=True)
 class CellInputs:
-    """Inputs of the items or queries of one cell.
+    """What the items or queries of one cell are made from.
 
     Attributes:
         scene_ids: Scene ids by split.
         scene_of: Loads a scene by its id.
-        least: Smallest displacement between two candidates, px at 336 x 336.
+        least: Minimum displacement between two candidates, px at 336 x 336.
         hard_negatives: Number of hard negatives of a query.
     """
 
@@ -37,14 +37,10 @@ class CellInputs:
     hard_negatives: int = 0
 
 
-def fill_quota(
-    subtype: str, timings: Callable, make_item: Callable, cell: CellInputs
-) -> tuple[list[SelectionItem], int]:
-    """Make the items of one cell, at most one a scene, from scenes in a seeded order.
+def fill_quota(subtype: str, family: Family, cell: CellInputs) -> tuple[list[SelectionItem], int]:
+    """Make the items of one cell, at most one per scene, from scenes in a seeded order.
 
-    Args:
-        timings: As in a family; see `data.tracks.selection.distractors`.
-        make_item: The same. The timings of a scene are tried in a random order.
+    The timings of a scene are tried in a random order.
 
     Returns:
         Items of each split up to its quota, and the number of targets that were dropped because
@@ -60,12 +56,12 @@ def fill_quota(
             if len(made) == getattr(cell.quota, split):
                 break
             scene = cell.scene_of(scene_ids[index])
-            places = timings(subtype, scene)
-            order = rng.permutation(len(places))
-            attempts = (make_item(subtype, scene, places[k], rng, picker) for k in order)
+            timings = family.timings(subtype, scene)
+            order = rng.permutation(len(timings))
+            attempts = (family.make_item(subtype, scene, timings[k], rng, picker) for k in order)
             made += islice(filter(None, attempts), 1)
-        # Each letter is the answer equally often. The remainder starts at a random letter, because
-        # otherwise the last letter would be right in fewer cells than the first.
+        # Each letter is the answer equally often. Letters are counted from a random one, because
+        # otherwise the first letters would be the answer more often in small cells.
         positions = rng.permutation((np.arange(len(made)) + rng.integers(4)) % 4)
         for item, position in zip(made, positions.tolist(), strict=True):
             target, *distractors = item.candidates
@@ -77,7 +73,8 @@ def fill_quota(
 
 
 def named_rng(seed: int, *names: str) -> np.random.Generator:
-    """A random generator for a seed and a name, so that one quota does not affect other cells."""
+    """A random generator for a seed and a name. Each cell has its own, so that the quota of one
+    does not affect the others."""
     digest = hashlib.sha256("/".join(names).encode()).digest()
     return np.random.default_rng([seed, int.from_bytes(digest[:8], "big")])
 
@@ -95,9 +92,6 @@ def round_robin(queues: Iterable[Iterable[Element]]) -> Iterator[Element]:
 
 def interleave(elements: Iterable[Element], key: Callable[[Element], Hashable]) -> list[Element]:
     """The first element of each key, then the second of each, and so on; stable otherwise."""
-    turns: Counter[Hashable] = Counter()
-    ranked = []
-    for element in elements:
-        turns[key(element)] += 1
-        ranked.append((turns[key(element)], element))
-    return [element for _, element in sorted(ranked, key=lambda pair: pair[0])]
+    turns: dict[Hashable, Iterator[int]] = defaultdict(count)
+    # `sorted` calls its key once for each element, in order.
+    return sorted(elements, key=lambda element: next(turns[key(element)]))

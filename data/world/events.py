@@ -13,9 +13,9 @@ OCCLUDED = 0.5
 ONSET = 0.01
 """Distance from its initial position at which an object counts as moving, simulator units."""
 ONSET_FRAMES = 3
-"""Consecutive frames for which it must keep that distance."""
+"""Number of consecutive frames at that distance that make an onset."""
 REST_FRAMES = 10
-"""Initial frames for which it must rest, within half of that distance."""
+"""Number of initial frames in which the object must stay within half of that distance."""
 
 
 def collision_frames(scene: Scene) -> list[int]:
@@ -28,35 +28,27 @@ def collisions_in(scene: Scene, first: int, last: int) -> list[Collision]:
     return [c for c in scene.collisions if first <= c.frame <= last]
 
 
-def view_changes_in(scene: Scene, first: int, last: int) -> int:
-    """Number of times that an object enters or leaves the view at frames first to last."""
-    return _changes(scene.in_view, first, last)
-
-
-def occlusion_changes_in(scene: Scene, first: int, last: int) -> int:
-    """Number of times that the occlusion of an object in view changes at frames first to last."""
-    return _changes(scene.in_view & (scene.visible_fraction < OCCLUDED), first, last)
-
-
-def _changes(state: np.ndarray, first: int, last: int) -> int:
-    window = state[max(first - 1, 0) : last + 1]
+def _changes_in(states: np.ndarray, first: int, last: int) -> int:
+    """Number of changes of the objects' boolean states (F, N) at frames first to last."""
+    window = states[max(first - 1, 0) : last + 1]
     return int((window[1:] != window[:-1]).sum())
 
 
 def window_group(scene: Scene, start: int, stop: int, horizon: int) -> str:
-    """The group of a window item by its events; the first of these that applies.
+    """The group of a window item: the first of these whose condition holds.
 
     G4: two or more collisions or view changes in the future window. G2: one collision in it. G3: a
     view change in the prefix or the future window, or an occlusion change in the prefix. G1: none.
+    A view change is an object that enters or leaves the view.
     """
-    ahead = (stop + 1, stop + horizon)
-    collisions, changes = len(collisions_in(scene, *ahead)), view_changes_in(scene, *ahead)
+    ahead, prefix = (stop + 1, stop + horizon), (start + 1, stop)
+    collisions, changes = len(collisions_in(scene, *ahead)), _changes_in(scene.in_view, *ahead)
     if collisions + changes >= 2:
         return "G4"
     if collisions == 1:
         return "G2"
-    prefix = (start + 1, stop)
-    if changes or view_changes_in(scene, *prefix) or occlusion_changes_in(scene, *prefix):
+    occluded = scene.in_view & (scene.visible_fraction < OCCLUDED)
+    if changes or _changes_in(scene.in_view, *prefix) or _changes_in(occluded, *prefix):
         return "G3"
     return "G1"
 

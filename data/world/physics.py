@@ -44,7 +44,7 @@ class Physics:
     ground_friction: float = 0.1
     object_friction: float = 0.3
     ground_restitution: float = 0.0
-    """Bullet multiplies it by the object's: with 0 nothing bounces on the ground."""
+    """Bullet multiplies it by the object's restitution: with 0 nothing bounces on the ground."""
     rubber_restitution: float = 0.5
     metal_restitution: float = 0.7
 

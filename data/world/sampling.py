@@ -14,13 +14,7 @@ import numpy as np
 from conf.schema import BenchmarkConfig
 from data.records import COLORS, FPS, MATERIALS, SHAPES, Scene, SceneObject
 from data.world.camera import STANDARD_CAMERA, Camera
-from data.world.physics import (
-    STANDARD_PHYSICS,
-    Body,
-    Motion,
-    Physics,
-    shared_simulator,
-)
+from data.world.physics import STANDARD_PHYSICS, Body, Motion, Physics, shared_simulator
 from data.world.shapes import BOUNDING_RADIUS, RADIUS
 from data.world.visibility import compute_visibility
 
@@ -31,8 +25,8 @@ SPEED = (1.0, 3.0)
 COLLISIONS = {2: 0.63, 3: 0.33, 4: 0.04}
 """Probability of each target number of collisions, from a sample of CLEVRER's release."""
 CLEAR = 2 * max(BOUNDING_RADIUS.values()) + 0.2
-"""Objects that keep this distance at every frame never touch: the distance of two centres falls by
-less than 0.1 between frames."""
+"""Objects that keep this distance at every frame never touch: between two frames their distance
+falls by less than 0.1."""
 PLACEMENTS = 40
 """Attempts to place one object before the scene is sampled again."""
 
@@ -41,8 +35,8 @@ def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> tuple[list[
     """Sample the bodies of scene `index` and simulate their motion.
 
     The first body moves. Each further one is placed so that it collides with an earlier one, until
-    the scene has its collisions; the remaining bodies rest clear of all others. Scenes in which a
-    pair touches at the start or collides twice are rejected and sampled again.
+    the scene has its target number of collisions; the remaining bodies rest and touch no other.
+    Scenes in which a pair touches at the start or collides twice are rejected and sampled again.
     """
     rng = np.random.default_rng([seed, index])
     while True:

@@ -46,26 +46,21 @@ def make_scenes(
     """
     if cfg.simulator != "bullet":
         return read_release(cfg, folder, workers, strict)
-    names = [scene_name(cfg, index) for index in range(cfg.scenes)]
+    prefix = f"standin_{cfg.standin}-" if cfg.standin else ""
+    names = [prefix + format_scene_id(cfg.seed, index) for index in range(cfg.scenes)]
     scene_ids = split_scenes(cfg, names)
     split_of = {name: split for split, some in scene_ids.items() for name in some}
-    paths = [scene_path(folder, name) for name in names]
+    paths = {name: scene_path(folder, name) for name in names}
     jobs = {
-        path: partial(_simulate_one, cfg, index, split_of[path.stem], path)
-        for index, path in enumerate(paths)
+        paths[name]: partial(_simulate_one, cfg, index, split_of[name], paths[name])
+        for index, name in enumerate(names)
     }
     workers.write_files(jobs, "simulating scenes", "scene")
     return scene_ids, {}
 
 
-def scene_name(cfg: BenchmarkConfig, index: int) -> str:
-    """The id of a simulated scene; those of stand-ins differ from standard ones."""
-    name = format_scene_id(cfg.seed, index)
-    return name if cfg.standin is None else f"standin_{cfg.standin}-{name}"
-
-
 def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, list[Element]]:
-    """Split scenes, in order: a seeded share of every `SPLIT_BLOCK` scenes is for testing.
+    """Assign a random share of every `SPLIT_BLOCK` scenes to the test split; the order is kept.
 
     A scene's split depends only on the seed and its index, so that the training scenes of a larger
     benchmark are never test scenes of a smaller one with the same scenes.
@@ -122,21 +117,24 @@ def read_release(
         )
     source = Path(cfg.folder)
     paths = READERS[cfg.simulator].list_scenes(source)[: cfg.scenes]
-    split_of = {path: split for split, some in split_scenes(cfg, paths).items() for path in some}
-    parts = {path: _part_path(folder, path, split_of[path]) for path in paths}
-    jobs = {
-        part: partial(_read_one, cfg, path, split_of[path], folder, part)
-        for path, part in parts.items()
-    }
+    jobs, split_of = {}, {}
+    for split, some in split_scenes(cfg, paths).items():
+        for path in some:
+            file = path if path.exists() else path.parent
+            # A record that changes is read again.
+            inputs = [str(path), split, file.stat().st_size, file.stat().st_mtime_ns]
+            part = part_path(folder, inputs)
+            jobs[part] = partial(_read_one, cfg, path, split, folder, part)
+            split_of[part] = split
     workers.write_files(jobs, f"reading {cfg.simulator}", "scene")
     scene_ids: dict[str, list[str]] = {split: [] for split in SPLITS}
     problems = []
-    for path, part in parts.items():
+    for part, split in split_of.items():
         outcome = json.loads(part.read_bytes())
         if "problem" in outcome:
             problems.append(outcome["problem"])
         else:
-            scene_ids[split_of[path]].append(outcome["scene_id"])
+            scene_ids[split].append(outcome["scene_id"])
     if problems and strict:
         raise UserError(
             f"{problems[0]} (strict=false leaves such records out)", code="invalid-record"
@@ -147,13 +145,6 @@ def read_release(
         more = len(problems) - LOGGED_PROBLEMS
         log.warning("left out: %d more invalid records of %d", more, len(paths))
     return scene_ids, {"bad records left out": len(problems)}
-
-
-def _part_path(folder: Path, path: Path, split: str) -> Path:
-    """The file with the outcome of reading a record; a record that changes is read again."""
-    file = path if path.exists() else path.parent
-    inputs = [str(path), split, file.stat().st_size, file.stat().st_mtime_ns]
-    return part_path(folder, inputs)
 
 
 def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: Path) -> None:

@@ -127,15 +127,15 @@ def simulate_standin(name: str, index: int, split: str, cfg: BenchmarkConfig) ->
 
     A scene without a collision, or with objects that touch at the start, is sampled again.
     """
-    kind = STANDINS[cfg.standin]
+    standin = STANDINS[cfg.standin]
     rng = np.random.default_rng([cfg.seed, index])
     while True:
-        start = kind.start(sample_objects(rng, cfg), kind.view, rng)
+        start = standin.start(sample_objects(rng, cfg), standin.view, rng)
         if start is None:
             continue
         scenario, bodies = start
-        motion = shared_simulator().simulate(bodies, kind.frames, kind.physics)
+        motion = shared_simulator().simulate(bodies, standin.frames, standin.physics)
         if motion.collisions and not motion.touching_at_start:
             return record_scene(
-                name, split, bodies, motion, kind.physics, kind.view.camera, scenario
+                name, split, bodies, motion, standin.physics, standin.view.camera, scenario
             )

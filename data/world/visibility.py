@@ -63,7 +63,8 @@ def compute_visibility(
 def _may_hide(centres: np.ndarray, bound: np.ndarray) -> np.ndarray:
     """(F, N, N) whether object j may hide a part of object i.
 
-    It may where the view cones of their bounding spheres overlap and j is not entirely behind i.
+    This requires that the view cones of their bounding spheres overlap and j is not entirely
+    behind i.
 
     Args:
         centres: (F, N, 3) positions relative to the camera.

@@ -24,16 +24,10 @@ from data.render.frame_cache import FrameReader
 from data.store import Store
 from evaluation.embedders.cache import EmbeddingCache
 from evaluation.metrics.results import UNTRAINED
-from models.fingerprints import (
-    image_model_id,
-    model_id,
-    pin_revisions,
-    processor_digest,
-    weights_digest,
-)
+from models.checks import check_modules, check_widths
+from models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
 from models.precision import resolve_precision
 from models.resolved import check_base
-from models.retriever.checks import check_pooling, check_widths
 from models.trained_runs import product_folder, resolve_model, run_title
 
 EMBEDDINGS = "embeddings"
@@ -198,8 +192,11 @@ def open_embedders(
         check_base(folder, preset)
         saved = product_folder(folder, "retriever")
         if preset.late is None:
-            check_pooling(saved)
-        digests = weights_digest(model_id(preset), saved), processor_digest(saved)
+            check_modules(saved)
+        digests = (
+            weights_digest(model_id(preset.model, preset.revision), saved),
+            processor_digest(saved),
+        )
         yield Embedder(run_title(folder), preset, precision, saved, *digests, *inputs)
     if preset.architecture is not None:
         # The base is built from a seed; a training run contains it.
@@ -214,6 +211,7 @@ def open_embedders(
     preset = pin_revisions(preset)
     name = f"{UNTRAINED} {preset.name}" if preset.encoder == "qwen3_vl" else preset.name
     name += ", late" if preset.late is not None else ""
-    source = model_id(preset)
-    digests = weights_digest(source, image_model_id(preset)), processor_digest(source)
+    source = model_id(preset.model, preset.revision)
+    image_source = model_id(preset.image_model, preset.image_revision)
+    digests = weights_digest(source, image_source), processor_digest(source)
     yield Embedder(name, preset, precision, None, *digests, *inputs)

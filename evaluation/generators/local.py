@@ -23,8 +23,7 @@ from models.fingerprints import model_id, pin_revisions, processor_digest, weigh
 from models.memory import explain_out_of_memory
 from models.resolved import check_base
 from models.student.collator import Collator
-from models.student.generation import THOUGHT, generate, response_token_limit
-from models.student.token_sampling import sampling_processors
+from models.student.generation import THOUGHT, generate, response_token_limit, sampling_processors
 from models.trained_runs import product_folder, run_title
 
 
@@ -50,9 +49,10 @@ class LocalModel:
         self._student, self._precision = student, precision
         self._batch, self._seed = cfg.batch, cfg.seed
         self.name = run_title(folder) if folder else f"{student.name} base"
+        base = model_id(student.model, student.revision)
         self.revision: dict[str, Any] = {
-            "weights": weights_digest(model_id(student), self._weights),
-            "processor": processor_digest(self._weights or model_id(student)),
+            "weights": weights_digest(base, self._weights),
+            "processor": processor_digest(self._weights or base),
             "revision": student.revision,
             "quantization": student.quantization,
             "precision": precision,

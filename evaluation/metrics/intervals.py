@@ -18,20 +18,13 @@ class Interval:
     n: int
 
 
-def wilson_interval(successes: float, n: int) -> tuple[float, float]:
-    """Return the 95% Wilson interval of `successes` out of `n`; (0, 1) for n = 0."""
+def mean_with_wilson(values: np.ndarray) -> Interval:
+    """Return the mean of values from 0 to 1, such as credits, with its Wilson interval."""
     # statsmodels takes longer to import than everything else that --help needs.
     from statsmodels.stats.proportion import proportion_confint
 
-    if n == 0:
-        return 0.0, 1.0
-    low, high = proportion_confint(successes, n, method="wilson")
-    return float(low), float(high)
-
-
-def mean_with_wilson(values: np.ndarray) -> Interval:
-    """Return the mean of values from 0 to 1, such as credits, with its Wilson interval."""
-    return Interval(float(values.mean()), *wilson_interval(values.sum(), len(values)), len(values))
+    low, high = proportion_confint(values.sum(), len(values), method="wilson")
+    return Interval(float(values.mean()), float(low), float(high), len(values))
 
 
 class SceneBootstrap:

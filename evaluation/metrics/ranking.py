@@ -43,15 +43,6 @@ def count_above_and_equal(scores: np.ndarray, targets: np.ndarray) -> tuple[np.n
     return (scores > targets).sum(1), (scores == targets).sum(1)
 
 
-def count_ranks(scores: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Count the frames strictly above each target, and the other frames tied with it (queries,).
-
-    Both are 0 for a NaN target score. Arguments are those of `target_scores`.
-    """
-    greater, equal = count_above_and_equal(scores, target_scores(scores, targets))
-    return greater, np.maximum(equal - 1, 0)
-
-
 def expected_hits(greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, k: int) -> np.ndarray:
     """Return each query's probability (queries,) to rank among the first `k` under random ties.
 
@@ -68,7 +59,7 @@ def query_metrics(
     """Return each query's measures (queries,) by name.
 
     Args:
-        greater, tied: (queries,) counts as `count_ranks` returns them.
+        greater, tied: (queries,) counts of frames above the target and of others tied with it.
         valid: (queries,) False for a miss: a query without a response or with a NaN target score.
             It has no hit, a reciprocal rank of 0 and the last rank, `frames`.
         frames: Size of the database.

@@ -1,23 +1,20 @@
-"""The rows of an evaluation's report.json: selection accuracies and retrieval measures."""
+"""The contents of an evaluation's report.json: selection accuracies and retrieval measures."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from data.records import RetrievalQuery, SelectionItem
-from data.tracks.selection.time import CELLS
-from evaluation.metrics.accuracy import accuracy_by_family, accuracy_by_group
-from evaluation.metrics.intervals import Interval, SceneBootstrap, macro_by_scene
-from evaluation.metrics.ranking import expected_hits, query_metrics
+from data.records import FAMILIES, RetrievalQuery
+from evaluation.metrics.calibration import Calibration, PositionBias
+from evaluation.metrics.intervals import Interval, SceneBootstrap, mean_with_wilson
+from evaluation.metrics.ranking import query_metrics
+from evaluation.metrics.significance import PairedComparison
 
 if TYPE_CHECKING:
-    from pydantic import TypeAdapter
-
     from evaluation.retrieval.exact_search import Ranks
 
 RECALLS = (1, 10, 50)
@@ -31,6 +28,34 @@ SIMILARITY = "similarity"
 """The mode of a retriever that chooses the nearest candidate."""
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Accuracy of each family that has items, their plain mean (macro) and that of all items."""
+
+    families: dict[str, Interval]
+    macro: float
+    micro: Interval
+
+
+def accuracy_by_group(groups: Sequence[str], credits: Sequence[float]) -> dict[str, Interval]:
+    """Return the accuracy of each group of items, in order of name, with Wilson intervals.
+
+    Args:
+        groups: One name per item, such as its family, subtype or horizon.
+        credits: One credit per item: a bool, or the 1/m of a tie among m candidates.
+    """
+    groups, credits = np.asarray(groups, str), np.asarray(credits, float)
+    return {str(g): mean_with_wilson(credits[groups == g]) for g in np.unique(groups)}
+
+
+def accuracy_by_family(families: Sequence[str], credits: Sequence[float]) -> Accuracy:
+    """Return the accuracy by family, in the order of `FAMILIES`, and over all items."""
+    by_family = accuracy_by_group(families, credits)
+    ordered = {f: by_family[f] for f in FAMILIES if f in by_family}
+    macro = float(np.mean([i.value for i in ordered.values()]))
+    return Accuracy(ordered, macro, mean_with_wilson(np.asarray(credits, float)))
 
 
 @dataclass(frozen=True)
@@ -79,8 +104,31 @@ class SelectionResult:
 
 
 def variant_name(mode: str, control: str | None) -> str:
-    """The mode, followed by the control if there is one."""
+    """Return the mode, followed by the control if there is one."""
     return mode if control is None else f"{mode}, {control}"
+
+
+@dataclass(frozen=True)
+class SelectionReport:
+    """report.json of evaluation.select and evaluation.similarity.
+
+    Attributes:
+        build: Identity of the benchmark's build.
+        controls: Comparisons of controls with the unchanged items, and of matched-anchor pairs.
+        subtypes, readings, positions, calibration: Details by `SelectionResult.key`; `readings`
+            counts parsed answers and the reasons why others could not be parsed.
+        asked: (mode, control, key of the lines in answers.jsonl) of each variant; empty for
+            retrievers.
+    """
+
+    build: str
+    rows: list[SelectionResult]
+    controls: list[PairedComparison]
+    subtypes: dict[str, dict[str, Interval]]
+    readings: dict[str, dict[str, int]]
+    positions: dict[str, PositionBias]
+    calibration: dict[str, Calibration]
+    asked: list[tuple[str, str | None, str]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -121,11 +169,23 @@ class RetrievalResult:
         return {name: getattr(self, name.replace("@", "_")) for name in MEASURES}
 
 
-@cache
-def _adapter(kind: Any) -> TypeAdapter:
-    from pydantic import TypeAdapter
+@dataclass(frozen=True)
+class RetrieverDifference:
+    """Mean differences between two retrievers, left less right, over the same queries."""
 
-    return TypeAdapter(kind)
+    left: str
+    right: str
+    width: int | None
+    measures: dict[str, Interval]
+
+
+@dataclass(frozen=True)
+class RetrievalReport:
+    """report.json of evaluation.retrieve and evaluation.two_stage."""
+
+    build: str
+    rows: list[RetrievalResult]
+    differences: list[RetrieverDifference] = field(default_factory=list)
 
 
 def from_json(kind: type[T], value: Any) -> T:
@@ -134,43 +194,9 @@ def from_json(kind: type[T], value: Any) -> T:
     Raises:
         ValueError: The value does not fit the type.
     """
-    return _adapter(kind).validate_python(value)
+    from pydantic import TypeAdapter
 
-
-def selection_result(
-    benchmark: str,
-    name: str,
-    mode: str,
-    items: Sequence[SelectionItem],
-    credits: Sequence[float],
-    parse_rate: float | None,
-    seed: int,
-    suite: str | None = None,
-    control: str | None = None,
-) -> SelectionResult:
-    """Return a model's result from the credit of each item: 1 if right, 1/m for a tie among m.
-
-    `seed` is that of the scene resampling for the macro accuracy's interval.
-    """
-    families = [i.family for i in items]
-    macro = macro_by_scene(credits, families, [i.scene_id for i in items], seed)
-    timed = [(h, c) for i, c in zip(items, credits, strict=True) if (h := horizon_of(i))]
-    by_horizon = accuracy_by_group([h for h, _ in timed], [c for _, c in timed])
-    # Horizons in frames are all below one second.
-    ordered = sorted(by_horizon, key=lambda h: (h.endswith(" s"), int(h.split()[0])))
-    horizons = {horizon: by_horizon[horizon] for horizon in ordered}
-    accuracy = accuracy_by_family(families, credits)
-    return SelectionResult(
-        benchmark, name, mode, accuracy.families, accuracy.macro, accuracy.micro, parse_rate,
-        len(items), macro, horizons, suite, control,
-    )  # fmt: skip
-
-
-def horizon_of(item: SelectionItem) -> str | None:
-    """Return the horizon of an item of the time family in s, or of the window family in frames."""
-    if item.family == "time":
-        return f"{CELLS[item.subtype]} s"
-    return f"{item.horizon} frames" if item.family == "window" else None
+    return TypeAdapter(kind).validate_python(value)
 
 
 def retrieval_results(
@@ -181,7 +207,8 @@ def retrieval_results(
     `seed` is that of the scene resampling for the intervals.
     """
     results = []
-    for builder, indices in queries_by_builder(queries).items():
+    for builder in (None, *sorted({q.builder for q in queries if q.builder})):
+        indices = [k for k, q in enumerate(queries) if builder in (None, q.builder)]
         scenes = SceneBootstrap([queries[k].scene_id for k in indices], seed)
         for k, width in enumerate(ranks.widths):
             per_query = _query_metrics(ranks, k, indices)
@@ -192,16 +219,6 @@ def retrieval_results(
                 RetrievalResult(benchmark, name, width, builder, *measures, *sizes, *cost)
             )
     return results
-
-
-@dataclass(frozen=True)
-class RetrieverDifference:
-    """Mean differences between two retrievers, left less right, over the same queries."""
-
-    left: str
-    right: str
-    width: int | None
-    measures: dict[str, Interval]
 
 
 def compare_retrievers(
@@ -222,7 +239,7 @@ def compare_retrievers(
     return compared
 
 
-def _query_metrics(ranks: Ranks, k: int, indices: np.ndarray | slice) -> dict[str, np.ndarray]:
+def _query_metrics(ranks: Ranks, k: int, indices: list[int] | slice) -> dict[str, np.ndarray]:
     """Return the measures of some queries at the k-th width."""
     counts = (ranks.greater[k, indices], ranks.tied[k, indices], ranks.found[indices])
     return query_metrics(*counts, ranks.frames, RECALLS)
@@ -233,19 +250,3 @@ def _measure(name: str, values: np.ndarray, scenes: SceneBootstrap) -> Interval:
     low, high = scenes.median(values) if median else scenes.mean(values)
     value = np.median(values) if median else np.mean(values)
     return Interval(float(value), float(low), float(high), len(values))
-
-
-def queries_by_builder(queries: Sequence[RetrievalQuery]) -> dict[int | None, np.ndarray]:
-    """Return the indices of all queries, under None, and of each builder's."""
-    builders = np.array([q.builder or 0 for q in queries])
-    groups = {None: np.arange(len(queries))}
-    return groups | {int(b): np.flatnonzero(builders == b) for b in np.unique(builders) if b}
-
-
-def recall_curve(name: str, ranks: Ranks) -> dict[str, Any]:
-    """Return recall over k at the widest width: `name`, `ks` up to the size of the database, and
-    `recalls`."""
-    ks = sorted({round(k) for k in np.geomspace(1, ranks.frames, 60)})
-    counts = ranks.greater[0], ranks.tied[0], ranks.found
-    recalls = [float(expected_hits(*counts, k).mean()) for k in ks]
-    return {"name": name, "ks": ks, "recalls": recalls}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from data.tracks.controls import pair_items
 from evaluation.metrics.intervals import macro_by_scene
 
 NAMED = 3
-"""Items of a difference that an error lists."""
+"""Number of items that the error about different items names."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,7 @@ class PairedComparison:
 
     Attributes:
         of: The items: a family's, "macro" for the plain mean of the families, or "all".
+        mode: Mode of both runs, if only one is compared.
         difference: Left accuracy less right accuracy, with its 95% interval from `low` to `high`
             by resampling scenes.
         only_left, only_right: Items that are right on one side only (of ties, those with more
@@ -41,6 +43,7 @@ class PairedComparison:
     only_left: int | None = None
     only_right: int | None = None
     p: float | None = None
+    mode: str = ""
 
 
 def compare_runs(
@@ -78,7 +81,7 @@ def compare_runs(
 def compare_anchors(
     items: Sequence[SelectionItem], credits: Mapping[str, float], seed: int
 ) -> list[PairedComparison]:
-    """Compare the two questions of matched-anchor pairs: event (left) against time (right).
+    """Compare the questions of matched-anchor pairs: event (left) with time (right).
 
     `credits` has each item's credit by its id.
     """
@@ -89,12 +92,9 @@ def compare_anchors(
 
 
 def check_same_items(
-    left: Mapping[str, float], right: Mapping[str, float], names: tuple[str, str]
+    left: Mapping[str, Any], right: Mapping[str, Any], names: tuple[str, str]
 ) -> None:
-    """
-    Raises:
-        UserError: Two runs answered different items.
-    """
+    """Raise a UserError if two runs, each with its results by item id, answered different items."""
     extra = (left.keys() - right.keys(), right.keys() - left.keys())
     differences = [
         f"{len(ids)} only in {name} (such as {', '.join(sorted(ids)[:NAMED])})"

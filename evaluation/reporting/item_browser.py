@@ -19,111 +19,112 @@ from data.store import Store, open_store
 from data.tracks.controls import MATCHED_ANCHOR
 from data.tracks.quota import interleave
 from evaluation.metrics.significance import PairedComparison, check_same_items
-from evaluation.reporting.comparisons import compare_models
-from evaluation.reporting.figures import count_confusions
-from evaluation.reporting.measurements import Measurement, deduplicate
+from evaluation.reporting.measurements import Measurement, compare_models, deduplicate
 from evaluation.reporting.run_responses import ItemResponse, Responses, read_responses
 
 PREFIX_FRAMES = 6
 FRAME_WIDTH = 160
 """Pixels."""
 WEBP_QUALITY = 70
-TEXT_LIMIT = 4000
-"""Characters of a response."""
 
 
 @dataclass
 class ItemBrowser:
-    """The items of the page, and what was computed from the responses to all items.
+    """The items of the page, and the comparisons of the models' responses to all items.
 
     Attributes:
         entries: The items, as the page's script reads them.
         frames: Data URLs of their frames by name.
         notes: Sentences on the shown and the missing items of each benchmark.
-        confusions: Counts of `count_confusions`, by item set and model.
         comparisons: Paired comparisons by benchmark.
     """
 
     entries: list[dict[str, Any]] = field(default_factory=list)
     frames: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    confusions: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    comparisons: dict[str, list[list[PairedComparison]]] = field(default_factory=dict)
+    comparisons: dict[str, list[PairedComparison]] = field(default_factory=dict)
+
+    def add_benchmark(
+        self,
+        store: Store,
+        models: Mapping[str, tuple[Measurement, Responses]],
+        limit: int,
+        seed: int,
+    ) -> None:
+        """Compare the models of a benchmark, and add at most `limit` of its items.
+
+        Args:
+            models: Models by label, with their responses.
+        """
+        suites = (None, MATCHED_ANCHOR)
+        items = {i.item_id: i for suite in suites for i in store.selection("test", suite)}
+        by_label = {label: responses for label, (_, responses) in models.items()}
+        # Controls are compared by the run that measured them.
+        unchanged = {label: model for label, model in models.items() if not model[0].variants}
+        self.comparisons[store.name] = compare_models(unchanged, items, seed)
+        answered = [i for k, i in items.items() if any(k in r for r in by_label.values())]
+        shown = choose_items(answered, by_label, limit, seed)
+        self.entries += page_entries(shown, by_label, store)
+        frames, errors = encode_frames(shown, store)
+        self.frames |= frames
+        self.notes.append(
+            f"{store.name}: {len(shown):,} of {len(answered):,} answered items, spread over "
+            "subtypes and over correct and wrong answers; items=N shows another number."
+        )
+        if errors:
+            more = f" ({len(errors) - 1:,} more scenes)" if errors[1:] else ""
+            self.notes.append(f"Frames are missing: {errors[0]}{more}.")
 
 
 def browse_items(
     selections: Sequence[Measurement], stores: Path, limit: int, seed: int
 ) -> ItemBrowser:
-    """At most `limit` items of each benchmark with responses.
+    """Return at most `limit` items of each benchmark with responses.
 
     Raises:
-        UserError: two runs measured different items of one benchmark.
+        UserError: Two runs measured different items of one benchmark.
     """
     runs = {m.run.folder: m.run for m in selections}
     by_run = {folder: read_responses(run) for folder, run in runs.items()}
-    first: dict[str, tuple[str, Responses]] = {}
+
+    def responses_of(m: Measurement) -> Responses:
+        return by_run[m.run.folder].get(m.result.key, {})
+
+    first: dict[str, Measurement] = {}
     for m in selections:
-        own = (str(m.run.folder), by_run[m.run.folder].get(m.row.key, {}))
-        (other_folder, others), (folder, responses) = first.setdefault(m.items, own), own
-        check_same_items(others, responses, (other_folder, folder))
+        other = first.setdefault(m.items, m)
+        names = (str(other.run.folder), str(m.run.folder))
+        check_same_items(responses_of(other), responses_of(m), names)
     browser, kept = ItemBrowser(), deduplicate(selections)
-    for name in dict.fromkeys(m.row.benchmark for m in kept):
-        answered = [
-            (m, by_run[m.run.folder].get(m.row.key, {})) for m in kept if m.row.benchmark == name
-        ]
+    for name in dict.fromkeys(m.benchmark for m in kept):
+        models = {
+            ", ".join([m.label, *m.variants]): (m, responses_of(m))
+            for m in kept
+            if m.benchmark == name
+        }
         try:
             store = open_store(stores / name)
         except UserError as error:
             browser.notes.append(f"The items of {name} cannot be shown: {error} benchmark={name}.")
             continue
-        if any(m.run.report["build"] != store.identity for m, _ in answered):
+        if any(m.run.report.build != store.identity for m, _ in models.values()):
             # Its items can differ although their ids agree.
             browser.notes.append(
                 f"The items of {name} cannot be shown: {store.folder} was rebuilt since the runs."
             )
             continue
-        _add_benchmark(browser, store, answered, limit, seed)
+        browser.add_benchmark(store, models, limit, seed)
     return browser
-
-
-def _add_benchmark(
-    browser: ItemBrowser,
-    store: Store,
-    answered: Sequence[tuple[Measurement, Responses]],
-    limit: int,
-    seed: int,
-) -> None:
-    items = {
-        i.item_id: i for suite in (None, MATCHED_ANCHOR) for i in store.selection("test", suite)
-    }
-    by_label: dict[str, Responses] = {}
-    for m, responses in answered:
-        label = ", ".join([m.label, *m.variants])
-        by_label[label] = {k: r for k, r in responses.items() if k in items}
-        pairs = [(items[k].letter, r.letter) for k, r in by_label[label].items()]
-        browser.confusions.setdefault(m.items, {})[label] = count_confusions(pairs)
-    # Controls are compared by the run that measured them.
-    unchanged = {m.label: (m, by_label[m.label]) for m, _ in answered if not m.variants}
-    browser.comparisons[store.name] = compare_models(unchanged, items, seed)
-    known = [i for k, i in items.items() if any(k in r for r in by_label.values())]
-    shown = choose_items(known, by_label, limit, seed)
-    browser.entries += page_entries(shown, by_label, store)
-    frames, errors = encode_frames(shown, store)
-    browser.frames |= frames
-    browser.notes.append(
-        f"{store.name}: {len(shown):,} of {len(known):,} answered items, spread over subtypes and "
-        "over correct and wrong answers; items=N shows another number."
-    )
-    if errors:
-        more = f" ({len(errors) - 1:,} more scenes)" if errors[1:] else ""
-        browser.notes.append(f"Frames are missing: {errors[0]}{more}.")
 
 
 def choose_items(
     items: Sequence[SelectionItem], responses: Mapping[str, Responses], limit: int, seed: int
 ) -> list[SelectionItem]:
-    """At most `limit` random items with equally many of each subtype, and in a subtype of each
-    combination of correct and wrong answers; by family and subtype."""
+    """Return at most `limit` random items, sorted by family and subtype.
+
+    Subtypes have equally many items, and so do the combinations of correct and wrong answers in a
+    subtype.
+    """
 
     def subtype(item: SelectionItem) -> tuple[int, str]:
         return FAMILIES.index(item.family), item.subtype
@@ -140,7 +141,7 @@ def choose_items(
 def page_entries(
     items: Sequence[SelectionItem], responses: Mapping[str, Responses], store: Store
 ) -> Iterator[dict[str, Any]]:
-    """The page's data of each item; frames by the names of `encode_frames`."""
+    """Yield the page's data of each item, which names frames as `encode_frames` does."""
     for item in items:
         yield {
             "id": item.item_id,
@@ -148,12 +149,12 @@ def page_entries(
             "family": item.family,
             "subtype": item.subtype,
             "question": item.question,
-            "prefix": [_frame_name(store, frame) for frame in _prefix(item)],
+            "prefix": [f"{store.name}/{frame.name}" for frame in _prefix(item)],
             "observed": f"frames {item.prefix_start} to {item.prefix_stop} of {item.scene_id}",
             "candidates": [
                 {
                     "letter": letter,
-                    "frame": _frame_name(store, c),
+                    "frame": f"{store.name}/{c.name}",
                     "caption": f"{c.source.replace('_', ' ')}: frame {c.frame}"
                     + (f" of {c.scene_id}" if c.scene_id != item.scene_id else ""),
                 }
@@ -170,7 +171,7 @@ def page_entries(
 
 
 def describe_truth(item: SelectionItem, store: Store) -> list[str]:
-    """The oracle's facts on an item, in sentences."""
+    """Return sentences on the target and on the collisions before it."""
     scene = store.scene(item.scene_id)
     sentences = [
         f"{item.letter} is correct: frame {item.target_frame}, "
@@ -179,22 +180,17 @@ def describe_truth(item: SelectionItem, store: Store) -> list[str]:
     ]
     for collision in scene.collisions:
         if item.prefix_stop < collision.frame <= item.target_frame:
-            one, other = (scene.objects[k].phrase for k in collision.objects)
+            one, other = (scene.objects[k].noun_phrase for k in collision.objects)
             sentences.append(f"The {one} and the {other} collide at frame {collision.frame}.")
     return sentences
 
 
 def _response_entry(label: str, response: ItemResponse, item: SelectionItem) -> dict[str, Any]:
-    text, letter = response.text, response.letter
-    if len(text) > TEXT_LIMIT:
-        text = (
-            f"{text[:TEXT_LIMIT]}… (the first {TEXT_LIMIT:,} of {len(text):,} characters; the "
-            "run's answers.jsonl has all of them)"
-        )
+    letter = response.letter
     verdict = "correct" if letter == item.letter else "wrong" if letter else "unparsed"
     return {
         "model": label, "letter": letter, "verdict": verdict, "reason": response.reason,
-        "text": text, "truncated": response.truncated,
+        "text": response.text, "truncated": response.truncated,
     }  # fmt: skip
 
 
@@ -203,13 +199,9 @@ def _prefix(item: SelectionItem) -> list[FrameRef]:
     return [FrameRef(item.scene_id, frame) for frame in frames]
 
 
-def _frame_name(store: Store, frame: FrameRef) -> str:
-    return f"{store.name}/{frame.scene_id}/{frame.frame}"
-
-
 def encode_frames(items: Sequence[SelectionItem], store: Store) -> tuple[dict[str, str], list[str]]:
-    """The frames of the items as WebP data URLs by name, and a sentence for each scene whose frames
-    cannot be read."""
+    """Return the frames of the items as WebP data URLs by name, and an error for each scene whose
+    frames cannot be read."""
     wanted: dict[str, set[int]] = {}
     for item in items:
         for frame in (*_prefix(item), *item.candidates):
@@ -223,12 +215,12 @@ def encode_frames(items: Sequence[SelectionItem], store: Store) -> tuple[dict[st
             errors.append(str(error))
             continue
         for index, pixels in zip(ordered, stack, strict=True):
-            frames[_frame_name(store, FrameRef(scene_id, index))] = encode_webp(pixels)
+            frames[f"{store.name}/{FrameRef(scene_id, index).name}"] = encode_webp(pixels)
     return frames, errors
 
 
 def encode_webp(pixels: np.ndarray) -> str:
-    """(height, width, 3) uint8 as the data URL of an image of `FRAME_WIDTH` pixels."""
+    """Return pixels (height, width, 3) as the data URL of an image of `FRAME_WIDTH` pixels."""
     from PIL import Image
 
     height, width = pixels.shape[:2]

@@ -1,15 +1,20 @@
-"""The results of all runs, each with what the report needs of its run."""
+"""The results of all runs, each with its run and the training of its model; their comparisons."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
-from evaluation.metrics.results import UNTRAINED, RetrievalResult, SelectionResult, from_json
-from evaluation.reporting.runs import FinishedRun, reading, training_settings
+from conf.errors import UserError
+from data.records import SelectionItem
+from evaluation.metrics.results import UNTRAINED, RetrievalResult, SelectionResult
+from evaluation.metrics.significance import PairedComparison, compare_runs
+from evaluation.reporting.run_responses import Responses
+from evaluation.reporting.runs import FinishedRun, training_settings
 
 TRANSFER_SUITES = {"movi_a": "MoVi-A", "physion": "Physion"}
 """The paper's transfer suites by their simulator."""
@@ -26,29 +31,33 @@ ABLATED_REGIMES = ("cot_no_candidate_analysis", "cot_no_match_layout")
 
 @dataclass(frozen=True)
 class Measurement:
-    """A result in a run's report, with its run.
+    """A result with its run and the training of its model.
 
     Attributes:
-        name: The name of the model in the report; the result has its name in the run.
+        name: Name of the model in the report, which may differ from the name in its run.
         training: Settings of the training run; None for a released model, empty if unknown.
     """
 
-    row: SelectionResult | RetrievalResult
+    result: SelectionResult | RetrievalResult
     run: FinishedRun
     name: str
     training: dict[str, Any] | None
 
     @property
+    def benchmark(self) -> str:
+        return self.result.benchmark
+
+    @property
     def variants(self) -> list[str]:
         """The suite and the control of its items; empty for the benchmark's unchanged items."""
-        if isinstance(self.row, RetrievalResult):
+        if isinstance(self.result, RetrievalResult):
             return []
-        return [variant for variant in (self.row.suite, self.row.control) if variant is not None]
+        return [x for x in (self.result.suite, self.result.control) if x is not None]
 
     @property
     def items(self) -> str:
-        """The name of its item set: the benchmark and the variants."""
-        return ", ".join([self.row.benchmark, *self.variants])
+        """The name of its item set: benchmark, suite and control."""
+        return ", ".join([self.benchmark, *self.variants])
 
     @property
     def trained(self) -> bool:
@@ -59,7 +68,7 @@ class Measurement:
         return (self.training or {}).get("train", {}).get("regime")
 
     @property
-    def home(self) -> str | None:
+    def training_benchmark(self) -> str | None:
         """The benchmark that the model was trained on, if known."""
         return (self.training or {}).get("benchmark", {}).get("name")
 
@@ -76,7 +85,7 @@ class Measurement:
 
     @property
     def label(self) -> str:
-        return f"{self.name} ({self.row.mode})"
+        return f"{self.name} ({self.result.mode})"
 
     @property
     def is_transfer_suite(self) -> bool:
@@ -86,64 +95,57 @@ class Measurement:
 
     @property
     def line(self) -> tuple:
-        """The line of a table that the result belongs to."""
-        row = self.row
-        variant = row.mode if isinstance(row, SelectionResult) else (row.width, row.builder)
-        return self.run.kind, self.items, row.name, variant
+        """Identifies the line of a table: results with equal lines have equal names."""
+        of = self.result
+        variant = of.mode if isinstance(of, SelectionResult) else (of.width, of.builder)
+        return self.run.kind, self.items, of.name, variant
 
 
 def read_measurements(
-    runs: Iterable[FinishedRun], root: Path, kinds: Sequence[str], result_type: type
+    runs: Iterable[FinishedRun], root: Path, kinds: Sequence[str]
 ) -> list[Measurement]:
-    """The results of the runs of some kinds below `root`.
-
-    Raises:
-        UserError: a report is damaged or of another version.
-    """
+    """Return the results of the runs of some kinds below `root`."""
     measurements = []
     for run in runs:
         if run.kind in kinds:
             training = training_settings(run, root)
-            with reading(run.folder):
-                rows = from_json(list[result_type], run.report["rows"])
-            # A trained retriever's report also has rows of its untrained base.
-            measurements += [
-                Measurement(
-                    row, run, row.name, None if row.name.startswith(UNTRAINED) else training
-                )
-                for row in rows
-            ]
+            for row in run.report.rows:
+                # A trained retriever's report also has rows of its untrained base.
+                trained = None if row.name.startswith(UNTRAINED) else training
+                measurements.append(Measurement(row, run, row.name, trained))
     return measurements
 
 
 def deduplicate(measurements: Iterable[Measurement]) -> list[Measurement]:
-    """Each result once: the reports of several retrievers repeat the row of their common base.
+    """Return each result once: reports of several retrievers repeat the row of a common base.
 
-    Different results of one name get the names of their runs.
+    Models of one name with different results are named after their runs, too.
     """
     kept: list[Measurement] = []
     for m in measurements:
-        if all(m.row != other.row for other in kept):
+        if all(m.result != other.result for other in kept):
             kept.append(m)
     counts = Counter(m.line for m in kept)
     return [
-        replace(m, name=f"{m.row.name}, {m.run.name}") if counts[m.line] > 1 else m for m in kept
+        replace(m, name=f"{m.result.name}, {m.run.name}") if counts[m.line] > 1 else m for m in kept
     ]
 
 
 def shared_names(measurements: Iterable[Measurement]) -> list[str]:
-    """A name for each result such that the results of one model on several benchmarks share it; a
-    second result on the same items keeps the name with its run."""
+    """Return a name for each result, which a model's results on several benchmarks share.
+
+    A second result of a model on the same items has the name of its run, too.
+    """
     used: set[tuple] = set()
     names = []
     for m in measurements:
-        names.append(m.name if m.line[1:] in used else m.row.name)
+        names.append(m.name if m.line[1:] in used else m.result.name)
         used.add(m.line[1:])
     return names
 
 
 def group_by_items(measurements: Iterable[Measurement]) -> dict[str, list[Measurement]]:
-    """The results by their item set: those on different items never share a table."""
+    """Return the results by item set: results on different items never share a table."""
     groups: dict[str, list[Measurement]] = {}
     for m in measurements:
         groups.setdefault(m.items, []).append(m)
@@ -151,18 +153,85 @@ def group_by_items(measurements: Iterable[Measurement]) -> dict[str, list[Measur
 
 
 def transfer_benchmarks(measurements: Sequence[Measurement]) -> set[str]:
-    """Benchmarks that no model was trained on and that are transfer suites, or on which models are
-    measured that were trained on another benchmark."""
-    homes = {m.home for m in measurements if m.home}
-    measured = {m.row.benchmark for m in measurements if m.is_transfer_suite or m.home}
-    return measured - homes
+    """Return the benchmarks that test transfer.
+
+    No model was trained on them, and they are transfer suites or measure a trained model.
+    """
+    trained_on = {m.training_benchmark for m in measurements if m.training_benchmark}
+    measured = {m.benchmark for m in measurements if m.is_transfer_suite or m.training_benchmark}
+    return measured - trained_on
 
 
 def widest_results(measurements: Iterable[Measurement]) -> list[Measurement]:
-    """The results over all queries at the largest width of each model, released models first."""
+    """Return the results over all queries at each model's largest width, released models first."""
     widest: dict[tuple[Path, str], Measurement] = {}
     for m in measurements:
         # A report has the widest first.
-        if m.row.builder is None:
+        if m.result.builder is None:
             widest.setdefault((m.run.folder, m.name), m)
     return sorted(widest.values(), key=lambda m: m.trained)
+
+
+def check_builds(measurements: Iterable[Measurement]) -> None:
+    """Raise a UserError if two runs measured different builds of a benchmark.
+
+    The items and queries of two builds can differ although their ids agree.
+    """
+    builds: dict[str, Measurement] = {}
+    for m in measurements:
+        other = builds.setdefault(m.benchmark, m)
+        if m.run.report.build != other.run.report.build:
+            raise UserError(
+                f"{other.run.folder} and {m.run.folder} measured different builds of benchmark "
+                f"{m.benchmark}: measure one of them again (run=NAME), or leave it out with "
+                "runs=[...]",
+                code="different-builds",
+            )
+
+
+def compare_models(
+    models: Mapping[str, tuple[Measurement, Responses]],
+    items: Mapping[str, SelectionItem],
+    seed: int,
+) -> list[PairedComparison]:
+    """Compare the pairs of models that the paper compares: by family, macro, and over all items.
+
+    Args:
+        models: Models of one benchmark by label, with their responses.
+        items: The benchmark's items by id.
+        seed: Seed of the bootstrap over scenes.
+    """
+    comparisons: list[PairedComparison] = []
+    for pair in permutations(models, 2):
+        if not _is_paper_comparison(*(models[label][0] for label in pair)):
+            continue
+        credits = [
+            {k: r.credit(items[k].letter) for k, r in models[label][1].items()} for label in pair
+        ]
+        answered = [item for item_id, item in items.items() if item_id in credits[0]]
+        if answered:
+            comparisons += compare_runs(answered, *credits, pair, seed)
+    return comparisons
+
+
+def _is_paper_comparison(m: Measurement, other: Measurement) -> bool:
+    """Whether the paper compares such models. These are:
+
+    - a student and its base in the same mode,
+    - a student with rationales and one without, of the same base and seed,
+    - the full student and an ablated one, of the same base, seed and mode,
+    - a retriever and its untrained base.
+    """
+    if m.run.kind == "similarity":
+        # The row of a common base is kept once, under the run that measured it first.
+        return m.trained and not other.trained and other.result in m.run.report.rows
+    if m.regime not in REGIMES or other.base != m.base:
+        return False
+    same_mode = other.result.mode == m.result.mode
+    if not other.trained:
+        return same_mode
+    if other.seed != m.seed:
+        return False
+    if other.regime == "answer_only":
+        return m.regime != "answer_only"
+    return m.regime == "cot" and other.regime in ABLATED_REGIMES and same_mode

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import yaml
 
 from data.records import FAMILIES
-from evaluation.reporting.table import DETAIL, FORMATS, Row
+from evaluation.reporting.table import DETAIL, FORMATS, Row, Table
 
 SUITE = "dynapix"
 """The suite whose items the paper's selection tables cover."""
@@ -49,12 +50,20 @@ def reference_rows(group: str) -> list[Row]:
     return rows
 
 
-def table_reference(table: str) -> dict[str, list[Row]]:
-    """Return the rows of the paper in one of the report's tables by the label of their group."""
-    groups = reference("tables")[table]["paper"]
-    return {
-        label: [row for n in names for row in reference_rows(n)] for label, names in groups.items()
+def table_with_paper(
+    key: str,
+    name: str,
+    columns: Sequence[str],
+    groups: Mapping[str, Sequence[Row]],
+    notes: tuple[str, ...],
+) -> Table:
+    """Return a table with the caption and the paper's rows of `tables[key]` in `reference.yaml`."""
+    table = reference("tables")[key]
+    paper = {
+        label: [row for name in names for row in reference_rows(name)]
+        for label, names in table["paper"].items()
     }
+    return Table(name, table["caption"], columns, groups, notes, paper)
 
 
 def _to_share(column: str, value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from conf.runs import read_json_lines
@@ -14,12 +14,12 @@ from models.student.answer_parser import Reason, parse_choice
 
 @dataclass(frozen=True)
 class ItemResponse:
-    """What a model answered to an item.
+    """A model's response to an item.
 
     Attributes:
         text: The response, or the scores of a retriever.
         letters: The chosen letters: several for tied scores, none for an unparsed response.
-        reason: Why the letter is unknown.
+        reason: Why there is no single letter.
         truncated: Whether generation stopped before the end of the text.
     """
 
@@ -43,44 +43,35 @@ Responses = Mapping[str, ItemResponse]
 
 
 def read_responses(run: FinishedRun) -> dict[str, Responses]:
-    """The responses that a run's report is about, by `SelectionResult.key` and item.
+    """Return the responses of a run by `SelectionResult.key` and item.
 
     Responses under other settings, and lines torn by a kill, are left out.
 
     Raises:
-        UserError: the report or the responses are missing or of another version.
+        UserError: The responses are missing or of another version.
     """
-    return _read_scores(run) if run.kind == "similarity" else _read_texts(run)
-
-
-def _read_scores(run: FinishedRun) -> dict[str, Responses]:
+    variants = {key: variant_name(mode, control) for mode, control, key in run.report.asked}
     responses: dict[str, dict[str, ItemResponse]] = {}
-    with reading(run.folder, "scores.jsonl"):
-        for row in read_json_lines(run.folder / "scores.jsonl"):
-            scores = dict(zip(LETTERS, row["scores"], strict=True))
-            responses.setdefault(row["by"], {})[row["item_id"]] = nearest_candidates(scores)
-    return responses
-
-
-def nearest_candidates(scores: Mapping[str, float | None]) -> ItemResponse:
-    """The candidates with the highest score; a score is None if it is missing."""
-    known = [score for score in scores.values() if score is not None]
-    letters = "".join(x for x, score in scores.items() if known and score == max(known))
-    reason = None if len(letters) == 1 else str(Reason.SEVERAL)
-    shown = {x: "no score" if score is None else f"{score:.4f}" for x, score in scores.items()}
-    return ItemResponse(", ".join(f"{x} {score}" for x, score in shown.items()), letters, reason)
-
-
-def _read_texts(run: FinishedRun) -> dict[str, Responses]:
-    with reading(run.folder):
-        variants = {key: variant_name(mode, control) for mode, control, key in run.report["asked"]}
-    responses: dict[str, dict[str, ItemResponse]] = {v: {} for v in variants.values()}
-    with reading(run.folder, "answers.jsonl"):
-        for row in read_json_lines(run.folder / "answers.jsonl"):
-            if "text" in row and row["key"] in variants:
+    file = "scores.jsonl" if run.kind == "similarity" else "answers.jsonl"
+    with reading(run.folder, file):
+        for row in read_json_lines(run.folder / file):
+            if run.kind == "similarity":
+                variant, response = row["by"], nearest_candidates(row["scores"])
+            elif "text" in row and row["key"] in variants:
+                variant = variants[row["key"]]
                 response = parse_response(str(row["text"]), bool(row["cut"]))
-                responses[variants[row["key"]]][row["item_id"]] = response
+            else:
+                continue
+            responses.setdefault(variant, {})[row["item_id"]] = response
     return responses
+
+
+def nearest_candidates(scores: Sequence[float]) -> ItemResponse:
+    """Return the letters of the candidates with the highest score."""
+    by_letter = dict(zip(LETTERS, scores, strict=True))
+    letters = "".join(x for x, score in by_letter.items() if score == max(scores))
+    text = ", ".join(f"{x} {score:.4f}" for x, score in by_letter.items())
+    return ItemResponse(text, letters, None if len(letters) == 1 else str(Reason.SEVERAL))
 
 
 def parse_response(text: str, truncated: bool) -> ItemResponse:

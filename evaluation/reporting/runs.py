@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,10 +16,16 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from conf.errors import UserError
+from evaluation.metrics.results import RetrievalReport, SelectionReport, from_json
 
 SELECTION_KINDS, RETRIEVAL_KINDS = ("select", "similarity"), ("retrieve", "two_stage")
 STUDY_KINDS, TRAINING_KINDS = ("export_study",), ("sft", "contrastive")
-KINDS = (*SELECTION_KINDS, *RETRIEVAL_KINDS, *STUDY_KINDS, *TRAINING_KINDS)
+REPORT_TYPES = {
+    **dict.fromkeys(SELECTION_KINDS, SelectionReport),
+    **dict.fromkeys(RETRIEVAL_KINDS, RetrievalReport),
+    **dict.fromkeys(STUDY_KINDS, dict[str, Any]),
+}
+KINDS = (*REPORT_TYPES, *TRAINING_KINDS)
 """Folders below checkpoints/ with runs that a report covers."""
 
 
@@ -29,7 +36,7 @@ class FinishedRun:
     Attributes:
         kind: The folder of its command, such as select.
         config: Its settings.
-        report: Its report.json; empty for a training run.
+        report: Its report.json; None for a training run.
         started: When it was first started, in ISO format.
     """
 
@@ -37,7 +44,7 @@ class FinishedRun:
     kind: str
     name: str
     config: dict[str, Any]
-    report: dict[str, Any]
+    report: SelectionReport | RetrievalReport | dict[str, Any] | None
     started: str
 
     @property
@@ -46,21 +53,23 @@ class FinishedRun:
 
 
 def gather_runs(root: Path, patterns: Sequence[str] | None) -> list[FinishedRun]:
-    """The finished runs below `root`, oldest first.
+    """Return the finished runs below `root`, oldest first.
 
     Args:
         patterns: Folders or patterns of folders below `root`, such as select/*; None for all.
 
     Raises:
-        UserError: nothing is measured, a pattern names no run, or a run cannot be read.
+        UserError: No evaluation has finished, a pattern matches no finished run, or a run cannot be
+            read.
     """
     # A sweep's jobs are one folder deeper.
     depths = ("*/metrics.json", "*/*/metrics.json")
-    finished = [p.parent for k in KINDS for d in depths for p in sorted(root.glob(f"{k}/{d}"))]
+    folders = [p.parent for k in KINDS for d in depths for p in sorted(root.glob(f"{k}/{d}"))]
+    finished = [folder.relative_to(root).as_posix() for folder in folders]
     chosen = (
-        finished if patterns is None else [f for p in patterns for f in _match(root, p, finished)]
+        finished if patterns is None else [t for p in patterns for t in _match(root, p, finished)]
     )
-    runs = [_read_run(root, folder) for folder in dict.fromkeys(chosen)]
+    runs = [_read_run(root, title) for title in dict.fromkeys(chosen)]
     if all(run.kind in TRAINING_KINDS for run in runs):
         raise UserError(
             f"no evaluation has finished below {root}: run python -m evaluation.select "
@@ -71,41 +80,33 @@ def gather_runs(root: Path, patterns: Sequence[str] | None) -> list[FinishedRun]
     return sorted(runs, key=lambda run: (run.started, run.kind, run.name))
 
 
-def _match(root: Path, pattern: str, finished: Sequence[Path]) -> list[Path]:
-    """The `finished` runs that a pattern names."""
+def _match(root: Path, pattern: str, finished: Sequence[str]) -> list[str]:
+    """Return the `finished` runs that a pattern matches."""
     pattern = pattern.strip("/").removeprefix(f"{root.as_posix().strip('/')}/")
-    try:
-        folders = [path for path in root.glob(pattern) if path.is_dir()]
-    except (ValueError, NotImplementedError) as error:
+    if matched := fnmatch.filter(finished, pattern):
+        return matched
+    if (root / pattern).is_dir():
         raise UserError(
-            f"runs: {pattern} is not a valid pattern of folders below {root}: {error}",
-            code="invalid-setting",
-        ) from error
-    if matched := [path for path in folders if path in finished]:
-        return sorted(matched)
-    if folders:
-        raise UserError(
-            f"runs: {folders[0]} is not a finished run of an evaluation or a training: run its "
+            f"runs: {root / pattern} is not a finished run of an evaluation or a training: run its "
             "command again, which resumes it (or python -m evaluation.study.export, if it is a "
             "study), or name another run",
             code="unfinished-run",
         )
-    names = [path.relative_to(root).as_posix() for path in finished]
-    similar = get_close_matches(pattern, names, 3, 0.3) or names[:3]
+    similar = get_close_matches(pattern, finished, 3, 0.3) or finished[:3]
     hint = f"; existing runs: {', '.join(similar)}" if similar else ""
     raise UserError(f"runs: {pattern} matches no run below {root}{hint}", code="missing-run")
 
 
-def _read_run(root: Path, folder: Path) -> FinishedRun:
-    kind, *name = folder.relative_to(root).parts
-    report = {}
+def _read_run(root: Path, title: str) -> FinishedRun:
+    kind, _, name = title.partition("/")
+    folder, report = root / title, None
     with reading(folder, "run.json"):
         record = json.loads((folder / "run.json").read_text())
         started = min(map(str, [record["started"], *record["earlier_starts"]]))
-    if kind not in TRAINING_KINDS:
+    if kind in REPORT_TYPES:
         with reading(folder):
-            report = dict(json.loads((folder / "report.json").read_text()))
-    return FinishedRun(folder, kind, "/".join(name), _read_settings(folder), report, started)
+            report = from_json(REPORT_TYPES[kind], json.loads((folder / "report.json").read_text()))
+    return FinishedRun(folder, kind, name, _read_settings(folder), report, started)
 
 
 def _read_settings(folder: Path) -> dict[str, Any]:
@@ -114,19 +115,18 @@ def _read_settings(folder: Path) -> dict[str, Any]:
 
 
 def training_settings(run: FinishedRun, root: Path) -> dict[str, Any] | None:
-    """The settings by which the model of an evaluation, or else its matcher, was trained.
+    """Return the settings of the training of a run's model, or else of its matcher.
 
     Returns:
         None for a released model, and an empty dictionary if the training folder is gone.
 
     Raises:
-        UserError: the settings cannot be read.
+        UserError: The settings cannot be read.
     """
     model = run.config.get("model") or (run.config.get("matcher") or {}).get("model")
     if model is None:
         return None
-    with reading(run.folder, "config.yaml"):
-        path = Path(model)
+    path = Path(str(model))
     # If the runs have moved, or the report runs in another folder, the model is below `root`.
     folders = [path, root / Path(*path.parts[1:])]
     found = [folder for folder in folders if (folder / "config.yaml").is_file()]
@@ -134,19 +134,14 @@ def training_settings(run: FinishedRun, root: Path) -> dict[str, Any] | None:
 
 
 @contextmanager
-def reading(folder: Path, file: str = "report.json", remedy: str = "") -> Iterator[None]:
-    """Report any failure to read or to interpret a file of a run as a UserError that names it.
-
-    Args:
-        remedy: What to do, if not to run the command again.
-    """
+def reading(folder: Path, file: str = "report.json") -> Iterator[None]:
+    """Turn a failure to read or interpret a file of a run into a UserError that names the file."""
     failures = (OSError, ValueError, KeyError, TypeError, AttributeError)
     try:
         yield
     except (*failures, YAMLError, OmegaConfBaseException) as error:
-        remedy = remedy or f"delete {folder} and run its command again"
         raise UserError(
-            f"{folder / file} is missing, damaged or of another version: {remedy}, or leave the "
-            "run out with runs=[...]",
+            f"{folder / file} is missing, damaged or of another version: delete {folder} and run "
+            "its command again, or leave the run out with runs=[...]",
             code="damaged-file",
         ) from error

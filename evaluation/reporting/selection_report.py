@@ -7,17 +7,22 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from conf.runs import write_text
 from data.records import SelectionItem
 from data.tracks.controls import MATCHED_ANCHOR
+from data.tracks.selection.time import CELLS
 from evaluation.generators.response_log import Answer
-from evaluation.metrics.accuracy import accuracy_by_group
 from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
-from evaluation.metrics.results import SelectionResult, selection_result
+from evaluation.metrics.intervals import macro_by_scene
+from evaluation.metrics.results import (
+    SelectionReport,
+    SelectionResult,
+    accuracy_by_family,
+    accuracy_by_group,
+)
 from evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
 from evaluation.reporting import tables
 from evaluation.reporting.figures import accuracy_figure
@@ -32,7 +37,7 @@ class Choices:
 
     Attributes:
         credits: 1 for a correct choice, 1/m for a tie among m candidates, 0 for others.
-        letters: The chosen letters; None without one.
+        letters: The chosen letters; None for a tie or an unparsed answer.
         answers: The parsed answers; empty for a retriever.
     """
 
@@ -50,12 +55,6 @@ class Choices:
         credits = [float(answer.right) for answer in answers]
         return cls(name, mode, control, credits, [a.letter for a in answers], answers)
 
-    @property
-    def parse_rate(self) -> float | None:
-        if not self.answers:
-            return None
-        return sum(letter is not None for letter in self.letters) / len(self.letters)
-
 
 def write_report(
     choices: Sequence[Choices],
@@ -64,48 +63,74 @@ def write_report(
     seed: int,
     folder: Path,
     suite: str | None = None,
-    **provenance: Any,
+    *,
+    build: str,
+    asked: Sequence[tuple[str, str | None, str]] = (),
 ) -> list[SelectionResult]:
     """Write a report into `folder`, and return the result of each of `choices`.
 
     Args:
         seed: Seed of the bootstrap over scenes.
         suite: As in `SelectCommand`.
-        provenance: Entries for report.json: the benchmark's build, and the keys of the log's lines.
+        build, asked: As in `SelectionReport`.
     """
-    results = [
-        selection_result(
-            benchmark, c.name, c.mode, items, c.credits, c.parse_rate, seed, suite, c.control
-        )
-        for c in choices
-    ]
+    results = [selection_result(c, items, benchmark, seed, suite) for c in choices]
     by_key = {result.key: c for result, c in zip(results, choices, strict=True)}
     subtypes, letters = [f"{i.family}/{i.subtype}" for i in items], [i.letter for i in items]
     calibrations = {key: _calibrate(c.answers) for key, c in by_key.items()}
-    details = {
-        "subtypes": {key: accuracy_by_group(subtypes, c.credits) for key, c in by_key.items()},
-        "readings": {key: count_readings(c.answers) for key, c in by_key.items() if c.answers},
-        "positions": {key: measure_position_bias(c.letters, letters) for key, c in by_key.items()},
-        "calibration": {key: of for key, of in calibrations.items() if of},
-    }
-    differences = _compare(by_key, items, seed)
-
+    report = SelectionReport(
+        build,
+        results,
+        controls=_compare(by_key, items, seed),
+        subtypes={key: accuracy_by_group(subtypes, c.credits) for key, c in by_key.items()},
+        readings={key: count_readings(c.answers) for key, c in by_key.items() if c.answers},
+        positions={key: measure_position_bias(c.letters, letters) for key, c in by_key.items()},
+        calibration={key: of for key, of in calibrations.items() if of},
+        asked=[*asked],
+    )
     parts = [tables.selection_table(results, items[0].suite)]
-    parts += [tables.paired_table(differences)] if differences else []
+    parts += [tables.paired_table(report.controls)] if report.controls else []
     log.info("%s", "\n\n".join(map(str, parts)))
-    parts += tables.detail_tables(*details.values())
+    parts += tables.detail_tables({key: (key, report) for key in by_key})
     write_text(folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")
-    controls = [{"mode": label, **asdict(p)} for label, pairs in differences for p in pairs]
-    report = {**provenance, "rows": results, "controls": controls, **details}
-    write_text(folder / "report.json", json.dumps(report, indent=1, default=asdict))
+    write_text(folder / "report.json", json.dumps(asdict(report), indent=1))
     shares = {f"{r.name} ({r.variant})": r.families for r in results}
     accuracy_figure(shares, folder / "selection.png", items[0].suite == SUITE)
     return results
 
 
+def selection_result(
+    choices: Choices,
+    items: Sequence[SelectionItem],
+    benchmark: str,
+    seed: int,
+    suite: str | None = None,
+) -> SelectionResult:
+    """Return the accuracies of choices; `seed` is that of the bootstrap over scenes."""
+    credits, families = choices.credits, [i.family for i in items]
+    macro = macro_by_scene(credits, families, [i.scene_id for i in items], seed)
+    timed = [(h, c) for i, c in zip(items, credits, strict=True) if (h := horizon_of(i))]
+    by_horizon = accuracy_by_group([h for h, _ in timed], [c for _, c in timed])
+    # Horizons in frames are all below one second.
+    ordered = sorted(by_horizon, key=lambda h: (h.endswith(" s"), int(h.split()[0])))
+    accuracy, letters = accuracy_by_family(families, credits), choices.letters
+    parse_rate = sum(x is not None for x in letters) / len(letters) if choices.answers else None
+    return SelectionResult(
+        benchmark, choices.name, choices.mode, accuracy.families, accuracy.macro, accuracy.micro,
+        parse_rate, len(items), macro, {h: by_horizon[h] for h in ordered}, suite,
+        choices.control,
+    )  # fmt: skip
+
+
+def horizon_of(item: SelectionItem) -> str | None:
+    """Return the horizon of an item of the time family in s, or of the window family in frames."""
+    if item.family == "time":
+        return f"{CELLS[item.subtype]} s"
+    return f"{item.horizon} frames" if item.family == "window" else None
+
+
 def count_readings(answers: Sequence[Answer]) -> dict[str, int]:
-    """Counts of parsed answers, of valid records among them if records were requested, and of the
-    reasons why the other answers could not be parsed."""
+    """Count parsed answers, requested records that are valid, and reasons for unparsed answers."""
     counts = {"with a letter": sum(a.letter is not None for a in answers)}
     if answers[0].valid is not None:
         counts["  in a valid record"] = sum(a.valid for a in answers)
@@ -114,23 +139,25 @@ def count_readings(answers: Sequence[Answer]) -> dict[str, int]:
 
 
 def _calibrate(answers: Sequence[Answer]) -> Calibration | None:
-    """The calibration of the confidence in valid records; None without any."""
+    """Return the calibration of the confidence in valid records; None without any."""
     valid = [answer for answer in answers if answer.valid]
     return measure_calibration([a.record.confidence for a in valid], [a.right for a in valid])
 
 
 def _compare(
     choices: Mapping[str, Choices], items: Sequence[SelectionItem], seed: int
-) -> list[tuple[str, list[PairedComparison]]]:
-    """By label: the unchanged items less the items under the control, and in matched-anchor pairs
-    the questions of the event less those of the time."""
+) -> list[PairedComparison]:
+    """Compare the unchanged items with the items under each control, and in matched-anchor pairs
+    the questions of the event with those of the time."""
     ids = [item.item_id for item in items]
     credits = {key: dict(zip(ids, c.credits, strict=True)) for key, c in choices.items()}
-    differences = []
+    compared = []
     for key, c in choices.items():
         if c.control is not None:
             pair, names = (credits[c.mode], credits[key]), ("unchanged", c.control)
-            differences.append((c.mode, compare_runs(items, *pair, names, seed)))
+            differences = compare_runs(items, *pair, names, seed)
+            compared += [replace(p, mode=c.mode) for p in differences]
         if items[0].suite == MATCHED_ANCHOR:
-            differences.append((key, compare_anchors(items, credits[key], seed)))
-    return differences
+            differences = compare_anchors(items, credits[key], seed)
+            compared += [replace(p, mode=key) for p in differences]
+    return compared

@@ -69,7 +69,7 @@ class Table:
 
     @cached_property
     def body(self) -> list[tuple[str, list[list[str]]]]:
-        """The label and the formatted rows of each group that has some."""
+        """The label and the formatted rows of each group with rows."""
         return [*self._format_groups(self.groups), *self._format_groups(self.paper)]
 
     def _format_groups(
@@ -111,7 +111,7 @@ class Table:
         return f"{scale * value.low:{end_digits}}-{scale * value.high:{end_digits}}"
 
     def __str__(self) -> str:
-        """The caption above aligned columns, the first one to the left."""
+        """Return the table as plain text with aligned columns."""
         head = ["", *self.columns]
         cells = [head, *(row for _, rows in self.body for row in rows)]
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -127,11 +127,11 @@ class Table:
         return "\n".join([*lines, rule, *(textwrap.fill(note, NOTE_WIDTH) for note in self.notes)])
 
     def as_markdown(self) -> str:
-        """A GitHub Markdown table below its caption."""
+        """Return the table in GitHub Markdown, below its caption."""
         return self._render("table.md", _escape_markdown, "**{}**")
 
     def as_latex(self) -> str:
-        """A float; requires the packages booktabs and graphicx."""
+        """Return a LaTeX float, which requires the packages booktabs and graphicx."""
         return self._render("table.tex", _escape_latex, r"\textbf{{{}}}")
 
     def _render(self, template: str, escape: Callable[[str], str], bold: str) -> str:

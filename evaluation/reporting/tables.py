@@ -1,8 +1,10 @@
-"""The tables of single evaluations; their rows also fill the report's tables."""
+"""The tables of evaluations and of the report, beside the paper's rows."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from data.records import FAMILIES, LETTERS
@@ -11,13 +13,16 @@ from evaluation.metrics.intervals import Interval
 from evaluation.metrics.results import (
     RECALLS,
     SIMILARITY,
+    Accuracy,
     RetrievalResult,
     RetrieverDifference,
+    SelectionReport,
     SelectionResult,
     from_json,
 )
 from evaluation.metrics.significance import PairedComparison
-from evaluation.reporting.reference import SUITE, reference, table_reference
+from evaluation.reporting.measurements import TRANSFER_SUITES, Measurement, shared_names
+from evaluation.reporting.reference import SUITE, reference, table_with_paper
 from evaluation.reporting.table import DETAIL, Row, Table
 
 FAMILY_COLUMNS = [family.capitalize() for family in FAMILIES]
@@ -26,6 +31,20 @@ RECALL_COLUMNS = [f"R@{k}" for k in RECALLS]
 MEASURE_COLUMNS = [*RECALL_COLUMNS, "MRR", "Median", "Tied"]
 RETRIEVAL_COLUMNS = ["Width", *MEASURE_COLUMNS, "MiB", "s"]
 
+GROUPS = (
+    "similarity scorers",
+    "generative models",
+    "trained",
+    "two-stage predict-then-match",
+    "direct embedders",
+)
+"""Groups of rows in the report's tables, in their order."""
+BEST = {
+    **dict.fromkeys((*FAMILY_COLUMNS, "Macro", "Micro", *RECALL_COLUMNS, "MRR"), max),
+    "Median": min,
+}
+"""Columns of these tables whose best value is marked."""
+BEST_NOTE = "Bold: the best value of a column among these runs, and among the paper's rows."
 SELECTION_NOTE = (
     "Wilson 95% intervals; macro's is bootstrapped over scenes. Answers that cannot be parsed "
     "count as wrong."
@@ -38,16 +57,15 @@ RETRIEVAL_NOTE = (
 
 
 def selection_table(results: Sequence[SelectionResult], suite: str = SUITE) -> Table:
-    """The results above the paper's rows, if the items are of the paper's suite."""
+    """Return the results above the paper's rows, if the items are of the paper's suite."""
     rows = [row for r in results for row in selection_rows(f"{r.name} ({r.variant})", r)]
-    table = "similarity" if results[0].mode == SIMILARITY else "select"
-    paper = table_reference(table) if suite == SUITE else {}
-    caption = reference("tables")[table]["caption"]
-    return Table("selection", caption, SELECTION_COLUMNS, {"": rows}, (SELECTION_NOTE,), paper)
+    key = "similarity" if results[0].mode == SIMILARITY else "select"
+    table = table_with_paper(key, "selection", SELECTION_COLUMNS, {"": rows}, (SELECTION_NOTE,))
+    return table if suite == SUITE else replace(table, paper={})
 
 
 def selection_rows(name: str, result: SelectionResult) -> list[Row]:
-    """A result under `SELECTION_COLUMNS`, and its accuracies by horizon of the time family."""
+    """Return a row of `SELECTION_COLUMNS`, and a row per horizon of the time family."""
     row = accuracy_row(name, result.families, result.macro_interval, result.micro)
     horizons = [
         {"name": f"{DETAIL}time, {horizon}", "Time": share, "Items": share.n, "ranked": False}
@@ -64,28 +82,31 @@ def accuracy_row(
     return {"name": name, **by_family, "Macro": macro, "Micro": micro, "Items": micro.n}
 
 
-def detail_tables(
-    subtypes: Mapping[str, Mapping[str, Interval]],
-    parsing: Mapping[str, Mapping[str, int]],
-    positions: Mapping[str, PositionBias],
-    calibrations: Mapping[str, Calibration],
-) -> list[Table]:
-    """The tables that detail selection results, each argument by the label of the model or mode."""
+def detail_tables(reports: Mapping[str, tuple[str, SelectionReport]]) -> list[Table]:
+    """Return the tables that detail selection results.
+
+    Args:
+        reports: By the label of a model or mode, the key of its details and the report with them.
+    """
+
+    def details(name: str) -> dict[str, Any]:
+        by_label = {label: getattr(r, name).get(key) for label, (key, r) in reports.items()}
+        return {label: of for label, of in by_label.items() if of}
+
     tables = []
-    if subtypes:
+    if subtypes := details("subtypes"):
         counts = {name: share.n for of in subtypes.values() for name, share in of.items()}
         rows = [{**row, "Items": counts[row["name"]]} for row in rows_by_label(subtypes)]
         caption = "Selection accuracy by subtype (%)"
         tables.append(Table("subtypes", caption, [*subtypes, "Items"], {"": rows}))
-    tables += [parsing_table(parsing)] if parsing else []
-    tables += [position_table(positions)] if positions else []
-    for k, (label, calibration) in enumerate(calibrations.items()):
-        tables.append(calibration_table(f"calibration-{k}", label, calibration))
-    return tables
+    makers = {
+        "readings": parsing_table, "positions": position_table, "calibration": calibration_table
+    }  # fmt: skip
+    return [*tables, *(make(of) for name, make in makers.items() if (of := details(name)))]
 
 
 def rows_by_label(values: Mapping[str, Mapping[str, Any]]) -> list[Row]:
-    """A row for each name that some label has a value of, with a column for each label."""
+    """Return a row for each name, with a column for each label; missing values are None."""
     names = dict.fromkeys(name for of_label in values.values() for name in of_label)
     return [
         {"name": name, **{label: of_label.get(name) for label, of_label in values.items()}}
@@ -94,13 +115,13 @@ def rows_by_label(values: Mapping[str, Mapping[str, Any]]) -> list[Row]:
 
 
 def parsing_table(counts: Mapping[str, Mapping[str, int]]) -> Table:
-    """Counts of parsed responses and of the reasons why others could not be parsed, by label."""
+    """Return the counts of parsed responses, and of the reasons for the others, by label."""
     caption = "Parsed responses, and why others could not be parsed"
     return Table("parsing", caption, [*counts], {"": rows_by_label(counts)})
 
 
 def position_table(positions: Mapping[str, PositionBias]) -> Table:
-    """By label: how often each letter was chosen and was correct, and the accuracy at each."""
+    """Return how often each letter was chosen and was correct, and the accuracy at it, by label."""
     rows: list[Row] = []
     for label, bias in positions.items():
         chosen, total = sum(bias.chosen.values()), sum(bias.right.values())
@@ -111,44 +132,36 @@ def position_table(positions: Mapping[str, PositionBias]) -> Table:
         ):
             shares = {x: counts[x] / totals[x] if totals[x] else None for x in LETTERS}
             rows.append({"name": f"{label}: {name}", **shares, "Answers": answers})
-        if bias.p is not None:
-            rows.append({"name": f"{DETAIL}chi-square {bias.chi_square:.1f}, p = {bias.p:.2g}"})
     caption = "Chosen and correct letters (%)"
     return Table("positions", caption, [*LETTERS, "Answers"], {"": rows})
 
 
-def calibration_table(name: str, label: str, calibration: Calibration) -> Table:
-    """Accuracy of the answers by their reported confidence."""
+def calibration_table(calibrations: Mapping[str, Calibration]) -> Table:
+    """Return the calibration of the confidence in valid records, by label."""
+    columns = ["Confidence", "Accuracy", "Calibration error", "Brier score", "Records"]
     rows = [
         {
-            "name": f"{b.low:.1f} to {b.high:.1f}", "Mean confidence": b.confidence,
-            "Accuracy": b.accuracy, "Answers": b.accuracy.n,
+            "name": label, "Confidence": c.confidence, "Accuracy": c.accuracy,
+            "Calibration error": f"{c.ece:.3f}", "Brier score": f"{c.brier:.3f}", "Records": c.n,
         }
-        for b in calibration.bins
+        for label, c in calibrations.items()
     ]  # fmt: skip
-    note = (
-        f"Expected calibration error {calibration.ece:.3f} and Brier score "
-        f"{calibration.brier:.3f} of {calibration.n:,} valid records."
-    )
-    caption = f"Accuracy by reported confidence (%): {label}"
-    return Table(name, caption, ["Mean confidence", "Accuracy", "Answers"], {"": rows}, (note,))
+    return Table("calibration", "Calibration of the reported confidence", columns, {"": rows})
 
 
-def paired_table(comparisons: Iterable[tuple[str, Sequence[PairedComparison]]]) -> Table:
-    """Paired differences of accuracy by family, a group for each comparison and its label."""
-    groups = {
-        f"{label}{': ' * bool(label)}{of[0].left} (left) less {of[0].right} (right)": [
-            {
-                "name": p.of, "Left": p.left_accuracy, "Right": p.right_accuracy,
-                "Difference": f"{100 * p.difference:+.1f}",
-                "95%": f"{100 * p.low:+.1f} to {100 * p.high:+.1f}",
-                "Only left": p.only_left, "Only right": p.only_right,
-                "p": "-" if p.p is None else f"{p.p:.2g}", "Items": p.n,
-            }
-            for p in of
-        ]
-        for label, of in comparisons
-    }  # fmt: skip
+def paired_table(comparisons: Iterable[PairedComparison]) -> Table:
+    """Return paired differences of accuracy by family, a group for each pair of runs."""
+    groups: dict[str, list[Row]] = {}
+    for p in comparisons:
+        label = f"{p.mode}{': ' * bool(p.mode)}{p.left} (left) less {p.right} (right)"
+        row = {
+            "name": p.of, "Left": p.left_accuracy, "Right": p.right_accuracy,
+            "Difference": f"{100 * p.difference:+.1f}",
+            "95%": f"{100 * p.low:+.1f} to {100 * p.high:+.1f}",
+            "Only left": p.only_left, "Only right": p.only_right,
+            "p": "-" if p.p is None else f"{p.p:.2g}", "Items": p.n,
+        }  # fmt: skip
+        groups.setdefault(label, []).append(row)
     columns = [
         "Left", "Right", "Difference", "95%", "Only left", "Only right", "p", "Items",
     ]  # fmt: skip
@@ -161,22 +174,20 @@ def paired_table(comparisons: Iterable[tuple[str, Sequence[PairedComparison]]]) 
 
 
 def retrieval_table(results: Sequence[RetrievalResult], command: str = "retrieve") -> Table:
-    """The results over all queries, widest first and untrained before trained, above the paper's
-    rows.
+    """Return the results over all queries, widest first and untrained before trained, above the
+    paper's rows.
 
     Args:
         command: retrieve or two_stage.
     """
     overall = [r for r in results if r.builder is None]
     overall.sort(key=lambda r: (-(r.width or 0), not r.untrained))
-    rows = {"": [retrieval_row(r.name, r) for r in overall]}
-    caption, notes = reference("tables")[command]["caption"], retrieval_notes(overall[0])
-    paper = table_reference(command)
-    return Table("retrieval", caption, RETRIEVAL_COLUMNS, rows, notes, paper)
+    rows, notes = [retrieval_row(r.name, r) for r in overall], retrieval_notes(overall[0])
+    return table_with_paper(command, "retrieval", RETRIEVAL_COLUMNS, {"": rows}, notes)
 
 
 def retrieval_row(name: str, result: RetrievalResult) -> Row:
-    """A result under `RETRIEVAL_COLUMNS`."""
+    """Return a row of `RETRIEVAL_COLUMNS`."""
     measures = dict(zip(MEASURE_COLUMNS, result.measures.values(), strict=True))
     return {
         "name": name, "Width": _width(result.width), **measures,
@@ -186,12 +197,12 @@ def retrieval_row(name: str, result: RetrievalResult) -> Row:
 
 
 def retrieval_notes(result: RetrievalResult) -> tuple[str, ...]:
-    """The notes of a table of results on the queries of `result`."""
+    """Return the notes of a table whose results are on the same queries as `result`."""
     return f"{result.queries:,} queries, {result.frames:,} frames.", RETRIEVAL_NOTE
 
 
 def builder_tables(results: Sequence[RetrievalResult]) -> list[Table]:
-    """A table for each retriever: its measures by builder and width."""
+    """Return a table of the measures by builder and width for each retriever."""
     tables = []
     for name in dict.fromkeys(r.name for r in results):
         rows = [
@@ -205,7 +216,7 @@ def builder_tables(results: Sequence[RetrievalResult]) -> list[Table]:
 
 
 def rank_differences_table(differences: Iterable[RetrieverDifference]) -> Table:
-    """Differences grouped by the pair of retrievers, with a row for each width."""
+    """Return the differences in groups by pair of retrievers, with a row for each width."""
     columns = [*RECALL_COLUMNS, "MRR"]
     groups: dict[str, list[Row]] = {}
     for d in differences:
@@ -218,7 +229,11 @@ def rank_differences_table(differences: Iterable[RetrieverDifference]) -> Table:
 
 
 def human_table(summary: Mapping[str, Any]) -> Table:
-    """The `evaluation.study.agreement.summary` of a study beside the paper's."""
+    """Return the table of a study, above the paper's rows.
+
+    Args:
+        summary: As `evaluation.study.agreement.summary` returns it.
+    """
     rows = [human_row(name, accuracy) for name, accuracy in summary["accuracy"].items()]
     if summary["majority"]:
         rows.append(human_row("Majority vote", summary["majority"]))
@@ -227,15 +242,17 @@ def human_table(summary: Mapping[str, Any]) -> Table:
         cells = {f.capitalize(): time and f"{time:.1f}" for f, time in times.items()}
         rows.append({"name": f"Median seconds, {clock}", **cells})
     columns = [*FAMILY_COLUMNS, "Macro", "Micro", "Items"]
-    caption, notes = reference("tables")["human"]["caption"], _human_notes(summary)
-    return Table("human", caption, columns, {"": rows}, notes, table_reference("human"))
+    return table_with_paper("human", "human", columns, {"": rows}, _human_notes(summary))
 
 
 def human_row(name: str, accuracy: Mapping[str, Any]) -> Row:
-    """The accuracy of annotators, from a study's summary. It does not compete with models."""
-    families = from_json(dict[str, Interval], accuracy["families"])
-    micro = from_json(Interval, accuracy["micro"])
-    row = accuracy_row(name, families, accuracy["macro"], micro)
+    """Return the row of annotators, who do not compete with models for the best value.
+
+    Args:
+        accuracy: An entry of a study's summary.
+    """
+    of = from_json(Accuracy, accuracy)
+    row = accuracy_row(name, of.families, of.macro, of.micro)
     return {**row, "Parsed": None, "ranked": False}
 
 
@@ -265,3 +282,76 @@ def _agreement(value: float | None) -> str:
 
 def _width(width: int | None) -> str:
     return "-" if width is None else str(width)
+
+
+def summary_table(name: str, rows: Sequence[Measurement], people: Sequence[Row] = ()) -> Table:
+    """Return the results of many runs on the same items, in the paper's groups.
+
+    Args:
+        name: A table of `reference.yaml`.
+        people: Rows of a human study.
+    """
+    groups: dict[str, list[Row]] = {label: [] for label in GROUPS}
+    if isinstance(rows[0].result, SelectionResult):
+        columns, notes = SELECTION_COLUMNS, (SELECTION_NOTE, BEST_NOTE)
+        for m in rows:
+            groups[_group(m)] += selection_rows(m.label, m.result)
+    else:
+        columns, notes = RETRIEVAL_COLUMNS, (*retrieval_notes(rows[0].result), BEST_NOTE)
+        for m in rows:
+            groups[_group(m)].append(retrieval_row(m.name, m.result))
+    groups["people, on the items of their study"] = [*people]
+    items = rows[0].items
+    table = table_with_paper(name, f"{name}-{items.replace(', ', '-')}", columns, groups, notes)
+    return replace(table, caption=f"{table.caption}, on {items}", best=BEST)
+
+
+def _group(m: Measurement) -> str:
+    if isinstance(m.result, RetrievalResult):
+        two_stage = m.run.kind == "two_stage"
+        return "two-stage predict-then-match" if two_stage else "direct embedders"
+    if m.trained:
+        return "trained"
+    return "similarity scorers" if m.result.mode == SIMILARITY else "generative models"
+
+
+def overall_table(
+    name: str, rows: Sequence[Measurement], label: Callable[[Measurement, str], str]
+) -> Table:
+    """Return the accuracy over all items of a benchmark, with a line for each model and a column
+    for each benchmark.
+
+    Args:
+        name: A table of `reference.yaml`.
+        label: Returns the label of a result from the result and the name of its model.
+    """
+    names, benchmarks = shared_names(rows), _benchmark_columns(rows)
+    columns = list(dict.fromkeys(["In domain", *TRANSFER_SUITES.values(), *benchmarks]))
+    lines: dict[str, dict[str, Any]] = {}
+    for m, model, column in zip(rows, names, benchmarks, strict=True):
+        empty = {"name": label(m, model), **dict.fromkeys(columns)}
+        lines.setdefault(empty["name"], empty)[column] = m.result.micro
+    notes = ("Wilson 95% intervals over items.", BEST_NOTE)
+    table = table_with_paper(name, name, columns, {"": [*lines.values()]}, notes)
+    return replace(table, best=dict.fromkeys(columns, max))
+
+
+def _benchmark_columns(rows: Sequence[Measurement]) -> list[str]:
+    """Return the column of each row: "In domain", its transfer suite, or its benchmark.
+
+    A column that several benchmarks would share is divided, and also names the benchmark.
+    """
+    trained_on = {m.training_benchmark for m in rows if m.training_benchmark}
+
+    def column(m: Measurement) -> str:
+        # A released model has no training benchmark: it is in domain where some student is.
+        if m.benchmark in ({m.training_benchmark} if m.trained else trained_on):
+            return "In domain"
+        simulator = m.run.config.get("benchmark", {}).get("simulator")
+        return TRANSFER_SUITES.get(simulator, m.benchmark)
+
+    benchmarks = Counter(name for name, _ in {(column(m), m.benchmark) for m in rows})
+    return [
+        f"{name} ({m.benchmark})" if benchmarks[name] > 1 else name
+        for m, name in zip(rows, map(column, rows), strict=True)
+    ]

@@ -64,7 +64,6 @@ def write_ranks(
 def write_report(
     folder: Path,
     rows: Sequence[RetrievalResult],
-    curves: Sequence[dict[str, Any]],
     extra_tables: Sequence[Table] = (),
     command: str = "retrieve",
     **entries: Any,
@@ -80,6 +79,6 @@ def write_report(
     log.info("%s", table)
     page = "\n\n".join(map(str, [table, *extra_tables, *tables.builder_tables(rows)]))
     write_text(folder / "report.txt", page + "\n")
-    report = {"rows": rows, "curves": curves, **entries}
+    report = {"rows": rows, **entries}
     write_text(folder / "report.json", json.dumps(report, indent=1, default=asdict))
     figures.retrieval_figure([(row.name, row) for row in rows], folder / "retrieval.png")

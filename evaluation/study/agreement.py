@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from data.records import LETTERS
-from evaluation.metrics.accuracy import accuracy_by_family
+from evaluation.metrics.results import accuracy_by_family
 
 
 def summarize_votes(votes: pd.DataFrame, items: int, annotators: Sequence[str]) -> dict[str, Any]:
@@ -27,7 +27,7 @@ def summarize_votes(votes: pd.DataFrame, items: int, annotators: Sequence[str]) 
 
     Returns:
         `items`, `judgments`; `annotators`, those with votes; `depth`, the number of items by their
-        number of votes; `accuracy` by annotator, as `evaluation.metrics.accuracy.Accuracy`;
+        number of votes; `accuracy` by annotator, as `evaluation.metrics.results.Accuracy`;
         `majority`, the same over the items with votes, and how many of them are `undecided`;
         `fleiss_kappa` and its `items`, which all annotators answered; `krippendorff_alpha` and its
         `items`, which have two votes or more; and median `seconds` by family.

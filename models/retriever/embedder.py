@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +23,14 @@ from sentence_transformers.util import is_sentence_transformer_model
 from transformers import AutoConfig
 
 from conf.errors import UserError
-from conf.runs import world_size
+from conf.runs import rank, world_size
 from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from models.attention import choose_attention
-from models.checks import PEFT, check_processor
+from models.checks import PEFT, check_family, check_modules, check_processor
 from models.compat import keep_differentiable
-from models.distributed import from_main
+from models.distributed import main_first
 from models.loading import (
     explain_damage,
     explain_unloadable,
@@ -39,7 +38,6 @@ from models.loading import (
     pin_sizes,
     weight_options,
 )
-from models.retriever.checks import check_family, check_modules, check_pooling
 from models.retriever.multi_vector import keep_head_fp32, load_multi_vector, multi_vector_modules
 from models.student.prompts import load_clip
 from models.tiny_qwen3_vl import build_model, build_processor
@@ -80,13 +78,14 @@ def load_retriever(
     """
     source = cfg.model
     if cfg.architecture is not None:
-        source = from_main(partial(build_base, cfg, texts, folder))
+        source = str(folder)
+        with main_first():
+            if rank() == 0:
+                build_base(cfg, texts, folder)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     with explain_unloadable("retriever", source):
         if is_sentence_transformer_model(source, revision=cfg.revision):
-            check_modules(source, cfg.revision)
-            if cfg.late is None:
-                check_pooling(source, cfg.revision)
+            check_modules(source, cfg.revision, late=cfg.late is not None)
         config = AutoConfig.from_pretrained(source, **origin)
         check_family(source, config)
         backbone = Transformer(
@@ -159,16 +158,13 @@ def load_head(model: Retriever, folder: Path) -> None:
             model[part["idx"]].load_state_dict(load_file(weights))
 
 
-def build_base(cfg: RetrieverConfig, texts: list[str], folder: Path) -> str:
-    """Build a base with random weights from an architecture and its seed.
-
-    The base is saved in `folder`, whose path is returned.
-    """
+def build_base(cfg: RetrieverConfig, texts: list[str], folder: Path) -> None:
+    """Build a base with random weights from an architecture and its seed, and save it in
+    `folder`."""
     assert cfg.architecture is not None
     processor = build_processor(texts, cfg.architecture.vocabulary, cfg.image_size)
     build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
     processor.save_pretrained(folder)
-    return str(folder)
 
 
 def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retriever:
@@ -206,7 +202,7 @@ def _load_saved(folder: Path, cfg: RetrieverConfig, **options: Any) -> Retriever
 
 
 def tokenizer_texts(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list[str]:
-    """Texts to train a tokenizer on: questions, instructions, roles and timestamps."""
+    """Return texts to train a tokenizer on: questions, instructions, roles and timestamps."""
     questions = sorted({q.question for q in queries})
     clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
     roles = ["system", "user", "assistant"]
@@ -214,13 +210,14 @@ def tokenizer_texts(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list
 
 
 def longest_query(queries: list[RetrievalQuery], tokenizer: Any) -> RetrievalQuery:
-    """The query with the most tokens. All clips have the same length, so only texts differ."""
+    """Return the query with the most tokens. All clips have the same length; only texts differ."""
     encoded = tokenizer([q.question for q in queries], add_special_tokens=False).input_ids
     return queries[max(range(len(queries)), key=lambda k: len(encoded[k]))]
 
 
 def query_input(query: RetrievalQuery, frames: FrameReader, cfg: RetrieverConfig) -> dict[str, Any]:
-    """A query as sentence-transformers takes it: the prefix with its true times, then the text."""
+    """Return a query as sentence-transformers takes it: the prefix with its true times, and the
+    question."""
     indices = sample_prefix_frames(query.prefix_start, query.prefix_stop, cfg.frames)
     clip = load_clip(query.scene_id, indices, frames)
     array = torch.from_numpy(clip.pixels).permute(0, 3, 1, 2)
@@ -228,7 +225,7 @@ def query_input(query: RetrievalQuery, frames: FrameReader, cfg: RetrieverConfig
 
 
 def frame_input(frame: FrameRef, frames: FrameReader) -> Any:
-    """A database frame as sentence-transformers takes it: an image."""
+    """Return a frame as sentence-transformers takes it: an image."""
     return frames.image(frame.scene_id, frame.frame)
 
 

@@ -7,7 +7,6 @@ frame's vectors (late interaction, ColBERT's MaxSim).
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import torch
@@ -16,21 +15,23 @@ from sentence_transformers.base.modules import Dense, Module, Normalize, Transfo
 from torch import nn
 
 from conf.schema import LateConfig
-from models import compat
 from models.retriever.scored_tokens import ScoredTokens
 
 MESSAGE_END = "<|im_end|>"
 
 # A saved model names its module by this path, and the library finds the file in the folder.
 ScoredTokens.__module__ = "scored_tokens"
-load_multi_vector = partial(
-    compat.load_multi_vector, classes={"scored_tokens.ScoredTokens": ScoredTokens}
-)
-"""Loads a saved retriever; its `ScoredTokens` is this project's class."""
+
+
+def load_multi_vector(folder: str, **options: Any) -> MultiVectorEncoder:
+    """Load a saved retriever with this project's `ScoredTokens`; code in the folder is not
+    executed."""
+    classes = {"scored_tokens.ScoredTokens": ScoredTokens}
+    return MultiVectorEncoder._load_with_module_classes(folder, classes, **options)
 
 
 def multi_vector_modules(backbone: Transformer, late: LateConfig) -> list[Module]:
-    """The backbone and the modules that compute vectors from its states. The projection is
+    """Return the backbone and the modules that compute vectors from its states. The projection is
     initialised from a fixed seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
@@ -56,10 +57,10 @@ def keep_head_fp32(model: MultiVectorEncoder) -> None:
 
 
 def cast_to_fp32(_: nn.Module, args: tuple[dict[str, Any]]) -> None:
-    """Before a module's forward: convert the token states."""
+    """Convert the token states to fp32. This is a hook that is called before a `forward`."""
     args[0]["token_embeddings"] = args[0]["token_embeddings"].float()
 
 
 def find_scored_tokens(model: MultiVectorEncoder) -> ScoredTokens:
-    """The module of a retriever that selects the scored tokens."""
+    """Return the module of a retriever that selects the scored tokens."""
     return next(module for module in model if isinstance(module, ScoredTokens))

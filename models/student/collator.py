@@ -8,11 +8,12 @@ their positions pass the head.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch.nn.utils.rnn import pad_sequence
 from transformers import ProcessorMixin
 from transformers.video_utils import VideoMetadata
 
@@ -22,8 +23,6 @@ from models.student.prompts import Sample, answer_line
 
 IGNORED = -100
 """Label of an unsupervised token, torch's default `ignore_index`."""
-
-
 MEDIA = {
     "image": ("pixel_values", "image_grid_thw"),
     "video": ("pixel_values_videos", "video_grid_thw"),
@@ -103,16 +102,13 @@ class Collator:
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
         encoded = [encode(s, self._processor, self._max_length, self._thinking) for s in samples]
-        return self._batch(encoded, [s.supervised for s in samples])
-
-    def _batch(self, encoded: Sequence[Encoded], supervised: Sequence[bool]) -> dict[str, Any]:
         batch = pad(encoded, self._processor.tokenizer.pad_token_id)
         labels = batch.pop("labels")
         if (labels == IGNORED).all():
             return batch
         # The position before the first supervised token predicts it.
         start = int((labels != IGNORED).any(dim=0).nonzero()[0]) - 1
-        labels[[not learned for learned in supervised]] = IGNORED
+        labels[[not sample.supervised for sample in samples]] = IGNORED
         batch["labels"] = labels[:, start:]
         batch["logits_to_keep"] = torch.arange(start, labels.shape[1])
         return batch
@@ -120,24 +116,21 @@ class Collator:
 
 def pad(encoded: Sequence[Encoded], pad_id: int) -> dict[str, Any]:
     """Left-pad to the longest conversation and concatenate the media in order."""
-    longest = max(len(e.input_ids) for e in encoded)
 
-    def stack(rows: list[list[int]], filler: int) -> torch.Tensor:
-        return torch.tensor([[filler] * (longest - len(r)) + r for r in rows])
+    def stack(rows: Iterable[list[int]], filler: int) -> torch.Tensor:
+        tensors = [torch.tensor(row) for row in rows]
+        return pad_sequence(tensors, True, filler, padding_side="left")
 
     batch: dict[str, Any] = {
-        "input_ids": stack([e.input_ids for e in encoded], pad_id),
-        "attention_mask": stack([[1] * len(e.input_ids) for e in encoded], 0),
-        "mm_token_type_ids": stack([e.mm_token_type_ids for e in encoded], 0),
-        "labels": stack([e.labels for e in encoded], IGNORED),
+        "input_ids": stack((e.input_ids for e in encoded), pad_id),
+        "attention_mask": stack(([1] * len(e.input_ids) for e in encoded), 0),
+        "mm_token_type_ids": stack((e.mm_token_type_ids for e in encoded), 0),
+        "labels": stack((e.labels for e in encoded), IGNORED),
     }
-    return batch | stacked_media(encoded)
-
-
-def stacked_media(encoded: Sequence[Encoded]) -> dict[str, torch.Tensor]:
-    """Concatenate the media tensors of all samples in order."""
-    parts = {name: [e.media[name] for e in encoded if name in e.media] for name in MEDIA_INPUTS}
-    return {name: torch.cat(tensors) for name, tensors in parts.items() if tensors}
+    for name in MEDIA_INPUTS:
+        if tensors := [e.media[name] for e in encoded if name in e.media]:
+            batch[name] = torch.cat(tensors)
+    return batch
 
 
 def letter_ids(processor: ProcessorMixin) -> list[int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import peft
@@ -11,7 +12,7 @@ from torch import nn
 
 from conf.schema import LoraConfig
 from models import loading
-from models.lora_kernels import AddedInPlace, PatchProduct, fuse, unfuse
+from models.lora_kernels import AddedInPlace, PatchProduct, fuse
 from models.student.collator import Collator
 from models.student.prompts import selection_sample
 from train.student.trainer import token_mean
@@ -64,9 +65,6 @@ def test_loss_and_every_gradient_are_the_same(student) -> None:
     assert computed.keys() == gradients.keys()
     for name, gradient in gradients.items():
         assert (computed[name] - gradient).norm() <= 1e-4 * gradient.norm(), name
-    unfuse(model)
-    again, _ = loss_and_gradients(model, batch)
-    assert torch.equal(again, plain)
 
 
 def test_rounding_to_bf16_is_no_larger(student) -> None:
@@ -85,6 +83,7 @@ def test_rounding_to_bf16_is_no_larger(student) -> None:
 def test_saved_weights_are_unchanged_and_give_the_same_logits(student, tmp_path) -> None:
     model, batch, adapted = student
     before = {name: value.clone() for name, value in model.state_dict().items()}
+    plain = copy.deepcopy(model)
     fuse(model)
     after = model.state_dict()
     assert after.keys() == before.keys()
@@ -94,6 +93,5 @@ def test_saved_weights_are_unchanged_and_give_the_same_logits(student, tmp_path)
         with torch.no_grad():
             fused = model.eval()(**inputs).logits
             model.save_pretrained(tmp_path)
-            unfuse(model)
-            again = peft.PeftModel.from_pretrained(model.unload(), tmp_path).eval()
+            again = peft.PeftModel.from_pretrained(plain.unload(), tmp_path).eval()
             torch.testing.assert_close(again(**inputs).logits, fused, atol=1e-4, rtol=1e-4)

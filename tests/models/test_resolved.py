@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from conf.schema import RetrieverConfig, StudentConfig
-from models.fingerprints import image_model_id, model_id, pin_revisions
+from models.fingerprints import model_id, pin_revisions
 from models.precision import resolve_precision
 from models.resolved import (
     RESOLVED,
@@ -19,7 +19,6 @@ from models.resolved import (
     pin_base,
     read_resolved,
     resolve_run,
-    resolved_precision,
 )
 from tests.user_errors import raises_user_error
 
@@ -50,9 +49,7 @@ def test_a_resumed_run_keeps_its_precision(base, tmp_path, monkeypatch) -> None:
     assert resolve_run(tmp_path, "auto", base, "x") == ("bf16", base)
     monkeypatch.setattr("models.precision.supports_bf16", lambda: False)
     assert resolve_run(tmp_path, "auto", base, "x") == ("bf16", base)
-    assert resolved_precision(tmp_path, "auto") == "bf16"
     assert resolve_precision("auto") == "fp32"
-    assert resolved_precision(tmp_path / "nowhere", "auto") == "auto"
 
 
 @pytest.mark.parametrize(
@@ -88,14 +85,14 @@ def test_a_run_keeps_the_commit_of_a_hub_base(tmp_path, hub) -> None:
     """The owner of a hub model may replace its weights under the same name."""
     cfg = RetrieverConfig(name="own", model="lab/base")
     _, first = resolve_run(tmp_path, "fp32", cfg, "x")
-    assert (first.revision, model_id(first)) == ("a" * 40, f"lab/base@{'a' * 40}")
+    assert model_id(first.model, first.revision) == f"lab/base@{'a' * 40}"
     hub.write_text("b" * 40)
     assert pin_revisions(cfg).revision == "b" * 40
     assert resolve_run(tmp_path, "fp32", cfg, "x")[1] == first == pin_base(tmp_path, cfg)
     # A revision in the preset takes precedence over the current commit.
     assert pin_revisions(replace(cfg, revision="a" * 40)) == first
     two = pin_revisions(replace(cfg, image_model="lab/base", image_revision="a" * 40))
-    assert (model_id(two), image_model_id(two)) == (f"lab/base@{'b' * 40}", f"lab/base@{'a' * 40}")
+    assert (two.revision, two.image_revision) == ("b" * 40, "a" * 40)
     other = replace(cfg, model="lab/other")
     assert pin_base(tmp_path, other) == other
 

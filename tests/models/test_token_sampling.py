@@ -10,9 +10,8 @@ import torch
 
 from conf.schema import StudentConfig
 from models.student.collator import Collator
-from models.student.generation import generate
+from models.student.generation import generate, sampling_processors
 from models.student.prompts import selection_sample
-from models.student.token_sampling import sampling_processors
 
 LOGITS = torch.tensor([2.0, 1.0, 0.5, 0.0, -1.0, -3.0])
 

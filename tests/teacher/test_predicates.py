@@ -46,7 +46,7 @@ def test_pair_on_a_collision_course_meets():
     scene = synthetic.scene([(-1.5, 0), (1.5, 0.1)], [(1, 0), (-1, 0)])
     (contact,) = scene.collisions
     assert find_collision_courses(scene, 10) == [(0, 1)]
-    names = tuple(o.phrase for o in scene.objects)
+    names = tuple(o.noun_phrase for o in scene.objects)
     # They approach at 2 units/s and meet after about 32 frames; the cut is frame 6, then 20.
     for stop, when in ((6, "soon"), (20, "imminent")):
         facts = extract_facts(scene, 0, stop, contact.frame)
@@ -161,7 +161,7 @@ def test_every_fact_agrees_with_the_oracle(benchmark_store):
             for k in c.objects:
                 since[k] = max(since[k], c.frame) if c.frame <= cut else since[k]
         for k, o in enumerate(predicates.objects):
-            assert o.object == scene.objects[k].phrase
+            assert o.object == scene.objects[k].noun_phrase
             assert (o.sight, o.target_sight) == (
                 expected_sight(scene, cut, k),
                 expected_sight(scene, target, k),
@@ -206,7 +206,7 @@ def test_every_fact_agrees_with_the_oracle(benchmark_store):
 
 
 def check_meetings(scene, predicates, cut, target, since, counts):
-    names = [o.phrase for o in scene.objects]
+    names = [o.noun_phrase for o in scene.objects]
     on_course = {frozenset(m.objects): m.when for m in predicates.courses}
     contacts = {frozenset(m.objects): m.when for m in predicates.contacts}
     close = {frozenset(c.objects): c.region for c in predicates.close}
@@ -279,7 +279,7 @@ def test_differences_of_candidates_agree_with_the_oracle(benchmark_store):
             frame, other = named.frame, benchmark_store.scene(named.scene_id)
             right = (named.scene_id, frame) == (item.scene_id, item.target_frame)
             assert candidate.agrees == right
-            names, others = ([o.phrase for o in s.objects] for s in (scene, other))
+            names, others = ([o.noun_phrase for o in s.objects] for s in (scene, other))
             assert candidate.other_objects == (set(names) != set(others))
             for d in candidate.differences:
                 i = names.index(d.object) if d.object in names else None
@@ -305,5 +305,5 @@ def test_displacement_has_a_direction_and_an_extent():
     scene = synthetic.scene([start, (0, -1)], [toward(start, (340, 160), 100), (0, 0)])
     item = synthetic.item((60, 80, 100, 120), answer=0)
     late = extract_predicates(item, scene, None).candidates[1].differences
-    assert [(d.object, d.kind) for d in late] == [(scene.objects[0].phrase, "displaced")]
+    assert [(d.object, d.kind) for d in late] == [(scene.objects[0].noun_phrase, "displaced")]
     assert (late[0].heading, late[0].extent) == ("east", "slightly")

@@ -15,8 +15,8 @@ from conf.errors import UserError
 from conf.schema import RetrieverConfig, StudentConfig
 from data.records import RetrievalQuery
 from data.render.frame_cache import FrameReader
-from models.parameter_counts import check_towers, count_towers, format_towers
-from models.retriever.checks import check_widths
+from models.checks import check_widths
+from models.parameter_counts import check_towers, count_towers
 from models.retriever.embedder import Retriever, frame_input, query_input
 from models.retriever.multi_vector import find_scored_tokens
 from models.student.collator import IGNORED, Collator
@@ -104,7 +104,7 @@ def describe_model(
             grids.append(f"{medium} of {time} x {height // merge} x {width // merge} tokens")
     return [
         f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'whole'})",
-        format_towers(towers),
+        towers.map("{:,}".format).rename_axis(None).to_string(),
         f"frames of {cfg.image_size} x {cfg.image_size} px become {' and '.join(grids)}",
     ]
 

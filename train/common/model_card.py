@@ -24,7 +24,7 @@ def model_card(
     format: str,
     measured: dict[str, float],
 ) -> ModelCard:
-    """The card of an export.
+    """Return the card of an export.
 
     Args:
         name: The training run.
@@ -36,12 +36,14 @@ def model_card(
     student = isinstance(settings, SftCommand)
     product = "student" if student else "retriever"
     preset, train = getattr(settings, product), settings.train
+    narrated = student and train.regime not in WITHOUT_RATIONALES
+    on_hub = is_hub_model(preset.model)
     metrics = json.loads((folder / "metrics.json").read_text())
     merged_library = "transformers" if student else "sentence-transformers"
     return ModelCard.from_template(
         ModelCardData(
             # A local folder is not a model that the hub could link to.
-            base_model=preset.model if is_hub_model(preset.model) else None,
+            base_model=preset.model if on_hub else None,
             library_name="peft" if format == "adapter" else merged_library,
             pipeline_tag="image-text-to-text" if student else "sentence-similarity",
             tags=["dynapix", train.regime if student else "retriever"],
@@ -50,9 +52,13 @@ def model_card(
         name=name,
         product=product,
         format=format,
-        training=training_rows(settings, folder),
+        preset=preset,
+        digest=None if on_hub else read_resolved(folder).get("base"),
+        benchmark=settings.benchmark,
+        seed=settings.seed,
+        teacher=settings.teacher if narrated else None,
+        record=json.loads((folder / "run.json").read_text()),
         settings=yaml.safe_dump({product: asdict(preset), "train": asdict(train)}, sort_keys=False),
-        quantization=preset.quantization,
         items="items" if student else "queries",
         best_step=metrics.get(BEST_STEP),
         best_metric=train.best_metric,
@@ -60,27 +66,3 @@ def model_card(
         at_start=AT_START_SUFFIX,
         measured=measured,
     )
-
-
-def training_rows(settings: SftCommand | ContrastiveCommand, folder: Path) -> list[tuple[str, str]]:
-    """Return what the model was trained from, as labels and values."""
-    student = isinstance(settings, SftCommand)
-    preset, benchmark = settings.student if student else settings.retriever, settings.benchmark
-    record = json.loads((folder / "run.json").read_text())
-    scenes = f"{benchmark.scenes} scenes by " if benchmark.simulator == "bullet" else ""
-    rows = {
-        "base": f"{preset.model}{f' at {preset.revision}' if preset.revision else ''}",
-        "benchmark": f"{benchmark.name}, {scenes}{benchmark.simulator}, seed {benchmark.seed}",
-        "seed": settings.seed,
-        "started": record["started"],
-        "versions": ", ".join(f"{name} {version}" for name, version in record["packages"].items()),
-    }
-    if not is_hub_model(preset.model) and (resolved := read_resolved(folder)):
-        rows["digest of the base's weights"] = resolved["base"]
-    if student and settings.train.regime not in WITHOUT_RATIONALES:
-        teacher = settings.teacher
-        rows["teacher"] = f"{teacher.name} ({teacher.model})" if teacher.model else teacher.name
-    if record["git"]:
-        changed = ", with changes" if record["git"]["dirty"] else ""
-        rows["code"] = f"commit {record['git']['commit']}{changed}"
-    return [(label, str(value)) for label, value in rows.items()]

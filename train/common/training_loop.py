@@ -16,7 +16,6 @@ from transformers.trainer_callback import TrainerState
 
 from conf.errors import UserError
 from conf.runs import Run, rank, run_id
-from models.compat import load_checkpoint
 from models.distributed import is_sharded
 from models.memory import explain_out_of_memory
 from train.common.arguments import PROJECT
@@ -26,7 +25,7 @@ from train.common.checkpoints import STATE, check_best_checkpoint
 log = logging.getLogger(__name__)
 
 SERIALIZED = f"{UserError.__module__}.{UserError.__qualname__}: "
-"""Marks a UserError in the traceback of another process."""
+"""What precedes the message of a UserError in the traceback of another process."""
 
 
 def run_training(
@@ -52,7 +51,7 @@ def run_training(
         "train.reuse_features=false, in another run (run=NAME)"
     )
     with explain_errors("while training", advice):
-        fit(trainer, checkpoint)
+        train_to_last_step(trainer, checkpoint)
     best_step = trainer.state.best_global_step
     if best_step:
         measure = f"{trainer.args.metric_for_best_model} = {trainer.state.best_metric:.4g}"
@@ -75,14 +74,14 @@ def add_callbacks(trainer: Trainer, run: Run) -> None:
             os.environ.setdefault(f"WANDB_{name}", str(value))
 
 
-def fit(trainer: Trainer, checkpoint: Path | None) -> None:
-    """Train to the last step, from the start or a checkpoint."""
+def train_to_last_step(trainer: Trainer, checkpoint: Path | None) -> None:
+    """Train from the start or a checkpoint; after the last step, only load the final weights."""
     if checkpoint is not None:
         log.info("resuming from %s", checkpoint)
         state = TrainerState.load_from_json(str(checkpoint / STATE))
         check_best_checkpoint(checkpoint, state.best_global_step)
         if state.global_step >= state.max_steps:
-            # The trainer would take another step.
+            # The trainer would train for one more step.
             trainer.state = state
             best = state.best_global_step or state.global_step
             load_weights(trainer, checkpoint.with_name(f"checkpoint-{best}"))
@@ -106,7 +105,7 @@ def explain_errors(when: str, lower: str) -> Iterator[None]:
     except RuntimeError as error:
         if SERIALIZED not in str(error):
             raise
-        # Of another rank, whose traceback the library includes.
+        # The error of another rank, whose traceback the library includes.
         raise UserError(user_message(error), code="failed-rank") from error
     except UserError as error:
         raise UserError(user_message(error), code=error.code) from error
@@ -119,7 +118,7 @@ def explain_load_errors(group: str) -> AbstractContextManager[None]:
 
 
 def user_message(error: Exception) -> str:
-    """Return an error's own message: torch prepends the traceback of a worker process."""
+    """Return an error's message without the traceback of a worker process or of another rank."""
     return str(error).rpartition(SERIALIZED)[2].strip()
 
 
@@ -153,7 +152,7 @@ def load_weights(trainer: Trainer, checkpoint: Path) -> None:
         # A sharded checkpoint needs a sharded model, and accelerate shards it with its optimizer.
         trainer.create_optimizer()
         trainer.accelerator.prepare(trainer.model, trainer.optimizer)
-    load_checkpoint(trainer, checkpoint)
+    trainer._load_from_checkpoint(str(checkpoint))
 
 
 def gather_weights(trainer: Trainer) -> dict[str, torch.Tensor] | None:

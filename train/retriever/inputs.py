@@ -1,4 +1,4 @@
-"""Makes the inputs of a retriever's forward pass from queries and frames."""
+"""Build the inputs of a retriever's forward pass from queries and frames."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class RetrieverInputs:
         model[0].register_forward_pre_hook(pass_features)
 
     def load(self, items: Sequence[Item]) -> dict[str, Any]:
-        """Inputs of some queries, or of some frames, on the CPU."""
+        """Return the inputs of queries, or of frames, on the CPU."""
         kept = self._kept.pop(tuple(items), None)
         if kept is not None:
             return kept
@@ -54,8 +54,9 @@ class RetrieverInputs:
     def prepare(
         self, items: Sequence[Item], inputs: dict[str, Any], first_pass: bool
     ) -> dict[str, Any]:
-        """Loaded inputs on the model's device; in a first pass with `reuse_features`, the vision
-        tower's outputs replace the pixels and are kept for the next `load` of these items."""
+        """Move loaded inputs to the model's device. In a first pass with `reuse_features`, also
+        replace the pixels by the vision tower's outputs, which the next `load` of these items
+        returns."""
         inputs = send_to_device(inputs, self._model.device, non_blocking=True)
         if first_pass and self._reuse:
             inputs = self._encode_media(inputs)
@@ -74,8 +75,8 @@ class RetrieverInputs:
 
 
 def pass_features(module: Any, args: tuple[dict[str, Any]]) -> None:
-    """Before the backbone's forward: pass kept outputs of the vision tower under the argument that
-    the model has for them."""
+    """Pass kept outputs of the vision tower to the backbone, under the name that its `forward`
+    has for them. This is a hook that is called before that `forward`."""
     (inputs,) = args
     kept = {kind: inputs.pop(f"{FEATURES}_{kind}", None) for kind in MEDIA}
     if outputs := {k: encoder_outputs(layers) for k, layers in kept.items() if layers is not None}:

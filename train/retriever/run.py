@@ -20,11 +20,7 @@ from train.common.arguments import common_arguments
 from train.common.audit import audit_retriever
 from train.common.callbacks import EpochCallback
 from train.retriever.batches import QueryBatchSampler, batch_columns
-from train.retriever.evaluator import (
-    HeldOutEvaluator,
-    MultiVectorHeldOutEvaluator,
-    build_database,
-)
+from train.retriever.evaluator import HeldOutEvaluator, build_database
 from train.retriever.inputs import RetrieverInputs
 from train.retriever.loss import RankingLoss
 from train.retriever.trainer import (
@@ -65,16 +61,14 @@ def build_trainer(
     # The dataset holds numbers; the loss loads pixels, and prefetches them itself.
     common = common_arguments(train, run, cfg.seed, checkpoint) | {"dataloader_num_workers": 0}
     if retriever.late is None:
-        trainer, evaluator = RetrieverTrainer, HeldOutEvaluator
-        arguments = SentenceTransformerTrainingArguments
+        trainer, arguments = RetrieverTrainer, SentenceTransformerTrainingArguments
     else:
-        trainer, evaluator = MultiVectorTrainer, MultiVectorHeldOutEvaluator
-        arguments = MultiVectorEncoderTrainingArguments
+        trainer, arguments = MultiVectorTrainer, MultiVectorEncoderTrainingArguments
     return trainer(
         model=model,
         args=arguments(**common, per_device_train_batch_size=rank_batch, dataloader_drop_last=True),
         train_dataset=numbered_rows(len(training)),
-        evaluator=evaluator(
+        evaluator=HeldOutEvaluator(
             validation, build_database(validation, store), frames, retriever, train.mini_batch
         ),
         loss=build_loss(train, retriever, model, frames),

@@ -1,7 +1,8 @@
 """sentence-transformers' trainers on batches of query numbers.
 
-The library's collator loads everything that a batch shows, and its sampler knows no scenes. Here a
-batch holds the numbers of its queries, and the loss loads their pixels.
+The library's collator would load the pixels of a whole batch, and its sampler would put queries
+with the same frames into one batch. Here a batch holds the numbers of queries that
+`QueryBatchSampler` chose, and the loss loads their pixels.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from sentence_transformers.sentence_transformer.data_collator import (
     SentenceTransformerDataCollator,
 )
 
-from models.retriever.embedder import ADAPTERS, load_adapters
+from models.retriever.embedder import ADAPTERS, Item, load_adapters
 from train.retriever.batches import QueryBatchSampler
 
 NUMBER = "query"
@@ -24,8 +25,8 @@ NUMBER = "query"
 
 
 def numbered_rows(count: int) -> Dataset:
-    """Training rows that name queries by number."""
-    return Dataset.from_list([{NUMBER: k} for k in range(count)])
+    """Return a training row for each query, with its number."""
+    return Dataset.from_dict({NUMBER: list(range(count))})
 
 
 class IndexCollator(SentenceTransformerDataCollator):
@@ -39,15 +40,16 @@ class IndexBatchTrainer:
     """Mixin for the library's trainers.
 
     Args:
-        sampler: Composes the batches of an epoch.
-        columns_of: The loss's features for the numbers of a batch's queries.
+        sampler: Chooses the queries of each batch.
+        columns_of: Returns the columns of a batch, which the loss takes, from the numbers of its
+            queries.
     """
 
     def __init__(
         self,
         *args: Any,
         sampler: QueryBatchSampler,
-        columns_of: Callable[[Sequence[int]], list[dict[str, Any]]],
+        columns_of: Callable[[Sequence[int]], list[list[Item]]],
         **options: Any,
     ) -> None:
         self._sampler = sampler
@@ -55,17 +57,17 @@ class IndexBatchTrainer:
         super().__init__(*args, **options)
 
     def add_model_card_callback(self, *_: Any) -> None:
-        """A card's examples come from texts in the training rows, which only hold numbers."""
+        """Add no callback: its card would show texts of the rows, which only hold numbers."""
 
     def get_batch_sampler(self, *_: Any, **__: Any) -> QueryBatchSampler:
         return self._sampler
 
-    def collect_features(self, inputs: dict[str, list[int]]) -> tuple[list[dict[str, Any]], None]:
+    def collect_features(self, inputs: dict[str, list[int]]) -> tuple[list[list[Item]], None]:
         return self._columns_of(inputs["indices"]), None
 
     def _load_from_checkpoint(self, checkpoint_path: str) -> None:
-        """Load adapters into the present ones: the library would load the base again without
-        quantisation, and fail because the weights do not fit."""
+        """Load the weights of the adapters only: the library would load the base again, without
+        quantisation, and its weights would not fit."""
         folder = Path(checkpoint_path)
         if (folder / ADAPTERS).exists():
             load_adapters(self.model, folder)
@@ -73,7 +75,8 @@ class IndexBatchTrainer:
             super()._load_from_checkpoint(checkpoint_path)
 
     def _load_best_model(self) -> None:
-        """Where this fails, the library would log it and keep the last weights."""
+        """Load the best weights or fail: the library would only log an error and keep the last
+        weights."""
         self._load_from_checkpoint(self.state.best_model_checkpoint)
 
 

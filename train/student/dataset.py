@@ -46,8 +46,8 @@ class SupervisedItem:
         return f"{self.item.question} {instruction(self.mode, self.regime)} {self.response}"
 
     def lazy(self, frames: FrameReader, frame_count: int, seed: int | None) -> LazySample:
-        """Return a sample that shows `frame_count` frames of the prefix. With a seed, candidates
-        are permuted in each epoch."""
+        """Return a sample with `frame_count` frames of the prefix. With a seed, each epoch permutes
+        the candidates."""
         render = partial(self.render, frames, frame_count, seed)
         return LazySample(self.text, frame_count // 2 + len(LETTERS), render, self.item.family)
 
@@ -105,9 +105,9 @@ def load_datasets(
     others = set(store.scene_ids("train")) - held_out
     items = store.selection("train")
     # No frame of a held-out scene is visible in training, not even as a distractor.
-    trained = [item for item in items if shows_only(item, others)]
+    trained = [item for item in items if uses_only(item, others)]
     if train.regime == "describe":
-        measured = [item for item in items if shows_only(item, held_out)]
+        measured = [item for item in items if uses_only(item, held_out)]
         training, validation = (
             questions.build_questions(store, part, frame_count, frames, seed)
             for part in (trained, measured)
@@ -118,7 +118,7 @@ def load_datasets(
         }
     else:
         by_item = {r.item_id: r for r in rationales}
-        # The items are sorted by family: a shuffled slice measures all of them.
+        # The items are sorted by family: a part of them has all families only if they are shuffled.
         measured = shuffled([i for i in items if i.scene_id in held_out], seed)
 
         def lazy(items: list[SelectionItem], seed: int | None) -> dict[str, list[LazySample]]:
@@ -133,8 +133,8 @@ def load_datasets(
     return StudentDataset(samples), {m: StudentDataset(v) for m, v in validation.items() if v}
 
 
-def shows_only(item: SelectionItem, scenes: set[str]) -> bool:
-    """Whether all frames of an item belong to these scenes."""
+def uses_only(item: SelectionItem, scenes: set[str]) -> bool:
+    """Whether the prefix and all candidates of an item are of these scenes."""
     return {item.scene_id, *(c.scene_id for c in item.candidates)} <= scenes
 
 

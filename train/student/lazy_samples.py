@@ -1,4 +1,4 @@
-"""Samples that are rendered on demand, so that pixels are not held for all of them."""
+"""Samples that are rendered when they are read, so that memory holds the pixels of a batch only."""
 
 from __future__ import annotations
 
@@ -13,32 +13,34 @@ from transformers import PreTrainedTokenizerBase
 from models.student.prompts import Sample
 
 TOKEN_PIXELS, EXTRA_TOKENS = 32, 8
-"""Side in px of the square that a visual token covers, and text tokens around each image or pair of
-video frames."""
+"""The side in px of the square that a visual token covers, and the number of text tokens around
+each image or pair of video frames."""
 
 
 @dataclass(frozen=True)
 class LazySample:
-    """A sample to be rendered.
+    """A sample before it is rendered.
 
     Attributes:
-        text: The text in which it differs from others of its kind.
-        media: Images, and pairs of a clip's frames. With `text`, it determines the length.
-        load: Renders the sample of an epoch.
+        text: The part of its text that other samples of its kind do not have.
+        media: Number of images and of pairs of a clip's frames. With `text`, it determines the
+            length in tokens.
+        render: Returns the sample of an epoch.
         family: The selection item's family, None for other samples.
     """
 
     text: str
     media: int
-    load: Callable[[int], Sample]
+    render: Callable[[int], Sample]
     family: str | None = None
 
 
 @dataclass(eq=False)
 class StudentDataset(Dataset):
-    """Lazy samples as a trainer reads them.
+    """Samples that are rendered when a trainer reads them.
 
-    Index ~k (below 0) is sample k without supervision; the sampler fills up a step with it.
+    A negative index ~k returns sample k without supervision, which fills up the last step of an
+    epoch.
     """
 
     samples: Sequence[LazySample]
@@ -53,7 +55,7 @@ class StudentDataset(Dataset):
     def __getitem__(self, index: int) -> Sample:
         if index < 0:
             return replace(self[~index], supervised=False)
-        return self.samples[index].load(self.epoch)
+        return self.samples[index].render(self.epoch)
 
     @property
     def families(self) -> list[str | None]:

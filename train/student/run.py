@@ -28,27 +28,6 @@ from train.tiny_base.object_tokens import ObjectTokenCollator, ObjectTokenTraine
 log = logging.getLogger(__name__)
 
 
-def training_arguments(cfg: SftCommand, run: Run, checkpoint: Path | None) -> TrainingArguments:
-    """Convert the settings, with a resolved precision, to the trainer's arguments.
-
-    Args:
-        checkpoint: The checkpoint that the run resumes from, or None.
-    """
-    train = cfg.train
-    accumulation = split_batch(train.batch, train.micro_batch)
-    return TrainingArguments(
-        **common_arguments(train, run, cfg.seed, checkpoint),
-        per_device_train_batch_size=train.micro_batch,
-        gradient_accumulation_steps=accumulation,
-        per_device_eval_batch_size=train.micro_batch,
-        dataloader_prefetch_factor=prefetch_factor(train.workers, accumulation),
-        label_names=["labels"],
-        # Every pass uses all adapters; the vision tower of a whole model is unused in prompts
-        # without images.
-        ddp_find_unused_parameters=not cfg.student.lora.rank,
-    )
-
-
 def prefetch_factor(workers: int, accumulation: int) -> int | None:
     """Return the number of batches that each worker prepares in advance; None without workers.
 
@@ -60,13 +39,18 @@ def prefetch_factor(workers: int, accumulation: int) -> int | None:
 
 def build_trainer(
     cfg: SftCommand,
-    arguments: TrainingArguments,
+    run: Run,
     model: nn.Module,
     processor: ProcessorMixin,
     training: StudentDataset,
     validation: dict[str, StudentDataset],
+    checkpoint: Path | None,
 ) -> StudentTrainer:
     """Audit the model and the longest sample, and return a trainer for the regime.
+
+    Args:
+        cfg: Settings with a resolved precision.
+        checkpoint: The checkpoint that the run resumes from, or None.
 
     Raises:
         UserError: the model is not what its preset says, or the longest sample is too long.
@@ -89,7 +73,19 @@ def build_trainer(
         limit = available_cpu_bytes() // 2 // local_world_size()
         cache = VisionCache(model, train.precision, limit)
     if train.generated_items:
-        answers = HeldOutAnswers(cfg, processor, Path(arguments.output_dir))
+        answers = HeldOutAnswers(cfg, processor, run.folder)
+    accumulation = split_batch(train.batch, train.micro_batch)
+    arguments = TrainingArguments(
+        **common_arguments(train, run, cfg.seed, checkpoint),
+        per_device_train_batch_size=train.micro_batch,
+        gradient_accumulation_steps=accumulation,
+        per_device_eval_batch_size=train.micro_batch,
+        dataloader_prefetch_factor=prefetch_factor(train.workers, accumulation),
+        label_names=["labels"],
+        # Every pass uses all adapters; the vision tower of a whole model is unused in prompts
+        # without images.
+        ddp_find_unused_parameters=not student.lora.rank,
+    )
     return trainer(
         model=model,
         args=arguments,

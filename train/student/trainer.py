@@ -26,7 +26,7 @@ from models.student.collator import IGNORED, Collator
 from models.student.prompts import Sample
 from train.student.held_out_answers import HeldOutAnswers
 from train.student.metrics import LetterAccuracy, TokenAccuracy
-from train.student.vision_cache import SLICES, VisionCache, slice_digests
+from train.student.vision_cache import PAIRS, VisionCache, pair_digests
 
 STOPPED = "stopped.json"
 """Names the samples of a non-finite loss or gradient; ranks above 0 put their number in front."""
@@ -59,14 +59,14 @@ def token_losses(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class TrainerCollator:
-    """Adds the samples' ids to a batch and, for a `VisionCache`, the digests of the slices."""
+    """Adds the samples' ids to a batch and, for a `VisionCache`, the digests of its frames."""
 
     collator: Collator
     digests: bool
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
         batch = {**self.collator(samples), "sample_ids": [s.sample_id for s in samples]}
-        return {**batch, SLICES: slice_digests(samples)} if self.digests else batch
+        return {**batch, PAIRS: pair_digests(samples)} if self.digests else batch
 
 
 class StudentTrainer(Trainer):
@@ -139,7 +139,7 @@ class StudentTrainer(Trainer):
         """Raises UserError for a non-finite loss, after writing the samples' ids to a file."""
         ids = inputs.pop("sample_ids")
         if self._vision_cache is not None:
-            self._vision_cache.replace_pixels(inputs)
+            self._vision_cache.encode_media(inputs)
         result = super().compute_loss(model, inputs, return_outputs, **settings)
         loss = result[0] if return_outputs else result
         if not torch.isfinite(loss):

@@ -1,8 +1,8 @@
 """A cache of the frozen vision tower's outputs.
 
-The tower attends within one image, or within two frames of a clip that share a temporal patch: its
-output for such a slice is the same in every sample, epoch and evaluation. The cache is keyed by the
-pixels, so that no slice is mistaken for another.
+The tower encodes each pair of frames separately: two neighbours of a clip, or an image twice. The
+output for a pair is therefore the same in every sample, epoch and evaluation. The key of a pair is
+a digest of its pixels.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from models.distributed import is_sharded
 from models.student.collator import MEDIA
 from models.student.prompts import Sample
 
-SLICES = "slices"
-"""Name of a batch's slice digests: images first, then pairs of the clips' frames."""
+PAIRS = "frame_pairs"
+"""Name of the digests of a batch's frame pairs: of its images, then of its clips."""
 
 
-def slice_digests(samples: Sequence[Sample]) -> list[bytes]:
-    """Return a digest of each image in order, then of each pair of the clips' frames in order."""
-    # The tower takes an image as two equal frames; so it does with the odd last frame of a clip.
+def pair_digests(samples: Sequence[Sample]) -> list[bytes]:
+    """Return a digest of each image, then of each pair of frames of each clip."""
     pairs = [(image, image) for sample in samples for image in sample.images]
     for sample in samples:
         if sample.clip is not None:
             pixels = sample.clip.pixels
+            # The last frame of an odd number forms a pair with itself.
             pairs += zip(pixels[::2], [*pixels[1::2], pixels[-1]], strict=False)
     digests = []
     for first, second in pairs:
@@ -44,9 +44,10 @@ def slice_digests(samples: Sequence[Sample]) -> list[bytes]:
 
 
 class VisionCache:
-    """Replaces a batch's pixels by the tower's outputs, which it keeps in the machine's memory.
+    """Replaces the pixels of batches by the tower's outputs, which it keeps in the CPU's memory.
 
-    Once `limit` bytes are reached nothing more is kept: other slices pass the tower each time.
+    Once `limit` bytes are reached, no more outputs are kept; the tower then encodes other pairs
+    each time.
 
     Args:
         model: The student, with or without adapters.
@@ -77,39 +78,37 @@ class VisionCache:
         self._kept: dict[bytes, torch.Tensor] = {}
         self.bytes = 0
 
-    def replace_pixels(self, inputs: dict[str, Any]) -> None:
-        """Put the tower's outputs, as `mm_encoder_outputs`, in the place of a batch's pixels."""
-        digests, patches, counts = inputs.pop(SLICES), [], {}
+    def encode_media(self, inputs: dict[str, Any]) -> None:
+        """Replace a batch's pixels by the tower's outputs, as `mm_encoder_outputs`."""
+        digests, size = inputs.pop(PAIRS), []
+        keys: dict[str, list[bytes]] = {}
+        pixels: dict[bytes, torch.Tensor] = {}
         for kind, (name, grid) in MEDIA.items():
             if name in inputs:
-                sizes = [h * w for time, h, w in inputs[grid].tolist() for _ in range(time)]
-                patches += inputs.pop(name).split(sizes)
-                counts[kind] = len(sizes)
-        slices = dict(zip(digests, patches, strict=True))
-        new = self._encode({k: v for k, v in slices.items() if k not in self._kept}, inputs)
+                size = inputs[grid][0, 1:].tolist()
+                pairs = inputs.pop(name).chunk(int(inputs[grid][:, 0].sum()))
+                keys[kind], digests = digests[: len(pairs)], digests[len(pairs) :]
+                pixels.update(zip(keys[kind], pairs, strict=True))
+        new = self._encode({k: v for k, v in pixels.items() if k not in self._kept}, size)
         device = inputs["input_ids"].device
-        outputs, start = {}, 0
-        for kind, count in counts.items():
-            features = [
-                new[key] if key in new else self._kept[key].to(device, non_blocking=True)
-                for key in digests[start : start + count]
-            ]
-            start += count
-            outputs[kind] = encoder_outputs(torch.cat(features, dim=1))
-        inputs["mm_encoder_outputs"] = outputs
+        inputs["mm_encoder_outputs"] = {
+            kind: encoder_outputs(
+                torch.cat([new[k] if k in new else self._kept[k].to(device) for k in pairs], dim=1)
+            )
+            for kind, pairs in keys.items()
+        }
         for key, features in new.items():
             if self.bytes + features.nbytes <= self._limit:
                 self._kept[key] = features.cpu()
                 self.bytes += features.nbytes
 
     def _encode(
-        self, slices: dict[bytes, torch.Tensor], inputs: dict[str, Any]
+        self, pixels: dict[bytes, torch.Tensor], size: list[int]
     ) -> dict[bytes, torch.Tensor]:
-        """Return (1 + deepstack layers, tokens, hidden) for each slice; all have one size."""
-        if not slices:
+        """Return (1 + deepstack layers, tokens, hidden) for each pair; all pairs have one size."""
+        if not pixels:
             return {}
-        height, width = next(inputs[g] for _, g in MEDIA.values() if g in inputs)[0, 1:].tolist()
-        patches = torch.cat(list(slices.values()))
-        grid = torch.tensor([[1, height, width]] * len(slices), device=patches.device)
+        patches = torch.cat(list(pixels.values()))
+        grid = torch.tensor([[1, *size]] * len(pixels), device=patches.device)
         encoded = encode_images(self._base, patches, grid, self._precision == "bf16")
-        return dict(zip(slices, encoded, strict=True))
+        return dict(zip(pixels, encoded, strict=True))

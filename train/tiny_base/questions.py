@@ -18,7 +18,14 @@ import numpy as np
 from data.records import LETTERS, Scene, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from data.store import Store
-from models.student.prompts import ObjectLabel, Sample, answer_line, conversation, load_clip
+from models.student.prompts import (
+    Clip,
+    ObjectLabel,
+    Sample,
+    answer_line,
+    conversation,
+    load_clip,
+)
 from teacher.narrator import write_description, write_match_lines
 from teacher.predicates import (
     REGIONS,
@@ -62,10 +69,10 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True)
 class Question:
-    """A question after pictures, and its answer.
+    """A question about pictures or a clip, and its answer.
 
     Attributes:
-        after_clip: Whether the clip of the item's prefix is before the pictures.
+        after_clip: Whether the prompt begins with the clip of the item's prefix.
     """
 
     text: str
@@ -77,16 +84,17 @@ class Question:
 def build_questions(
     store: Store, items: list[SelectionItem], frame_count: int, frames: FrameReader, seed: int
 ) -> dict[str, list[LazySample]]:
-    """Samples by kind of question. Frames, candidates and their order are random in each epoch."""
+    """Return samples by kind of question. Frames, candidates and their order are random in each
+    epoch."""
     builder = QuestionBuilder(store, items, frame_count, frames, seed)
     return {kind: [s for item in items for s in builder.samples(item, kind)] for kind in KINDS}
 
 
 @dataclass(frozen=True)
 class QuestionBuilder:
-    """Asks questions about items; seed, epoch and item determine the random choices.
+    """Builds questions about items; seed, epoch and item determine the random choices.
 
-    Each kind of question has a method, which returns None if it cannot ask about the item.
+    Each kind of question has a method, which returns None for items that do not allow it.
     """
 
     store: Store
@@ -97,46 +105,45 @@ class QuestionBuilder:
 
     def samples(self, item: SelectionItem, kind: str) -> Iterator[LazySample]:
         """Return the samples of a kind; the first epoch's question estimates their length."""
-        if first := self.ask(item, kind, 0, epoch=0):
+        if first := self.build(item, kind, 0, epoch=0):
             media = len(first.pictures) + self.frame_count // 2 * first.after_clip
             for repeat in range(KINDS[kind][1]):
                 render = partial(self.render, item, kind, repeat)
                 yield LazySample(f"{first.text} {first.answer}", media, render)
 
-    def ask(self, item: SelectionItem, kind: str, repeat: int, epoch: int) -> Question | None:
-        ask, repeats = KINDS[kind]
+    def build(self, item: SelectionItem, kind: str, repeat: int, epoch: int) -> Question | None:
+        method, repeats = KINDS[kind]
         keys = (kind, repeat) if repeats > 1 else (kind,)
-        return ask(self, item, seeded_rng(self.seed, epoch, item.item_id, *keys))
+        return method(self, item, seeded_rng(self.seed, epoch, item.item_id, *keys))
 
     def render(self, item: SelectionItem, kind: str, repeat: int, epoch: int) -> Sample:
-        question = self.ask(item, kind, repeat, epoch)
+        """Return the sample of a question: the clip, the pictures with their captions, the text."""
+        question = self.build(item, kind, repeat, epoch)
+        clip, labels = self.labelled_clip(item) if question.after_clip else (None, [])
+        pairs = (len(clip.indices) + 1) // 2 if clip else 0
         parts: list[str | np.ndarray] = []
-        for picture in question.pictures:
-            later = "Later: " if question.after_clip else ""
-            label = f"\nCandidate {picture.letter}: " if picture.letter else later
-            parts += [label] if label else []
+        for k, picture in enumerate(question.pictures, pairs):
+            if picture.letter:
+                parts.append(f"\nCandidate {picture.letter}: ")
+            elif clip:
+                parts.append("Later: ")
             parts.append(self.frames.array(picture.scene_id, picture.frame))
+            objects = visible_objects(self.store.scene(picture.scene_id), picture.frame)
+            labels += [ObjectLabel(k, at, (*words, *picture.letter)) for _, at, words in objects]
         parts.append(f"\n{question.text}" if question.pictures else question.text)
-        clip, labels, pairs = None, [], []
-        if question.after_clip:
-            indices = self.prefix_frames(item)
-            clip, scene = load_clip(item.scene_id, indices, self.frames), self.scene(item)
-            # A visual token of a clip covers two frames; objects are labelled as in the first.
-            pairs = list(zip(indices[::2], [*indices[1::2], indices[-1]], strict=False))
-            labels = [
-                ObjectLabel(k, place, (*words, object_heading(scene, index, *pair) or "stationary"))
-                for k, pair in enumerate(pairs)
-                for index, place, words in visible_objects(scene, pair[0])
-            ]
-        labels += [
-            ObjectLabel(k, place, (*words, *picture.letter))
-            for k, picture in enumerate(question.pictures, len(pairs))
-            for _, place, words in visible_objects(
-                self.store.scene(picture.scene_id), picture.frame
-            )
-        ]
         name = f"{item.item_id} ({kind} {repeat})"
         return conversation(name, parts, question.answer, clip, labels)
+
+    def labelled_clip(self, item: SelectionItem) -> tuple[Clip, list[ObjectLabel]]:
+        """Return the clip of an item's prefix, and its objects with their headings. A visual token
+        of a clip covers two frames; objects are labelled as in the first."""
+        indices, scene = self.prefix_frames(item), self.scene(item)
+        labels = []
+        for k, pair in enumerate(zip(indices[::2], [*indices[1::2], indices[-1]], strict=False)):
+            for index, place, words in visible_objects(scene, pair[0]):
+                heading = object_heading(scene, index, *pair) or "stationary"
+                labels.append(ObjectLabel(k, place, (*words, heading)))
+        return load_clip(item.scene_id, indices, self.frames), labels
 
     def frame(self, item: SelectionItem, rng: np.random.Generator) -> Question:
         """The objects of a frame and their places."""
@@ -254,7 +261,7 @@ class QuestionBuilder:
         rng: np.random.Generator,
     ) -> str:
         """A random visible object, if possible one whose place distinguishes candidates."""
-        names = sorted(visible) or [o.phrase for o in self.scene(item).objects]
+        names = sorted(visible) or [o.noun_phrase for o in self.scene(item).objects]
         names = [p for p in names if len({objects.get(p) for objects in places}) > 1] or names
         return names[rng.integers(len(names))]
 
@@ -306,7 +313,7 @@ def format_place(letter: str, phrase: str, place: str | None) -> str:
 def visible_regions(scene: Scene, frame: int) -> dict[str, str]:
     """The region of each visible object of a frame, by the object's phrase."""
     return {
-        o.phrase: object_region(scene, frame, k)
+        o.noun_phrase: object_region(scene, frame, k)
         for k, o in enumerate(scene.objects)
         if scene.in_view[frame, k] and scene.visible_fraction[frame, k] > HIDDEN
     }
@@ -327,7 +334,7 @@ def visible_objects(
     places = scene.image_positions[frame] / np.asarray(scene.image_size)
     visible = scene.in_view[frame] & (scene.visible_fraction[frame] > CLEAR)
     for k in np.flatnonzero(visible):
-        yield int(k), tuple(places[k].tolist()), tuple(scene.objects[k].phrase.split())
+        yield int(k), tuple(places[k].tolist()), tuple(scene.objects[k].noun_phrase.split())
 
 
 def find_moved_frames(scene: Scene, start: int) -> list[int]:

@@ -11,17 +11,10 @@ from data.store import Store
 
 
 def check_training(store: Store, queries: Sequence[RetrievalQuery], negatives: int) -> None:
-    """Check training queries against each other and against the test split.
-
-    Args:
-        negatives: Number of hard negatives that training uses for each query.
-
-    Raises:
-        UserError: a query id occurs twice, a query refers to a test scene, or a query has too few
-            hard negatives.
-    """
-    _refuse_repeated(store, "retrieval", [f"query {q.query_id}" for q in queries])
-    _refuse_leaks(store, queries, "test")
+    """Raises UserError where a query repeats, refers to a test scene, or has fewer than
+    `negatives` hard negatives."""
+    _refuse(store, "duplicate-record", _find_repeated("retrieval", queries))
+    _refuse(store, "split-leak", _find_leaks(store, queries, "test"))
     fewest = min((len(q.hard_negatives) for q in queries), default=negatives)
     lacking = [
         f"train.hard_negatives={negatives}, but query {q.query_id} has {len(q.hard_negatives)}"
@@ -34,48 +27,39 @@ def check_training(store: Store, queries: Sequence[RetrievalQuery], negatives: i
 def check_test(
     store: Store, queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]
 ) -> None:
-    """Check test queries and their database against each other and against the training split.
-
-    Raises:
-        UserError: the benchmark has no test queries, a query id or a frame occurs twice, a target
-            is missing from the database, or a query refers to a training scene.
-    """
+    """Raises UserError where there is no query, a query or frame repeats, a query refers to a
+    training scene, or the database lacks a target."""
     if not queries:
         raise UserError(
             f"{store.folder} has no queries of the standard test", code="missing-queries"
         )
-    _refuse_repeated(store, "retrieval", [f"query {q.query_id}" for q in queries])
-    _refuse_repeated(
-        store, "database", [f"frame {f.frame} of scene {f.scene_id}" for f in database]
-    )
+    repeated = _find_repeated("retrieval", queries) + _find_repeated("database", database)
+    _refuse(store, "duplicate-record", repeated)
     frames = set(database)
     lacking = [
-        f"database test lacks frame {q.target.frame} of scene {q.target.scene_id}, the target of "
-        f"query {q.query_id}"
+        f"database test lacks frame {q.target.name}, the target of query {q.query_id}"
         for q in queries
         if q.target not in frames
     ]
     _refuse(store, "missing-target", lacking)
-    _refuse_leaks(store, queries, "train")
+    _refuse(store, "split-leak", _find_leaks(store, queries, "train"))
 
 
-def _refuse_leaks(store: Store, queries: Sequence[RetrievalQuery], other: str) -> None:
-    """Refuse queries of one split that refer to a scene of the other one."""
+def _find_leaks(store: Store, queries: Sequence[RetrievalQuery], other: str) -> list[str]:
+    """Describe the references of one split's queries to scenes of the other split."""
     scenes = {*store.scene_ids(other), *(q.scene_id for q in store.retrieval(other))}
-    leaked = [
+    return [
         f"query {q.query_id} of the {q.split} split refers to scene {f.scene_id} of the {other} "
         "split, which would invalidate the evaluation"
         for q in queries
         for f in (FrameRef(q.scene_id, q.prefix_stop), q.target, *q.hard_negatives)
         if f.scene_id in scenes
     ]
-    _refuse(store, "split-leak", leaked)
 
 
-def _refuse_repeated(store: Store, table: str, names: Sequence[str]) -> None:
-    counts = Counter(names)
-    repeated = [f"{table}.parquet has {name} {n} times" for name, n in counts.items() if n > 1]
-    _refuse(store, "duplicate-record", repeated)
+def _find_repeated(table: str, records: Sequence[RetrievalQuery | FrameRef]) -> list[str]:
+    counts = Counter(record.name for record in records)
+    return [f"{table}.parquet contains {name} {n} times" for name, n in counts.items() if n > 1]
 
 
 def _refuse(store: Store, code: str, problems: Sequence[str], advice: str = "") -> None:

@@ -12,8 +12,8 @@ import numpy as np
 
 from data.records import FPS, FrameRef, RetrievalQuery, Scene
 from data.tracks.quota import CellInputs, named_rng
-from data.tracks.retrieval.future import spell_seconds
-from data.tracks.retrieval.queries import fill_quota
+from data.tracks.retrieval.queries import fill_query_quota
+from data.tracks.selection.time import spell_seconds
 from data.world.displacement import DIAGONAL, on_screen_positions
 
 LONGEST = 2 * FPS
@@ -23,11 +23,8 @@ HORIZONS = (1, 2, 3)
 
 
 def removed_object(scene: Scene, seed: int) -> int | None:
-    """Sample the object to remove, among those whose first contact follows the prefix.
-
-    The object must be on screen at the prefix's end, and the prefix at least a second long. None
-    where no object qualifies.
-    """
+    """Sample the object to remove, among those whose first contact follows a prefix of at least a
+    second and that are on screen at its end. None where there is no such object."""
     stops = {k: _prefix_stop(scene, k) for k in range(len(scene.objects))}
     on_screen = on_screen_positions(scene)[1]
     eligible = [k for k, stop in stops.items() if stop is not None and on_screen[stop, k]]
@@ -59,7 +56,7 @@ def removal_displacement(scene: Scene, absent: Scene, removed: int) -> np.ndarra
 
 
 def make_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
-    """Make the counterfactual queries, and count the dropped ones; see `queries.fill_quota`.
+    """Make the counterfactual queries, and count the dropped ones; see `fill_query_quota`.
 
     The removal displaces another object in the target. The first hard negative is the factual scene
     at the target's frame; the others are wrong-time frames of the counterfactual scene.
@@ -69,7 +66,7 @@ def make_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
         removed = removed_object(scene, cell.seed)
         if removed is None:
             return
-        absent, phrase = absent_id(scene.scene_id, removed), scene.objects[removed].phrase
+        absent, phrase = absent_id(scene.scene_id, removed), scene.objects[removed].noun_phrase
         displacement = removal_displacement(scene, cell.scene_of(absent), removed)
         stop = _prefix_stop(scene, removed)
         for seconds in HORIZONS:
@@ -93,4 +90,4 @@ def make_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
                     removed_object=phrase,
                 )
 
-    return fill_quota("counterfactual", cell, queries_of)
+    return fill_query_quota("counterfactual", cell, queries_of)

@@ -25,13 +25,13 @@ from data.world.displacement import on_screen_positions
 TWIN_DISTANCE = 1.0
 """Frames are twins where no object's position differs by this much, px at 336 x 336."""
 VISIBLE_FRACTIONS = (0.02, 0.08)
-"""An object counts as visible from this fraction on. Frames are twins under either bound, so that
-an object near one of them does not make twins differ."""
+"""Minimum visible fractions of an object that counts as visible. Frames are twins if they agree
+under either bound, so that a fraction near one bound does not make twins differ."""
 
 
 @dataclass
 class UniqueFrames:
-    """Frames without twins, and the number of frames that were left out as twins."""
+    """Frames of which no two are twins, and the number of frames that were left out as twins."""
 
     scene_of: Callable[[str], Scene]
     frames: dict[FrameRef, None] = field(default_factory=dict)

@@ -11,7 +11,8 @@ from functools import partial
 
 from data.records import FPS, FrameRef, RetrievalQuery, Scene
 from data.tracks.quota import CellInputs
-from data.tracks.retrieval.queries import fill_quota
+from data.tracks.retrieval.queries import fill_query_quota
+from data.tracks.selection.time import spell_seconds
 from data.world.events import collision_frames
 
 EVENTS_PER_SCENE = 3
@@ -19,6 +20,11 @@ EVENTS_PER_SCENE = 3
 ONE_PER_SCENE = (4, 5, 6)
 """Builders that use one event of a scene (paper, retrieval construction)."""
 NEXT_COLLISION = "Which frame shows the scene at the moment of the next collision?"
+AFTER_COLLISION = (
+    "The observation ends at a collision. Which frame shows the scene 1 second after that "
+    "collision?"
+)
+AFTER_NEXT_COLLISION = "Which frame shows the scene half a second after the next collision?"
 
 Choice = tuple[str, int, int, int]
 """A question about a scene, the first and last frame of its prefix, and its target frame."""
@@ -56,32 +62,19 @@ def _is_next(scene: Scene, stop: int, event: int) -> bool:
     return min((c.frame for c in scene.collisions if c.frame > stop), default=None) == event
 
 
-def spell_seconds(count: int) -> str:
-    return "1 second" if count == 1 else f"{count} seconds"
-
-
 BUILDERS: dict[int, Callable[[Scene], Iterator[Choice]]] = {
     1: _clip_end,
     2: _clock,
     3: _next_event,
-    4: partial(
-        _around_event,
-        0,
-        "The observation ends at a collision. Which frame shows the scene 1 second after that "
-        "collision?",
-    ),
+    4: partial(_around_event, 0, AFTER_COLLISION),
     5: partial(_around_event, FPS, NEXT_COLLISION),
-    6: partial(
-        _around_event,
-        FPS // 2,
-        "Which frame shows the scene half a second after the next collision?",
-    ),
+    6: partial(_around_event, FPS // 2, AFTER_NEXT_COLLISION),
 }
 """Each builder yields all questions that it can ask about a scene."""
 
 
 def make_queries(builder: int, cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
-    """Make the queries of one builder, and count the dropped ones; see `queries.fill_quota`."""
+    """Make the queries of one builder, and count the dropped ones; see `fill_query_quota`."""
 
     def queries_of(scene: Scene) -> Iterator[RetrievalQuery]:
         for question, start, stop, target in BUILDERS[builder](scene):
@@ -98,4 +91,4 @@ def make_queries(builder: int, cell: CellInputs) -> tuple[list[RetrievalQuery], 
                 target=FrameRef(scene.scene_id, target),
             )
 
-    return fill_quota(str(builder), cell, queries_of, builder in ONE_PER_SCENE)
+    return fill_query_quota(str(builder), cell, queries_of, builder in ONE_PER_SCENE)

@@ -1,4 +1,4 @@
-"""Parts that the builders of queries share: quotas spread over scenes, and hard negatives."""
+"""Functions that all builders of queries share: filling a quota, and hard negatives."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DENSE_STEP = 4
 """Step in frames of the denser grid for targets whose preferred offsets do not suffice."""
 
 
-def fill_quota(
+def fill_query_quota(
     builder: str,
     cell: CellInputs,
     queries_of: Callable[[Scene], Iterable[RetrievalQuery]],
@@ -25,8 +25,7 @@ def fill_quota(
 ) -> tuple[list[RetrievalQuery], int]:
     """Make the queries of one builder up to its quota in each split.
 
-    Scenes are in a seeded order and give one query each before any gives a second one, so that
-    queries spread over scenes.
+    Scenes take turns in a seeded order: each gives one query before any gives a second one.
 
     Args:
         queries_of: Returns the queries that a scene allows, without their wrong-time negatives.

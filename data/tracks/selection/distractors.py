@@ -1,14 +1,8 @@
-"""Selection items with distractors that differ visibly from the target.
-
-A family is a module (or an object) with `CELLS`, its cells by subtype, and two functions:
-
-    timings(subtype, scene) -> list[Timing]                          where an item of a cell may lie
-    make_item(subtype, scene, timing, rng, picker) -> item or None   the item at one of these
-"""
+"""Selection items with distractors that differ visibly from the target."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -39,8 +33,23 @@ class Timing:
     event: int | None = None
 
     def outside_prefix(self, frames: Iterable[int]) -> list[int]:
-        """The frames that are not in the prefix: a frame of it is recognisable by comparison."""
+        """The given frames outside the prefix; a model could recognise a frame that it has seen."""
         return [int(f) for f in frames if not self.start <= f <= self.stop]
+
+
+@dataclass(frozen=True)
+class Family:
+    """How the items of a family are made.
+
+    Attributes:
+        cells: Construction cells by subtype.
+        timings: Returns the timings that items of a subtype can have in a scene.
+        make_item: Makes the item of a subtype at one of these timings, or returns None.
+    """
+
+    cells: Mapping[str, Any]
+    timings: Callable[[str, Scene], list[Timing]]
+    make_item: Callable[..., SelectionItem | None]
 
 
 @dataclass
@@ -48,10 +57,10 @@ class DistractorPicker:
     """Makes items whose candidates differ visibly from each other.
 
     Attributes:
-        least: Smallest displacement between two candidates, px at 336 x 336, in some object.
+        least: Minimum displacement of some object between two candidates, px at 336 x 336.
         scene_ids: Scenes of the split; cross-scene distractors come from these.
         scene_of: Loads a scene by its id.
-        dropped: Number of targets for which no three such distractors exist.
+        dropped: Number of targets that had too few such distractors.
     """
 
     least: float
@@ -71,7 +80,7 @@ class DistractorPicker:
         suite: str = "dynapix",
         **fields: Any,
     ) -> SelectionItem | None:
-        """Make an item from the first distractors of each pool that differ enough.
+        """Make an item from the first distractors of each pool that differ by `least` px.
 
         Args:
             about: Indices of the objects that must differ; any object by default.
@@ -137,10 +146,10 @@ class DistractorPicker:
 def balance_in_time(
     pool: Iterable[Candidate], target: int, rng: np.random.Generator
 ) -> tuple[Pool, Pool, Pool]:
-    """Divide a scene's pool so that 0 to 3 distractors, at random, precede the target.
+    """Divide a scene's pool so that a random number of distractors, 0 to 3, precede the target.
 
-    Without this balance the target's place in time among the candidates would reveal the answer.
-    The last pool replaces frames that the other two lack.
+    Otherwise the order of the candidates in time would reveal the answer. The last pool is used
+    where the other two have too few frames.
     """
     pool = list(pool)
     earlier = int(rng.integers(4))

@@ -14,6 +14,7 @@ import numpy as np
 from data.records import Candidate, Scene, SelectionItem
 from data.tracks.selection.distractors import (
     DistractorPicker,
+    Family,
     Timing,
     balance_in_time,
     scene_candidates,
@@ -97,3 +98,6 @@ def _wrong_frames(
         return rng.permutation(timing.outside_prefix(pool))
     similar = np.argsort(object_match_scores(scene, target), kind="stable")
     return timing.outside_prefix(similar[similar != target])
+
+
+FAMILY = Family(CELLS, timings, make_item)

@@ -7,6 +7,7 @@ import numpy as np
 from data.records import SELECTION_SECOND, Scene, SelectionItem
 from data.tracks.selection.distractors import (
     DistractorPicker,
+    Family,
     Timing,
     balance_in_time,
     scene_candidates,
@@ -17,11 +18,14 @@ CELLS = {"in_1s": 1, "in_2s": 2}
 """Seconds from the observation's end to the target, by subtype."""
 
 
+def spell_seconds(count: int) -> str:
+    return "1 second" if count == 1 else f"{count} seconds"
+
+
 def question(seconds: int) -> str:
-    spelled = "1 second" if seconds == 1 else f"{seconds} seconds"
     return (
         "Watch the 1-second observation video. Which image best shows what the scene will look "
-        f"like {spelled} after the observation ends?"
+        f"like {spell_seconds(seconds)} after the observation ends?"
     )
 
 
@@ -52,3 +56,6 @@ def make_item(
         distractors="same_time",
         horizon=horizon,
     )
+
+
+FAMILY = Family(CELLS, timings, make_item)

@@ -17,6 +17,7 @@ from conf.schema.benchmark import WINDOW_DIFFICULTIES, WINDOW_FAMILIES, WINDOW_H
 from data.records import Scene, SelectionItem
 from data.tracks.selection.distractors import (
     DistractorPicker,
+    Family,
     Timing,
     balance_in_time,
     scene_candidates,
@@ -98,3 +99,6 @@ def subject_objects(cell: WindowCell, scene: Scene, timing: Timing) -> tuple[int
     moved = np.linalg.norm(positions[target] - positions[stop], axis=-1)
     moved[~(on_screen[target] & on_screen[stop])] = 0
     return (int(moved.argmax()),) if moved.max() > 0 else ()
+
+
+FAMILY = Family(CELLS, timings, make_item)

@@ -108,21 +108,21 @@ def test_a_killed_export_resumes_and_gives_the_same_bytes(
     monkeypatch.setattr(huggingface, "SHARD_GROUPS", 5)
     folder = tmp_path / "copy" / "micro"
     shutil.copytree(micro_store.folder, folder)
-    hurt = Store(folder, micro_store.manifest)
+    damaged = Store(folder, micro_store.manifest)
     # A test scene: every shard of the training items is written by then.
-    broken = folder / "scenes" / f"{hurt.scene_ids('test')[0]}.npz"
+    broken = folder / "scenes" / f"{damaged.scene_ids('test')[0]}.npz"
     whole = broken.read_bytes()
     broken.write_bytes(whole[: len(whole) // 2])
     shutil.rmtree(folder / "frames")
     out = tmp_path / "out" / "micro"
     with pytest.raises(Exception, match="not a zip"):
-        ensure_export(hurt, out, images=True)
+        ensure_export(damaged, out, images=True)
     assert not out.exists()
     done = sorted(out.parent.glob(".micro.partial/*/train-*.parquet"))
     assert done
     made = [p.stat().st_mtime_ns for p in done]
     broken.write_bytes(whole)
-    ensure_export(hurt, out, images=True)
+    ensure_export(damaged, out, images=True)
     assert [(out / p.relative_to(p.parents[1])).stat().st_mtime_ns for p in done] == made
     assert [p.name for p in out.parent.iterdir()] == ["micro"]
     names = sorted(p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file())

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data.publish.contact_sheets import ExampleRows, draw_sheet
+from data.publish.contact_sheets import SheetRows, draw_sheet
 from data.publish.gallery import draw_sheets, render_page
 from data.records import LETTERS
 from data.render.frame_cache import FrameReader
 from data.store import Store
-from data.world.displacement import cross_scene_displacement
 
 pytestmark = pytest.mark.slow
 
@@ -43,9 +42,9 @@ def test_the_seed_determines_the_sheets(micro_store, sheets) -> None:
 
 
 def test_an_item_row_has_its_candidates_answer_and_displacements(micro_store) -> None:
-    rows, frames = ExampleRows(micro_store), FrameReader(micro_store)
+    rows, frames = SheetRows(micro_store), FrameReader(micro_store)
     for item in micro_store.selection("test")[::7]:
-        row = rows.item(item)
+        row = rows.make(item)
         assert [c.is_answer for c in row.candidates] == [k == item.answer for k in range(4)]
         for letter, cell, candidate in zip(LETTERS, row.candidates, item.candidates, strict=True):
             assert np.array_equal(cell.image, frames.array(candidate.scene_id, candidate.frame))
@@ -59,15 +58,16 @@ def test_an_item_row_has_its_candidates_answer_and_displacements(micro_store) ->
 
 
 def test_a_counterfactual_row_shows_one_moment_with_and_without_the_object(micro_store) -> None:
-    rows, frames = ExampleRows(micro_store), FrameReader(micro_store)
+    rows, frames = SheetRows(micro_store), FrameReader(micro_store)
     for query in micro_store.retrieval(pool="counterfactual"):
-        factual, target = rows.query(query).candidates[:2]
+        factual, target, *wrong = rows.make(query).candidates
+        assert all("px away" in cell.caption[1] for cell in wrong)
         frame = query.target.frame
         assert np.array_equal(factual.image, frames.array(query.scene_id, frame))
         assert np.array_equal(target.image, frames.array(query.target.scene_id, frame))
         assert (factual.is_answer, target.is_answer) == (False, True)
         scene = micro_store.scene(query.scene_id)
-        removed = [o.phrase for o in scene.objects].index(query.removed_object)
+        removed = [o.noun_phrase for o in scene.objects].index(query.removed_object)
         share = scene.image_positions[frame, removed] / scene.image_size
         assert factual.ring == pytest.approx(share * factual.image.size)
         assert target.ring is None
@@ -75,7 +75,7 @@ def test_a_counterfactual_row_shows_one_moment_with_and_without_the_object(micro
 
 def test_the_answer_has_a_green_frame(micro_store) -> None:
     item = micro_store.selection("test")[0]
-    row = ExampleRows(micro_store).item(item)
+    row = SheetRows(micro_store).make(item)
     sheet = np.asarray(Image.open(io.BytesIO(draw_sheet([row]))).convert("RGB"))
     columns = np.flatnonzero((sheet == (26, 127, 55)).all(-1).any(0)) / sheet.shape[1]
     # Eight frames, the last four after a gap: the answer's column is the only green one.
@@ -103,12 +103,3 @@ def test_the_page_links_every_sheet_once_and_nothing_else(micro_store, sheets) -
     inside = [f"#{name}" for name in found["id"]]
     assert sorted(found["href"]) == sorted(inside + found["src"])
     assert len(set(found["id"])) == len(sheets)
-
-
-def test_captions_give_displacements_from_the_target(micro_store) -> None:
-    query = micro_store.retrieval("test")[0]
-    scene = micro_store.scene(query.scene_id)
-    cells = ExampleRows(micro_store).query(query).candidates[1:]
-    for cell, frame in zip(cells, query.hard_negatives, strict=True):
-        away = cross_scene_displacement(scene, query.target.frame, scene, frame.frame)
-        assert f"{away:.0f} px away" in cell.caption[1]

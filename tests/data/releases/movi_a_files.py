@@ -22,7 +22,7 @@ def movi_example(contacts: list[tuple[float, int, int, float, float]] | None = N
     z = np.stack([5 - 0.5 * 9.81 * s**2] * 3)
     half = np.stack([s, s, s]) / 2
     return {
-        "looks": [
+        "appearances": [
             ("cube", "large", "metal", "red"),
             ("sphere", "small", "rubber", "cyan"),
             ("cylinder", "small", "metal", "red"),
@@ -47,7 +47,7 @@ def write_movi_folder(folder: Path, example: dict) -> Path:
             "visibility": example["visibility"][k].tolist(),
             **{key: example[key][k].tolist() for key in arrays},
         }
-        for k, (shape, size, material, color) in enumerate(example["looks"])
+        for k, (shape, size, material, color) in enumerate(example["appearances"])
     ]  # fmt: skip
     metadata = {
         "flags": {},
@@ -77,14 +77,14 @@ def write_movi_folder(folder: Path, example: dict) -> Path:
 def movi_features(example: dict) -> dict[str, Any]:
     """Return the example's features as TensorFlow Datasets flattens them, by name."""
     contacts = example["contacts"]
-    shapes, sizes, materials, colors = zip(*example["looks"], strict=True)
+    shapes, sizes, materials, colors = zip(*example["appearances"], strict=True)
     arrays = ("positions", "quaternions", "velocities", "angular_velocities", "image_positions")
     return {
         "metadata/video_name": [b"123"],
         "metadata/width": [256],
         "metadata/height": [256],
         "metadata/num_frames": [24],
-        "metadata/num_instances": [len(example["looks"])],
+        "metadata/num_instances": [len(example["appearances"])],
         "metadata/depth_range": [0.5, 20.0],
         **{f"instances/{key}": example[key].ravel().tolist() for key in arrays},
         "instances/visibility": example["visibility"].ravel().tolist(),

@@ -17,8 +17,11 @@ COLORS = np.array([[200, 10, 30], [20, 220, 90], [1, 2, 3]], np.uint8)
 
 
 def physion_trial(frames: int = 60) -> dict[str, Any]:
-    """Three objects at rest on the floor, y up. `pairs`, `states`, `room` and `points` are what
-    each frame lists: touching ids, their states, ids that touch walls or floor, (normal, point)."""
+    """Three objects at rest on the floor, with y up.
+
+    For each frame, `pairs` lists the ids in contact, `states` their states, `environment` the ids
+    that touch walls or floor, and `points` the (normal, point) of these contacts.
+    """
     places = np.tile(np.float32([[-1, 0.5, 0], [0, 0.5, 1], [1, 0.5, 0]]), (frames, 1, 1))
     return {
         "stimulus_name": "pilot_it2_collision_box_0003",
@@ -29,7 +32,7 @@ def physion_trial(frames: int = 60) -> dict[str, Any]:
         "angular_velocities": np.zeros((frames, 3, 3), np.float32),
         "pairs": [[] for _ in range(frames)],
         "states": [[] for _ in range(frames)],
-        "room": [[] for _ in range(frames)],
+        "environment": [[] for _ in range(frames)],
         "points": [[] for _ in range(frames)],
         "hidden": {},
         "camera": (np.diag([1.0, 1.0, -1.0, 1.0]), np.float64(PROJECTION)),
@@ -51,26 +54,26 @@ def write_physion(
         static["model_names"] = trial["models"]
         static["object_segmentation_colors"] = COLORS
         static["mass"] = np.ones(3, np.float32)
-        moments = file.create_group("frames")
+        groups = file.create_group("frames")
         for k in range(len(trial["positions"])):
-            _write_moment(moments.create_group(f"{k + first:04d}"), trial, k, states, suffix)
+            _write_frame(groups.create_group(f"{k + first:04d}"), trial, k, states, suffix)
     return path
 
 
-def _write_moment(moment: h5py.Group, trial: dict, k: int, states: bool, suffix: str) -> None:
+def _write_frame(group: h5py.Group, trial: dict, k: int, states: bool, suffix: str) -> None:
     segments = np.zeros((32, 48, 3), np.uint8)
     for n, color in enumerate(COLORS):
         if n not in trial["hidden"].get(k, ()):
             segments[4:8, 10 * n : 10 * n + 4] = color
-    images = moment.create_group("images")
+    images = group.create_group("images")
     for key, image in (("_img", picture(k)), ("_id", Image.fromarray(segments))):
         images[key + suffix] = np.frombuffer(png(image), np.uint8)
-    objects = moment.create_group("objects")
+    objects = group.create_group("objects")
     for key in ("positions", "rotations"):
         objects[key + suffix] = trial[key][k]
     for key in ("velocities", "angular_velocities"):
         objects[key] = trial[key][k]
-    collisions = moment.create_group("collisions")
+    collisions = group.create_group("collisions")
     collisions["object_ids"] = np.array(trial["pairs"][k], np.int32).reshape(-1, 2)
     collisions["relative_velocities"] = np.zeros((len(trial["pairs"][k]), 3), np.float32)
     # One point more than pairs: the points of all collisions are joined.
@@ -78,13 +81,13 @@ def _write_moment(moment: h5py.Group, trial: dict, k: int, states: bool, suffix:
     if states:
         listed = np.array(trial["states"][k], "S5")
         collisions["states"] = listed if len(listed) else listed.reshape(0, 1)
-    room = moment.create_group("env_collisions")
-    at_room = np.array(trial["room"][k], np.int32)
-    room["object_ids"] = at_room if len(at_room) else at_room.reshape(0, 1)
-    room["contacts"] = np.array(trial["points"][k], np.float32).reshape(-1, 2, 3)
-    cameras = moment.create_group("camera_matrices")
+    environment = group.create_group("env_collisions")
+    listed_ids = np.array(trial["environment"][k], np.int32)
+    environment["object_ids"] = listed_ids if len(listed_ids) else listed_ids.reshape(0, 1)
+    environment["contacts"] = np.array(trial["points"][k], np.float32).reshape(-1, 2, 3)
+    cameras = group.create_group("camera_matrices")
     for key, matrix in zip(("camera_matrix", "projection_matrix"), trial["camera"], strict=True):
         cameras[key + suffix] = np.float32(matrix).ravel()
-    labels = moment.create_group("labels")
+    labels = group.create_group("labels")
     labels["target_delta_position"] = np.float32([9, 9, 9])
     labels["target_on_ground"] = True

@@ -23,7 +23,7 @@ def test_a_scene_has_the_values_of_its_annotation(tmp_path: Path) -> None:
     (path,) = clevrer.list_scenes(tmp_path)
     scene = clevrer.read_scene(path, tmp_path, "test")
     assert (scene.scene_id, scene.split, scene.fps) == ("clevrer-00007", "test", 25)
-    assert [o.phrase for o in scene.objects] == ["red metal cube", "blue rubber sphere"]
+    assert [o.noun_phrase for o in scene.objects] == ["red metal cube", "blue rubber sphere"]
     assert scene.collisions == (Collision(20, (0, 1)),)
     np.testing.assert_allclose(scene.positions[40, 1], [0.5, 1.0, 0.2], rtol=1e-6)
     np.testing.assert_allclose(scene.velocities[40, 1], [0, 1.25, 0])
@@ -56,9 +56,6 @@ DEFECTS: dict[str, tuple[Callable[[dict], object], str]] = {
     "quaternions": (
         lambda r: r["motion_trajectory"][3]["objects"][1].update(orientation=[0.0, 0.0, 0.0, 1.0]),
         "objects.1.orientation",
-    ),
-    "no velocity": (
-        lambda r: r["motion_trajectory"][3]["objects"][1].pop("velocity"), "objects.1.velocity"
     ),
     "a frame without an object": (
         lambda r: r["motion_trajectory"][9]["objects"].pop(0), "frame 9"

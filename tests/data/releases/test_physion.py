@@ -28,7 +28,7 @@ def test_a_scene_has_the_values_of_its_trial(tmp_path: Path) -> None:
     scene = read(tmp_path, physion_trial())
     assert (scene.scene_id, scene.scenario) == ("physion-Collide-Collide_box_0003", "Collide")
     assert (scene.frames, scene.fps, scene.image_size) == (60, 100, (48, 32))
-    assert [o.phrase for o in scene.objects] == ["bowl", "cone", "bowl"]
+    assert [o.noun_phrase for o in scene.objects] == ["bowl", "cone", "bowl"]
     assert np.isnan(scene.visible_fraction).all()
     assert scene.footage == "Collide/box/0003.hdf5"
     images = physion.load_images(scene, tmp_path, [59, 0])
@@ -166,13 +166,13 @@ def test_a_landing_is_the_first_floor_contact_after_a_flight(tmp_path: Path) -> 
     trial = physion_trial()
     for frame in range(60):
         if frame >= 25:
-            trial["room"][frame].append(A)
+            trial["environment"][frame].append(A)
             trial["points"][frame].append((UP, (-1.1, 0.0, 0.0)))
         if frame not in range(30, 50):
-            trial["room"][frame].append(C)
+            trial["environment"][frame].append(C)
             trial["points"][frame].append((UP, (1.1, 0.001, 0.0)))
     # A bounce lands once.
-    trial["room"][27], trial["points"][27] = [], []
+    trial["environment"][27], trial["points"][27] = [], []
     assert read(tmp_path, trial).landings == (Landing(25, 0), Landing(50, 2))
 
 
@@ -182,7 +182,7 @@ def test_a_landing_is_the_first_floor_contact_after_a_flight(tmp_path: Path) -> 
 )
 def test_walls_shelves_and_ceilings_are_not_the_ground(tmp_path: Path, normal, point) -> None:
     trial = physion_trial()
-    trial["room"][30], trial["points"][30] = [A], [(normal, point)]
+    trial["environment"][30], trial["points"][30] = [A], [(normal, point)]
     assert read(tmp_path, trial).landings == ()
 
 
@@ -190,14 +190,14 @@ def test_any_contact_ends_a_flight(tmp_path: Path) -> None:
     trial = physion_trial()
     touch(trial, 20, 28, [A, B])
     for frame in (31, 40):
-        trial["room"][frame], trial["points"][frame] = [A], [(UP, (-1.0, 0.0, 0.0))]
+        trial["environment"][frame], trial["points"][frame] = [A], [(UP, (-1.0, 0.0, 0.0))]
     assert read(tmp_path, trial).landings == (Landing(40, 0),)
 
 
 def test_a_contact_point_is_assigned_to_the_nearest_object(tmp_path: Path) -> None:
     """A lands while C, also after a flight, touches a wall high above the floor."""
     trial = physion_trial()
-    trial["room"][30] = [C, A]
+    trial["environment"][30] = [C, A]
     trial["points"][30] = [(SIDE, (1.2, 0.9, 0.0)), (UP, (-0.9, 0.0, 0.1))]
     assert read(tmp_path, trial).landings == (Landing(30, 0),)
 

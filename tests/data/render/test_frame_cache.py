@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data.render import frame_cache
-from data.render.frame_cache import FrameCache, FrameReader, load_frames, save_frames
+from data.render.frame_cache import FrameReader, load_frames, render_frames, save_frames
 
 
 def test_decoded_frames_are_bounded_for_any_access_pattern(micro_store, monkeypatch) -> None:
@@ -36,7 +36,8 @@ def test_decoded_frames_are_exact_and_not_shared(micro_store) -> None:
 
 def test_stored_frame_equals_a_new_rendering(benchmark_store) -> None:
     item = benchmark_store.selection("train")[0]
-    rendered = FrameCache.of(benchmark_store).render(item.scene_id, [item.target_frame])
+    scene, config = benchmark_store.scene(item.scene_id), benchmark_store.manifest["config"]
+    rendered = render_frames(scene, [item.target_frame], config)
     stored = FrameReader(benchmark_store).array(item.scene_id, item.target_frame)
     np.testing.assert_array_equal(rendered[item.target_frame], stored)
 

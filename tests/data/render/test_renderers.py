@@ -32,14 +32,12 @@ def test_versions_need_no_renderer_package() -> None:
     code = (
         "import sys\n"
         "from data.render import RENDERERS\n"
-        "print(*(renderer.version for renderer in RENDERERS.values()), sep='\\n')\n"
+        "print([renderer.version for renderer in RENDERERS.values()])\n"
         "assert not {'pybullet', 'bpy'} & set(sys.modules)"
     )
     run = run_child([sys.executable, "-c", code], check=True)
-    bullet, blender_version = run.stdout.splitlines()
-    assert bullet == "bullet-1"
-    assert blender.BPY in blender_version
-    assert str(blender.SAMPLES) in blender_version
+    assert "bullet-1" in run.stdout
+    assert f"bpy {blender.BPY}, {blender.SAMPLES} samples" in run.stdout
 
 
 def test_shadow_is_confined_to_its_box() -> None:

@@ -232,7 +232,7 @@ def test_counterfactual_targets_differ_from_the_factual_scene(benchmark_store) -
     assert {q.split for q in queries} == {"train", "test"}
     for q in queries:
         scene, absent = benchmark_store.scene(q.scene_id), benchmark_store.scene(q.target.scene_id)
-        k = [o.phrase for o in scene.objects].index(q.removed_object)
+        k = [o.noun_phrase for o in scene.objects].index(q.removed_object)
         assert q.target.scene_id == f"{q.scene_id}-without-{k}"
         assert absent.objects == scene.objects[:k] + scene.objects[k + 1 :]
         assert absent.split == scene.split == q.split

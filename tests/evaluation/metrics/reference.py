@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from evaluation.metrics.ranking import count_ranks, query_metrics, target_scores
+from evaluation.metrics.ranking import count_above_and_equal, query_metrics, target_scores
 
 
 def scene_interval(
@@ -22,6 +22,12 @@ def scene_interval(
     results = [statistic(values[np.concatenate([rows[i] for i in picks])]) for picks in sampled]
     low, high = np.percentile(results, [2.5, 97.5])
     return float(low), float(high)
+
+
+def count_ranks(scores: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Count the frames above each target and the others tied with it; 0 for a NaN target score."""
+    greater, equal = count_above_and_equal(scores, target_scores(scores, targets))
+    return greater, np.maximum(equal - 1, 0)
 
 
 def matrix_metrics(scores: np.ndarray, targets: np.ndarray, ks: Sequence[int]) -> dict[str, float]:

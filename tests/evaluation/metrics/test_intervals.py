@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from evaluation.metrics.accuracy import accuracy_by_family
-from evaluation.metrics.intervals import SceneBootstrap, macro_by_scene, wilson_interval
+from evaluation.metrics.intervals import SceneBootstrap, macro_by_scene, mean_with_wilson
+from evaluation.metrics.results import accuracy_by_family
 from tests.evaluation.metrics.reference import scene_interval
 
 
@@ -13,11 +13,9 @@ def test_wilson_is_its_formula(successes, n):
     z, p = 1.959963984540054, successes / n
     centre = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
-    assert wilson_interval(successes, n) == pytest.approx((centre - half, centre + half), abs=1e-12)
-
-
-def test_wilson_interval_without_items_is_0_to_1():
-    assert wilson_interval(0, 0) == (0, 1)
+    found = mean_with_wilson(np.full(n, p))
+    assert (found.value, found.n) == (pytest.approx(p), n)
+    assert (found.low, found.high) == pytest.approx((centre - half, centre + half), abs=1e-12)
 
 
 def test_bootstrap_resamples_whole_scenes():

@@ -107,7 +107,7 @@ def test_the_questions_of_a_matched_pair_are_compared(benchmark_store, tmp_path)
         Choices.from_answers("one", "answer", control, answers)
         for control in (None, "candidate_only")
     ]
-    _, result = write_report(choices, items, "any", 0, tmp_path, MATCHED_ANCHOR)
+    _, result = write_report(choices, items, "any", 0, tmp_path, MATCHED_ANCHOR, build="any")
     controls = json.loads((tmp_path / "report.json").read_text())["controls"]
     truth = [by_event.letter for by_event, _ in pair_items(items)]
     matched = [p for p in controls if p["left"] == "event"]

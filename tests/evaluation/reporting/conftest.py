@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ from tests.evaluation.reporting.measured import (
     always_a,
     retrieve_run,
     right,
+    run_report,
     select_run,
     similarity_run,
     trained_student,
@@ -41,3 +44,9 @@ def runs(measured, tmp_path) -> Path:
     """A copy to damage."""
     shutil.copytree(measured, tmp_path / "checkpoints")
     return tmp_path / "checkpoints"
+
+
+@pytest.fixture
+def report(runs, micro_store) -> Callable[..., Path]:
+    """Report these runs with some settings, and return the report's folder."""
+    return partial(run_report, runs, micro_store.folder.parent)

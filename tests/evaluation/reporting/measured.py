@@ -32,7 +32,6 @@ from evaluation.generators.response_log import score_response
 from evaluation.metrics.results import (
     SIMILARITY,
     compare_retrievers,
-    recall_curve,
     retrieval_results,
 )
 from evaluation.reporting.selection_report import Choices, write_report
@@ -74,7 +73,7 @@ def trained_student(root: Path, benchmark, name: str, regime: str) -> None:
     )
     finish(folder, settings, None, {"answer_loss_at_start": 2.0, "answer_loss": 1.0})
     journal = [{"step": k, "loss": 2 - k / 9, "eval_answer_loss": 2 - k / 8} for k in range(5)]
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in journal))
+    write_json_lines(folder / "metrics.jsonl", journal)
 
 
 def select_run(
@@ -104,7 +103,7 @@ def select_run(
     keys = {"key": "k1", "mode": mode}
     lines = [{**keys, "asked": {"control": None, "seed": 0}}]
     lines += [{**keys, "item_id": i.item_id, "text": respond(i), "cut": False} for i in items]
-    (folder / "answers.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_json_lines(folder / "answers.jsonl", lines)
     return folder
 
 
@@ -149,15 +148,14 @@ def retrieve_run(
     finish(root / "contrastive" / name, trained)
     queries = store.standard_test()
     rng = np.random.default_rng(0)
-    rows, curves, found = [], [], {}
+    rows, found = [], {}
     for title in (name, "untrained small"):
         greater = rng.integers(frames, size=(2, len(queries)))
         every = np.ones(len(queries), bool)
         ranks = Ranks((64, 32), greater, np.zeros_like(greater), every, frames, frames, 0.5)
         found[title] = ranks
         rows += retrieval_results(store.name, title, ranks, queries, 0)
-        curves.append(recall_curve(title, ranks))
-    report = {"rows": rows, "build": store.identity, "curves": curves}
+    report = {"rows": rows, "build": store.identity}
     if kind == "retrieve":
         report["differences"] = compare_retrievers(found, queries, 0)
     settings = RetrieveCommand(
@@ -168,8 +166,8 @@ def retrieve_run(
     return root / kind / name
 
 
-def reported(root: Path, store: Path, **settings) -> Path:
-    """The folder of a report over what is below `root`."""
+def run_report(root: Path, store: Path, **settings) -> Path:
+    """Report the runs below `root`, and return the report's folder."""
     folder = root / "report" / "default"
     folder.mkdir(parents=True, exist_ok=True)
     cfg = ReportCommand(checkpoints=str(root), store=str(store), **settings)

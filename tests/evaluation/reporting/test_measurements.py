@@ -8,12 +8,7 @@ from pathlib import Path
 
 from conf.schema import ExportStudyCommand
 from data.records import FAMILIES
-from tests.evaluation.reporting.measured import (
-    finish,
-    read_table,
-    reported,
-    retrieve_run,
-)
+from tests.evaluation.reporting.measured import finish, read_table, retrieve_run, run_report
 from tests.evaluation.study.test_agreement import summarize, vote
 
 
@@ -30,7 +25,7 @@ def test_a_model_that_is_measured_twice_keeps_its_line(runs):
     change_first_row(runs / "select" / "again" / "report.json", macro_interval=macro)
     shutil.copytree(runs / "select" / "cot", runs / "select" / "elsewhere")
     change_first_row(runs / "select" / "elsewhere" / "report.json", benchmark="elsewhere")
-    folder = reported(runs, runs, items=1)
+    folder = run_report(runs, runs, items=1)
     for name, line in (("transfer", "cot (reasoning)"), ("ablation", "full student (cot)")):
         table = read_table(folder, name)
         [row] = [row for row in table.splitlines() if row.startswith(f"| {line} |")]
@@ -38,15 +33,15 @@ def test_a_model_that_is_measured_twice_keeps_its_line(runs):
         assert "cot, cot" in table
 
 
-def test_a_common_base_has_one_curve_and_two_runs_have_names(runs, micro, micro_store):
+def test_a_common_base_has_one_row_and_two_runs_have_names(runs, micro, micro_store, report):
     retrieve_run(runs, micro_store, micro, "other")
-    folder = reported(runs, micro_store.folder.parent, runs=["retrieve/*"], items=1)
-    svg = (folder / "figures" / "recall-micro.svg").read_text()
-    assert svg.count(">untrained small<") == 1
-    assert svg.count(">emb<") == svg.count(">other<") == 1
+    folder = report(runs=["retrieve/*"], items=1)
+    table = read_table(folder, "distillation-retrieval-micro")
+    assert table.count("| untrained small |") == 1
+    assert table.count("| emb |") == table.count("| other |") == 1
 
 
-def test_the_majority_vote_of_the_same_build_is_a_row_that_does_not_compete(runs, micro_store):
+def test_the_majority_vote_of_the_same_build_has_a_row_that_is_not_bold(runs, micro_store, report):
     votes = [vote(name, k, 0, FAMILIES[k % 3]) for k in range(6) for name in ("A1", "A2")]
     found = {
         "benchmark": "micro",
@@ -54,12 +49,12 @@ def test_the_majority_vote_of_the_same_build_is_a_row_that_does_not_compete(runs
         **summarize(votes, 6, ["A1", "A2"]),
     }
     finish(runs / "export_study" / "pilot", ExportStudyCommand(run="pilot"), found)
-    folder = reported(runs, micro_store.folder.parent, items=0)
+    folder = report(items=0)
     # Every vote is correct, and no cell is bold.
     whole = " | ".join(["100.0"] * 5)
     row = f"| Majority vote, pilot | {whole} | - | 6 |"
     assert row in read_table(folder, "selection-micro")
     for other in ({"benchmark": "elsewhere"}, {"build": "before"}):
         (runs / "export_study" / "pilot" / "report.json").write_text(json.dumps({**found, **other}))
-        folder = reported(runs, micro_store.folder.parent, items=0)
+        folder = report(items=0)
         assert "Majority vote, pilot" not in read_table(folder, "selection-micro")

@@ -67,9 +67,8 @@ def choose(browser: webdriver.Chrome, **values: str) -> list[str]:
 
 
 def items_of(browser: webdriver.Chrome) -> list[dict]:
-    return json.loads(browser.execute_script("return document.getElementById('data').textContent"))[
-        "items"
-    ]
+    data = browser.execute_script("return document.getElementById('data').textContent")
+    return json.loads(data)["items"]
 
 
 @pytest.mark.parametrize("width", [360, 1280])
@@ -164,7 +163,5 @@ def test_page_works_by_keyboard(chromium, page):
     before = len(chromium.execute_script(SHOWN))
     chromium.switch_to.active_element.send_keys(Keys.ENTER)
     assert len(chromium.execute_script(SHOWN)) == 2 * before
-    assert (
-        chromium.switch_to.active_element.get_attribute("data-id")
-        == (chromium.execute_script(SHOWN)[before])
-    )
+    focused = chromium.switch_to.active_element.get_attribute("data-id")
+    assert focused == chromium.execute_script(SHOWN)[before]

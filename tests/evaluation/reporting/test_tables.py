@@ -10,27 +10,22 @@ import pytest
 from PIL import Image
 
 from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
-from evaluation.metrics.accuracy import accuracy_by_family
-from evaluation.metrics.intervals import wilson_interval
+from evaluation.metrics.intervals import mean_with_wilson
 from evaluation.metrics.ranking import query_metrics
 from evaluation.metrics.results import (
     RECALLS,
     UNTRAINED,
     RetrievalResult,
     SelectionResult,
+    accuracy_by_family,
     compare_retrievers,
     from_json,
-    recall_curve,
     retrieval_results,
-    selection_result,
 )
 from evaluation.reporting import figures
 from evaluation.reporting.reference import COT_STUDENT
-from evaluation.reporting.tables import (
-    rank_differences_table,
-    retrieval_table,
-    selection_table,
-)
+from evaluation.reporting.selection_report import Choices, selection_result
+from evaluation.reporting.tables import rank_differences_table, retrieval_table, selection_table
 from evaluation.retrieval.exact_search import Ranks
 from tests.evaluation.metrics.reference import ranking_metrics, scene_interval
 from train.common.curves import plot_curves
@@ -50,7 +45,8 @@ def selection() -> SelectionResult:
         )
         for k, family in enumerate(FAMILIES)
     ]  # fmt: skip
-    return selection_result("tiny", "one", "answer", items, CREDITS, 1.0, seed=4)
+    choices = Choices("one", "answer", None, CREDITS, ["A"] * len(items))
+    return selection_result(choices, items, "tiny", seed=4)
 
 
 @pytest.fixture(scope="module")
@@ -106,22 +102,13 @@ def test_retrieval_results_are_the_metrics_of_their_queries_with_intervals(ranks
     assert results != retrieval_results("tiny", "one", ranks, queries, seed=4)
 
 
-def test_recall_curve_rises_to_the_ranked_share(ranks, retrievals):
-    curve = recall_curve("one", ranks)
-    assert (curve["ks"][0], curve["ks"][-1]) == (1, 10_000)
-    assert curve["recalls"] == sorted(curve["recalls"])
-    assert curve["recalls"][-1] == pytest.approx(ranks.found.mean())
-    assert curve["recalls"][0] == pytest.approx(retrievals[0].recall_1.value)
-
-
 def test_selection_results_hold_horizons_and_the_interval_of_macro(selection):
     assert list(selection.horizons) == ["8 frames", "16 frames", "1 s", "2 s"]
     for name, share in selection.horizons.items():
         family = "time" if name.endswith("s") and "frames" not in name else "window"
         second = name in ("2 s", "16 frames")
         of = [c for k, c in enumerate(CREDITS) if FAMILIES[k] == family and k % 2 == second]
-        assert share.value == pytest.approx(np.mean(of))
-        assert (share.low, share.high) == wilson_interval(sum(of), len(of))
+        assert share == mean_with_wilson(np.array(of))
     assert selection.families == accuracy_by_family(FAMILIES, CREDITS).families
     assert selection.macro_interval.value == pytest.approx(selection.macro)
     table = str(selection_table([selection]))
@@ -172,15 +159,6 @@ def test_differences_between_retrievers_are_paired_by_query():
     assert "+0.0 to +0.0" in text
 
 
-def test_confusions_count_every_answer_once():
-    pairs = [("A", "A"), ("A", "B"), ("B", None), ("D", "D"), ("D", "D")]
-    counts = figures.count_confusions(pairs)
-    assert counts.sum() == len(pairs)
-    assert counts[0].tolist() == [1, 1, 0, 0, 0]
-    assert counts[1].tolist() == [0, 0, 0, 0, 1]
-    assert np.trace(counts) == 3
-
-
 def test_figures_are_written(selection, retrievals, tmp_path):
     figures.accuracy_figure({"one": selection.families}, tmp_path / "selection.png")
     figures.accuracy_figure({"one": selection.horizons}, tmp_path / "horizons.png")
@@ -197,11 +175,8 @@ def test_figures_are_written(selection, retrievals, tmp_path):
     assert len(list(tmp_path.iterdir())) == 5
 
 
-def test_a_dollar_sign_in_a_name_begins_no_formula(tmp_path):
+def test_a_dollar_sign_in_a_name_begins_no_formula(selection, tmp_path):
     name = r"run $\frac$"
-    curve = {"ks": [1, 10], "recalls": [0.1, 0.5]}
     with matplotlib.rc_context({"svg.fonttype": "none"}):
-        figures.recall_figure({name: curve}, tmp_path / "recall.svg")
-        figures.confusion_figure({name: np.eye(4, 5)}, tmp_path / "confusion.svg")
-    for path in tmp_path.iterdir():
-        assert f">{name}<" in path.read_text()
+        figures.accuracy_figure({name: selection.families}, tmp_path / "accuracy.svg")
+    assert f">{name}<" in (tmp_path / "accuracy.svg").read_text()

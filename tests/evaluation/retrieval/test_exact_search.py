@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.metrics.ranking import count_ranks
 from evaluation.retrieval import exact_search
 from evaluation.retrieval.exact_search import (
     GridEmbeddings,
@@ -14,6 +13,7 @@ from evaluation.retrieval.exact_search import (
     pair_scores,
     row_sums,
 )
+from tests.evaluation.metrics.reference import count_ranks
 
 WIDTHS = (96, 48, 20, 7)
 

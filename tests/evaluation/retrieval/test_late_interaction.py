@@ -7,9 +7,9 @@ import pytest
 from sentence_transformers.util.similarity import maxsim
 
 from evaluation.embedders.cache import pad_rows
-from evaluation.metrics.ranking import count_ranks
 from evaluation.retrieval import late_interaction
 from evaluation.retrieval.late_interaction import late_ranks, pair_scores
+from tests.evaluation.metrics.reference import count_ranks
 
 WIDTH = 24
 

@@ -21,7 +21,7 @@ from data.store import Store
 from tests.user_errors import raises_user_error
 from train import sft
 from train.common.held_out import HELD_OUT, held_out_scenes
-from train.student.dataset import load_datasets, shows_only
+from train.student.dataset import load_datasets, uses_only
 from train.student.trainer import token_mean
 
 
@@ -89,7 +89,7 @@ class OneMore:
 def test_no_training_item_shows_a_held_out_scene(settings, micro_store, regime) -> None:
     held_out = held_out_scenes(micro_store)
     others = set(micro_store.scene_ids("train")) - held_out
-    item = next(i for i in micro_store.selection("train") if shows_only(i, others))
+    item = next(i for i in micro_store.selection("train") if uses_only(i, others))
     candidates = list(item.candidates)
     distractor = replace(candidates[item.answer - 1], scene_id=next(iter(held_out)))
     candidates[item.answer - 1] = distractor

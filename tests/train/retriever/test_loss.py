@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
 
@@ -19,7 +20,7 @@ from torch.nn.functional import cross_entropy, normalize
 from torch.nn.utils.rnn import pad_sequence
 
 from conf.schema import LateConfig, LoraConfig, RetrieverConfig
-from models.lora_kernels import fuse, unfuse
+from models.lora_kernels import fuse
 from models.retriever.embedder import (
     Retriever,
     embed,
@@ -118,14 +119,11 @@ def library(trained, distinct, frames) -> Gradients:
 
 def own(trained, queries, frames, reuse_features=False, **options) -> Gradients:
     """The loss of `train.contrastive`, with its LoRA kernels."""
-    model, cfg = trained
+    model, cfg = copy.deepcopy(trained)
+    fuse(model)
     inputs = RetrieverInputs(model, frames, cfg, bf16=False, reuse_features=reuse_features)
     loss = ranking_loss(model, inputs, cfg, **options)
-    fuse(model)
-    try:
-        return gradients(model, loss, batch_columns(queries, NEGATIVES))
-    finally:
-        unfuse(model)
+    return gradients(model, loss, batch_columns(queries, NEGATIVES))
 
 
 def assert_equal(one: Gradients, two: Gradients) -> None:

@@ -10,7 +10,7 @@ import torch
 from transformers import EvalPrediction, PreTrainedModel, ProcessorMixin
 
 from conf.schema import LoraConfig
-from data.records import FPS, SelectionItem, sample_prefix_frames
+from data.records import SelectionItem
 from models import loading
 from models.attention import BY_FRAME
 from models.student.collator import IGNORED, Collator, Encoded, encode, letter_ids, pad
@@ -121,21 +121,6 @@ def test_logits_of_supervised_positions_give_the_loss_of_all(samples, processor,
         logits[:, :-1].flatten(0, 1), labels[:, 1:].flatten(), ignore_index=IGNORED
     )
     torch.testing.assert_close(loss_of(model, Collator(processor, 1500)(samples)), full)
-
-
-def test_the_prompt_has_each_frame_at_its_time(micro_store, frames, student_cfg, processor) -> None:
-    item = micro_store.selection("train")[0]
-    encoded = encode(
-        selection_sample(item, "answer", "cot", frames, student_cfg.frames), processor, 1500
-    )
-    assert encoded.media["video_grid_thw"].tolist() == [[6, 6, 6]]
-    assert encoded.media["image_grid_thw"].tolist() == [[1, 6, 6]] * 4
-    visible = sample_prefix_frames(item.prefix_start, item.prefix_stop, 12)
-    times = [(a + b) / 2 / FPS for a, b in zip(visible[::2], visible[1::2], strict=True)]
-    text = processor.tokenizer.decode(encoded.input_ids)
-    at = 0
-    for time in times:
-        at = text.index(f"<{time:.1f} seconds>", at) + 1
 
 
 def test_a_sample_over_the_limit_is_refused(samples, processor) -> None:

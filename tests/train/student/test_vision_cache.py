@@ -17,7 +17,7 @@ from tests.user_errors import raises_user_error
 from train import sft
 from train.common.journal import read_journal
 from train.student.trainer import TrainerCollator, token_mean
-from train.student.vision_cache import SLICES, VisionCache, slice_digests
+from train.student.vision_cache import PAIRS, VisionCache, pair_digests
 
 PLENTY = 1 << 40
 
@@ -51,10 +51,10 @@ def loss_and_gradients(
     batch.pop("sample_ids")
     labels = batch.pop("labels")
     if cache is None:
-        batch.pop(SLICES)
+        batch.pop(PAIRS)
     else:
-        cache.replace_pixels(batch)
-        assert not {"pixel_values", "pixel_values_videos", SLICES} & batch.keys()
+        cache.encode_media(batch)
+        assert not {"pixel_values", "pixel_values_videos", PAIRS} & batch.keys()
     model.zero_grad()
     loss = token_mean(model(**batch), labels)
     loss.backward()
@@ -88,7 +88,7 @@ def test_loss_and_gradients_are_those_of_the_pixels(student, samples, share) -> 
     assert share < 1 or part.bytes == whole.bytes
 
 
-def test_cached_slices_do_not_pass_the_tower(student, samples) -> None:
+def test_cached_pairs_do_not_pass_the_tower(student, samples) -> None:
     model, processor = student
     collator = TrainerCollator(Collator(processor, 1500), digests=True)
     cache = VisionCache(model, "fp32", PLENTY)
@@ -97,9 +97,9 @@ def test_cached_slices_do_not_pass_the_tower(student, samples) -> None:
         lambda _, inputs: seen.append(len(inputs[0]))
     )
     loss_and_gradients(model, collator, samples[:2], cache)
-    slices = slice_digests(samples[:2])
+    pairs = pair_digests(samples[:2])
     # 96 px are six patches of 16 px.
-    assert seen == [36 * len(set(slices))]
+    assert seen == [36 * len(set(pairs))]
     loss_and_gradients(model, collator, [samples[1], samples[0]], cache)
     assert len(seen) == 1
 
@@ -109,7 +109,7 @@ def test_digests_depend_on_the_pixels_only(micro_store, frames, student_cfg, pro
 
     def digests(images, clip=()):
         clip = Clip(np.asarray(clip), list(range(len(clip)))) if len(clip) else None
-        return slice_digests([conversation("", images, None, clip)])
+        return pair_digests([conversation("", images, None, clip)])
 
     assert len(set(digests([one, two, one]))) == 2
     assert digests([one]) == digests([one.copy()]) != digests([two])

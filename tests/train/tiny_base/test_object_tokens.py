@@ -24,7 +24,7 @@ def test_words_are_labels_of_the_tokens_at_their_objects(
 ) -> None:
     items = micro_store.selection("train")
     kinds = questions.build_questions(micro_store, items, student_cfg.frames, frames, 0)
-    samples = [questions_of_kind[0].load(0) for questions_of_kind in kinds.values()]
+    samples = [questions_of_kind[0].render(0) for questions_of_kind in kinds.values()]
     batch = ObjectTokenCollator(processor, 1500)(samples)
     plain = Collator(processor, 1500)(samples)
     assert torch.equal(batch["input_ids"], plain["input_ids"])

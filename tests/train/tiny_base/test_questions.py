@@ -26,7 +26,7 @@ def kinds(micro_store, frames, student_cfg) -> dict[str, list[LazySample]]:
 def visible(store: Store, scene_id: str, frame: int) -> dict[str, str]:
     scene = store.scene(scene_id)
     return {
-        o.phrase: object_region(scene, frame, k)
+        o.noun_phrase: object_region(scene, frame, k)
         for k, o in enumerate(scene.objects)
         if scene.in_view[frame, k] and scene.visible_fraction[frame, k] > 0.05
     }
@@ -52,7 +52,7 @@ def described(text: str) -> dict[str, str]:
 
 
 def samples_of(lazy: list[LazySample], epochs: int = 1) -> Iterator[Sample]:
-    return (one.load(epoch) for one in lazy for epoch in range(epochs))
+    return (one.render(epoch) for one in lazy for epoch in range(epochs))
 
 
 def test_a_frame_is_described_completely(regions, kinds) -> None:
@@ -121,7 +121,7 @@ def test_motion_of_an_object_in_a_clip(micro_store, kinds) -> None:
         scene = micro_store.scene(item.scene_id)
         end = find_cut(scene, item.prefix_start, item.prefix_stop)
         phrase = re.fullmatch(r"How does the (.+) move\?", sample.content[-1]["text"])[1]
-        index = [o.phrase for o in scene.objects].index(phrase)
+        index = [o.noun_phrase for o in scene.objects].index(phrase)
         speed = np.linalg.norm(scene.velocities[end, index])
         stated = re.fullmatch(
             rf"[A-Z].+, the {phrase} is (near the [\w-]+) and (does not move|moves .+)\.",
@@ -150,7 +150,7 @@ def test_headings_of_objects_at_visual_tokens(micro_store, kinds) -> None:
         scene, frames = micro_store.scene(item.scene_id), sample.clip.indices
         assert {label.picture for label in sample.object_labels} <= set(range(sample.pictures))
         for label in sample.object_labels:
-            index = [tuple(o.phrase.split()) for o in scene.objects].index(label.words[:3])
+            index = [tuple(o.noun_phrase.split()) for o in scene.objects].index(label.words[:3])
             pair = [frames[2 * label.picture], frames[2 * label.picture + 1]]
             moves = np.linalg.norm(scene.velocities[pair[1], index]) >= 0.05
             assert (label.words[3] != "stationary") == moves
@@ -194,13 +194,13 @@ def test_answer_is_the_later_frame(kinds) -> None:
 
 def test_clip_is_described_with_and_without_the_target(kinds) -> None:
     for lazy in kinds["clip"]:
-        samples = [lazy.load(epoch) for epoch in range(12)]
+        samples = [lazy.render(epoch) for epoch in range(12)]
         assert {len(sample.images) for sample in samples} == {0, 1}
         assert len({sample.response for sample in samples}) == 1
         assert samples[0].response.startswith("Scene parse: ")
 
 
 def test_frames_vary_by_epoch_reproducibly(kinds) -> None:
-    responses = [[lazy.load(epoch).response for lazy in kinds["frame"]] for epoch in (0, 1, 0)]
+    responses = [[lazy.render(epoch).response for lazy in kinds["frame"]] for epoch in (0, 1, 0)]
     assert responses[0] == responses[2]
     assert responses[0] != responses[1]
