@@ -61,6 +61,21 @@ def check_same_weights(one: Path, two: Path) -> None:
 
 
 @pytest.mark.slow
+def test_other_data_is_refused(sft_settings, tmp_path, monkeypatch) -> None:
+    whole, resumed = train(sft.main, sft_settings, tmp_path / "whole"), tmp_path / "resumed"
+    shutil.copytree(whole, resumed, ignore=shutil.ignore_patterns("metrics.json", "student"))
+    build = dataset.supervised_items
+
+    def one_less(*arguments):
+        return {mode: items[:-1] for mode, items in build(*arguments).items()}
+
+    monkeypatch.setattr(dataset, "supervised_items", one_less)
+    with raises_user_error("other-data"):
+        train(sft.main, sft_settings, resumed)
+    assert not (resumed / "student").exists()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("steps", "step"), [(4, 2), (6, 3)], ids=["between epochs", "within one"])
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_student_resumes_in_a_later_epoch(
