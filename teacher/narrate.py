@@ -1,4 +1,4 @@
-"""Command: writes a rationale for every training item of the selection track.
+"""Write a rationale for every training item of the selection track.
 
 Every response is appended to the store's rationales.jsonl, accepted or not, so that a killed run
 resumes. The built-in narrator then writes the same bytes as an uninterrupted run.

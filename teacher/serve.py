@@ -1,4 +1,4 @@
-"""Command: replaces itself by a vLLM server that runs in a separate Python environment."""
+"""Serve a model: replace this process with a vLLM server in a separate Python environment."""
 
 from __future__ import annotations
 

@@ -122,8 +122,9 @@ def _at(words: list[str], raw: list[str], i: int) -> tuple[str, str | Noun, int]
 
 
 def _is_article(words: list[str], letter: str, i: int) -> bool:
-    """Whether an "A" is an article. In doubt it is a candidate (unlike in `teacher.letters`),
-    since a letter taken for an article would assign the following claims to another candidate."""
+    """Whether an "A" is an article. In doubt it is a candidate, unlike in
+    `teacher.candidate_letters`: a letter taken for an article would assign the following claims to
+    another candidate."""
     following = words[i + 1] if i + 1 < len(words) else "."
     described = following in ADJECTIVES or following in EVENTS
     return letter == "A" and described and not (i > 0 and words[i - 1] in LISTED)
