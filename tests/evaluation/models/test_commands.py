@@ -77,7 +77,7 @@ def test_a_student_is_measured_resumed_and_reported(
     page = new_run(tmp_path / "report" / "run")
     report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path), store=store), page)
     html = (page.folder / "report.html").read_text()
-    assert all(f'"id":"{item.item_id}"' in html for item in select.limit_items(items, 8, 0))
+    assert all(f'"id": "{item.item_id}"' in html for item in select.limit_items(items, 8, 0))
 
 
 @pytest.mark.slow
