@@ -8,7 +8,7 @@ from teacher.reading.reader import BOUNDARIES
 from teacher.reading.tagging import Tag
 from teacher.reading.topics import TopicReader
 
-NOUNS = {"error", "errors", "mistake", "mistakes", "fault", "faults", "flaw", "flaws"}
+ERRORS = {"error", "errors", "mistake", "mistakes", "fault", "faults", "flaw", "flaws"}
 
 
 class CandidateReader(TopicReader):
@@ -16,7 +16,7 @@ class CandidateReader(TopicReader):
 
     def end(self) -> None:
         if not self.lasting and len(self.letters) == 1 and not self.doubted:
-            self._choose(self.letters[0])
+            self._add_choice(self.letters[0])
         for claim in self.found:
             if claim.candidate != "":
                 self.claims.append(claim)
@@ -24,13 +24,13 @@ class CandidateReader(TopicReader):
                 # Before it names a candidate, an outcome describes the target.
                 self.claims.append(claim._replace(candidate=None))
 
-    def _choose(self, letter: str) -> None:
-        """Choose the candidate of an outcome that names only one and no error in it."""
+    def _add_choice(self, letter: str) -> None:
+        """Record that a candidate agrees if an outcome names it alone and without an error."""
         named = {str(t.value) for t in self.sentence if t.tag == "candidate"}
         wrong = {c.candidate for c in self.found if c.kind == "agrees" and not c.affirmed}
         described = any(c.candidate == letter for c in self.found)
         if not described and named <= wrong | {letter}:
-            tag = self.choice or self.sentence[-1]
+            tag = self.choice or self.sentence.tags[-1]
             self.found.append(self.claim("agrees", (), "", True, TARGET, tag, letter))
 
     # Claims about an object in a candidate.
@@ -43,18 +43,18 @@ class CandidateReader(TopicReader):
                 self.add_claim_of_any("region", tag)
             return
         if self.expected or self.negated:
+            # The place where the object should be or is not, whatever the candidate.
             affirmed = self.contrasted or not (self.expected and self.negated)
             for name in self.objects:
-                self.found.append(
-                    self.claim("region", (name,), str(tag.value), affirmed, TARGET, tag)
-                )
+                claim = self.claim("region", [name], str(tag.value), affirmed, TARGET, tag)
+                self.found.append(claim)
         else:
             self.add_claim("region", str(tag.value), True, tag)
 
     on_into = on_region
 
     def on_direction(self, tag: Tag) -> None:
-        if self.word(self.near(-1)) != "from" and not self.expected and not self.negated:
+        if self.near(-1).words != "from" and not self.expected and not self.negated:
             if self.objects:
                 self.add_claim("displaced", str(tag.value), True, tag)
             elif self.near(-1).tag in ("off", "slight", "clear"):
@@ -71,7 +71,7 @@ class CandidateReader(TopicReader):
         self._extent("slightly", tag)
 
     def on_clear(self, tag: Tag) -> None:
-        if self.word(tag) == "clearly":
+        if tag.words == "clearly":
             self._extent("clearly", tag)
 
     def _extent(self, extent: str, tag: Tag) -> None:
@@ -84,9 +84,9 @@ class CandidateReader(TopicReader):
             self.lacking = True
 
     def on_passed(self, tag: Tag) -> None:
-        if self.word(tag).startswith("miss"):
+        if tag.words.startswith("miss"):
             self.on_lack(tag)
-        elif self.word(tag).startswith("avoid"):
+        elif tag.words.startswith("avoid"):
             self.negated = True
 
     def on_moves(self, tag: Tag) -> None:
@@ -96,7 +96,7 @@ class CandidateReader(TopicReader):
     on_moving = on_moves
 
     def on_future(self, tag: Tag) -> None:
-        self.skipped |= self.word(tag) == "would"
+        self.skipped |= tag.words == "would"
 
     def on_gone(self, tag: Tag) -> None:
         if self.near(1).tag == "object":
@@ -137,50 +137,39 @@ class CandidateReader(TopicReader):
             self.passing = not self.negated
         elif not self.letters:
             self.passing = not self.negated and not (self.lasting and self.objects)
-        elif not self.objects and not self._partial():
+        elif not self.objects and not self._is_partial():
             self.add_candidate_claim("agrees", not (self.negated or self.refused), tag)
 
     def _is_choice_ahead(self) -> bool:
         """Whether the candidate named next is the one that agrees: "the answer is therefore B"."""
-        step = 1
-        while self.near(step).tag in ("be", "word", "break", "future"):
-            step += 1
-        copula = any(self.near(k).tag in ("be", "future") for k in range(1, step))
-        return copula and self.near(step).tag == "candidate"
+        stop = self.sentence.skip(self.at + 1, {"be", "word", "break", "future"})
+        copula = any(t.tag in ("be", "future") for t in self.sentence.tags[self.at + 1 : stop])
+        return copula and self.sentence[stop].tag == "candidate"
 
     def on_differ(self, tag: Tag) -> None:
         self.doubted = True
-        if self._is_between():
+        if tag.words.startswith("differ") and self._is_between():
             # "A and B differ in the X", "A differs from B in the X."
             return
         if self.lacking:
             # "D does not have the error of C."
             self.lacking = False
-            return
-        if self.objects and self.near(-1).tag == "comma" and self.word(tag) in NOUNS:
+        elif self.objects and self.near(-1).tag == "comma" and tag.words in ERRORS:
             # "It is near the left, an error not seen in B."
             self.objects, self.skipped = [], True
-            return
-        if not self.objects and not self.negated and not self.lacking:
+        elif not self.objects and not self.negated:
             self.add_candidate_claim("agrees", False, tag)
 
     def _is_between(self) -> bool:
         """Whether the candidates differ from each other."""
-        if not self.word(self.sentence[self.at]).startswith("differ"):
-            return False
-        step = 1
-        while self.near(step).tag not in BOUNDARIES | {"object"}:
-            if self.near(step).tag == "candidate":
-                return True
-            step += 1
+        if self.next_of(BOUNDARIES | {"object", "candidate"}).tag == "candidate":
+            return True
         return len(self.letters) > 1 and self.near(1).tag != "ignore"
 
-    def _partial(self) -> bool:
+    def _is_partial(self) -> bool:
         """Whether an agreement is limited to an object or has an exception."""
-        rest = self.sentence[self.at + 1 :]
-        ahead = [t.tag for t in rest]
-        if any(t.tag in ("lack", "gone", "off", "differ", "misplace", "extra") for t in rest):
+        rest = {tag.tag for tag in self.sentence.tags[self.at + 1 :]}
+        if rest & {"lack", "gone", "off", "differ", "misplace", "extra"}:
             return True
-        while ahead and ahead[0] in ("by", "word", "with"):
-            ahead.pop(0)
-        return bool(ahead) and ahead[0] == "object"
+        limit = self.sentence[self.sentence.skip(self.at + 1, {"by", "word", "with"})]
+        return limit.tag == "object"

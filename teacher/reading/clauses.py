@@ -30,29 +30,36 @@ class ClauseReader(PairReader):
         self.finite = False
         """Whether the subject already has a verb, so that another noun phrase is a new subject."""
         self.blocked = self.complement = False
-        """Whether the following words may refer to an object other than the subject."""
-        self.crossed = self.moved = self.absolute = False
+        """Whether the following words may refer to an object other than the subject, and whether
+        the sentence has named one."""
+        self.crossed = False
+        """Whether the next verb is that of the subject, since a boundary lies before it."""
+        self.moved = False
+        """Whether the sentence has said that something moves."""
+        self.absolute = False
+        """Whether the clause ends with the next comma: "with the A at rest, the B ..."."""
         self.last: Names = []
         """The antecedents of "which"."""
         self.hypothetical = False
+        """Whether the whole sentence depends on a condition."""
         self.inner = False
         """Whether the current clause is a place clause inside another one ("where the A was")."""
         self.neither = self.relative = False
+        """Whether the sentence has a "neither", and whether it has a "which"."""
         self.pronominal = False
         """Whether the subject is a pronoun, which cannot start a list."""
         self.gapped = self.verbal = False
         """Whether the subject has a claim without a verb ("the A moves east, the B west"), and
         whether an earlier subject of the sentence had a verb."""
-        self._boundary()
+        self._cross_boundary()
 
     def end(self) -> None:
         self.flush()
-        ending = [t.tag for t in self.sentence[-2:]]
-        if ending == ["not", "stop"]:
+        if [tag.tag for tag in self.sentence.tags[-2:]] == ["not", "stop"]:
             # "They look set to meet, but they do not."
             self.claims = [c for c in self.claims if c.kind != "meeting"]
 
-    def _boundary(self) -> None:
+    def _cross_boundary(self) -> None:
         self.negated = self.staying = self.future = self.past = self.slight = False
         self.maybe = self.hypothetical
         self.crossed = True
@@ -64,19 +71,19 @@ class ClauseReader(PairReader):
             self.flush()
             # "Neither the A, which moves, nor the B, ...": the denied claim about both follows.
             self.hypothetical |= self.neither and self.relative
-            self._boundary()
+            self._cross_boundary()
             if self.inner and self.near(1).tag != "break":
                 self.subjects, self.group_start, self.inner = [None], 0, False
             self.finite |= self.absolute
             self.absolute = False
             if self.near(1).tag == "region" and self.near(2).tag == "object":
-                self._open()
+                self._open_clause()
 
     def on_semicolon(self, tag: Tag) -> None:
         self.flush()
-        self._boundary()
+        self._cross_boundary()
         self.finite = bool(self.subjects)
-        self._open()
+        self._open_clause()
 
     on_break = on_semicolon
 
@@ -88,71 +95,68 @@ class ClauseReader(PairReader):
             # "Near the left and near the right, the A ..." continues a list.
             listed = self.near(-1).tag == self.near(1).tag == "region"
             if not (listed and self.near(2).tag == "comma"):
-                self._open()
+                self._open_clause()
 
-    def _open(self) -> None:
+    def _open_clause(self) -> None:
         """Drop the subject if the clause opens with a claim about the next one: "and near the top
         is the A", "while moving slowly, the A"."""
-        step = 1
-        while self.near(step).tag in OPENING:
-            if self.word(self.near(step)) == "where":
-                return
-            step += 1
-        if step > 1 and self.near(step - 1).tag not in ("by", "with"):
-            precedes = any(self.near(k).tag in PRECEDING for k in range(1, step))
-            if precedes and self.near(step).tag == "object":
-                self.subjects, self.finite, self.blocked, self.denied_subject = (
-                    [],
-                    False,
-                    False,
-                    False,
-                )
+        stop = self.sentence.skip(self.at + 1, OPENING)
+        opening = self.sentence.tags[self.at + 1 : stop]
+        place = any(tag.words == "where" for tag in opening)
+        precedes = any(tag.tag in PRECEDING for tag in opening) and opening[-1].tag != "by"
+        if precedes and not place and self.sentence[stop].tag == "object":
+            self.start_clause([])
+
+    def start_clause(self, subjects: Names, group_start: int = 0) -> None:
+        """Begin a clause with new subjects; its verb has not been read."""
+        self.subjects, self.group_start = subjects, group_start
+        self.finite = self.blocked = self.denied_subject = False
 
     # Function words.
 
     def on_not(self, tag: Tag) -> None:
         self.negated = True
-        self.neither |= self.word(tag) == "neither"
+        self.neither |= tag.words == "neither"
 
     on_contrast = on_not
 
     def on_maybe(self, tag: Tag) -> None:
         self.maybe = True
-        self.hypothetical |= "if" in self.word(tag).split()
+        self.hypothetical |= "if" in tag.words.split()
 
     def on_future(self, tag: Tag) -> None:
         self.future = True
-        if self.word(tag) == "would" and any(t.tag == "maybe" for t in self.sentence):
+        if tag.words == "would" and any(t.tag == "maybe" for t in self.sentence):
             self.maybe = True
-        self.verb()
+        self.record_verb()
 
     on_expected = on_future
 
     def on_past(self, tag: Tag) -> None:
         self.past = True
-        if self.word(tag).split()[0] in WAS:
-            self.verb()
+        if tag.words.split()[0] in WAS:
+            self.record_verb()
 
     def on_lack(self, tag: Tag) -> None:
-        if self.word(tag).startswith("without"):
+        if tag.words.startswith("without"):
             self.negated = True
 
     def on_word(self, tag: Tag) -> None:
         if self.near(-1).tag == "object":
             # An unknown word may be a verb of motion.
-            self.verb()
+            self.record_verb()
             self.moved |= str(tag.value).endswith("s")
 
     def on_be(self, tag: Tag) -> None:
-        self.verb()
+        self.record_verb()
 
     on_show = on_be
 
     def on_stays(self, tag: Tag) -> None:
         self.staying = True
-        self.verb()
+        self.record_verb()
 
-    def verb(self) -> None:
+    def record_verb(self) -> None:
         if self.crossed:
             self.blocked = False
         if self.subjects or self.denied_subject:
@@ -176,22 +180,21 @@ class ClauseReader(PairReader):
                 if not self.denied_subject:
                     self.pending.append((kind, value, affirmed, when, tag))
                 return
-            # Before the verb, "the A and the B near the top" may speak of the B alone.
-            apart = not self.finite and self.near(-1).tag == "object"
-            subjects = self.subjects[-1:] if apart else self.subjects
-            if not self.finite and not apart:
+            if self.finite:
+                subjects = self.subjects
+            elif self.near(-1).tag == "object":
+                # Before the verb, "the A and the B near the top" may speak of the B alone.
+                subjects = self.subjects[-1:]
+            else:
                 subjects = self.subjects[self.group_start :]
             self.gapped |= not self.finite and (self.verbal or self._is_verbless(kind))
         for name in subjects:
             self.claims.append(self.claim(kind, (name,), value, affirmed, when, tag))
-        if len(subjects) > 1 and affirmed:
-            self.shared.append((kind, value, tuple(subjects), tag))
+        if affirmed:
+            self.share(kind, value, subjects, tag)
 
     def _is_verbless(self, kind: str) -> bool:
         """Whether the subject has a motion without a verb or participle."""
-        step = -1
-        while self.near(step).tag not in ("object", *BOUNDARIES):
-            if self.near(step).tag in ("moving", "moves"):
-                return False
-            step -= 1
-        return kind in ("direction", "speed", "extent")
+        previous = self.next_of(BOUNDARIES | {"object", "moving", "moves"}, -1)
+        motion = kind in ("direction", "speed", "extent")
+        return motion and previous.tag not in ("moving", "moves")

@@ -1,9 +1,9 @@
-"""Checks single claims against the predicates: true, false, or None if the predicates are
-silent."""
+"""Checks single claims against the predicates: true, false, or None if the predicates do not
+tell."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple
 
 from teacher.predicates import COMPASS, OUT_OF_VIEW, Difference, ObjectFacts, Predicates
@@ -12,9 +12,9 @@ from teacher.reading.phrases import COARSE
 CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
 """The moment of a claim: the cut, the path from the cut to the target, the target, or, if the
 words are ambiguous, the cut or the target."""
-
-
 VERDICTS = ("supported", "contradicted", "unknown")
+PLACES = ("close region", "place of either")
+"""Kinds of claims about the place of a pair."""
 
 
 class Claim(NamedTuple):
@@ -75,52 +75,57 @@ class Ground:
     def truth(self, claim: Claim) -> bool | None:
         """Whether a claim holds, ignoring its negation."""
         if claim.candidate is not None:
-            if claim.candidate not in self.candidates:
-                return None
-            if not claim.subjects and claim.kind not in ("agrees", "other objects"):
-                return self._of_none_shown(claim)
-            return CANDIDATE[claim.kind](self, claim)
+            return self._truth_in_candidate(claim.candidate, claim)
+        if claim.kind == "mention":
+            name = claim.subjects[0]
+            # A candidate may show an object that the scene lacks.
+            return name in self.objects or (claim.when == EITHER and name in self.extras)
         if claim.kind in PLACES and not claim.subjects:
-            return self._of_none(claim._replace(kind="region"))
+            return self._truth_of_any(claim._replace(kind="region"))
         if claim.kind in PAIRS:
             return PAIRS[claim.kind](self, claim)
-        if claim.kind == "mention":
-            return _mention(self, claim)
         if not claim.subjects:
-            return self._of_none(claim)
+            return self._truth_of_any(claim)
         facts = self.objects.get(claim.subjects[0])
         return None if facts is None else OBJECTS[claim.kind](facts, claim.value, claim.when)
 
-    def _of_none(self, claim: Claim) -> bool | None:
+    def _truth_in_candidate(self, letter: str, claim: Claim) -> bool | None:
+        if letter not in self.candidates:
+            return None
+        if claim.kind == "agrees":
+            return self.candidates[letter].agrees
+        if claim.kind == "other objects":
+            return self.candidates[letter].other_objects
+        differences = self.differences[letter]
+        if not claim.subjects:
+            return self._truth_of_any_shown(claim, differences.values())
+        name = claim.subjects[0]
+        return SHOWN[claim.kind](self.objects.get(name), differences.get(name), claim.value)
+
+    def _truth_of_any(self, claim: Claim) -> bool | None:
         """False for a region without any object or a direction without any moving object: the claim
         is then false whatever its subject is."""
         if claim.kind not in ("region", "direction") or not claim.affirmed:
             return None
-        truths = [OBJECTS[claim.kind](o, claim.value, EITHER) for o in self.objects.values()]
+        truths = {OBJECTS[claim.kind](o, claim.value, EITHER) for o in self.objects.values()}
         near = claim.kind == "region" and any(_same(claim.value, r) for r in self.close.values())
-        return False if set(truths) == {False} and not near else None
+        return False if truths == {False} and not near else None
 
-    def _of_none_shown(self, claim: Claim) -> bool | None:
+    def _truth_of_any_shown(self, claim: Claim, found: Collection[Difference]) -> bool | None:
         """False for a region or a displacement that no object of a candidate has."""
         if claim.kind not in ("region", "displaced") or not claim.affirmed:
             return None
-        found = self.differences[claim.candidate].values()
         if claim.kind == "displaced":
             if claim.value.lstrip(COARSE) not in COMPASS or any(d.kind == "region" for d in found):
                 return None
-            truths = [_same(claim.value, d.heading) for d in found if d.heading]
+            truths = {_same(claim.value, d.heading) for d in found if d.heading}
         else:
             # The words may also describe where an object should be.
-            truths = [_region(o, claim.value, EITHER) for o in self.objects.values()]
-            truths += [_same(claim.value, d.region) for d in found if d.region]
-            truths += [None for d in found if d.kind == "extra"]
-        return False if set(truths) <= {False} else None
-
-
-def _mention(ground: Ground, claim: Claim) -> bool:
-    known = claim.subjects[0] in ground.objects
-    # A candidate may show an object that the scene lacks.
-    return known or (claim.when == EITHER and claim.subjects[0] in ground.extras)
+            truths = {_region(o, claim.value, EITHER) for o in self.objects.values()}
+            truths |= {_same(claim.value, d.region) for d in found if d.region}
+            if any(d.kind == "extra" for d in found):
+                return None
+        return False if truths <= {False} else None
 
 
 def _same(value: str, actual: str | None) -> bool | None:
@@ -144,12 +149,13 @@ def _either(*found: bool | None) -> bool | None:
     return True if True in found else None if None in found else False
 
 
+def _at(when: str, cut: str, target: str) -> tuple[str, ...]:
+    """The values at the moment of a claim."""
+    return {CUT: (cut,), TARGET: (target,)}.get(when, (cut, target))
+
+
 def _region(o: ObjectFacts, value: str, when: str) -> bool | None:
-    if when == CUT:
-        return _same(value, o.region)
-    if when == TARGET:
-        return _same(value, o.target_region)
-    return _either(_same(value, o.region), _same(value, o.target_region))
+    return _either(*(_same(value, region) for region in _at(when, o.region, o.target_region)))
 
 
 def _direction(o: ObjectFacts, value: str, when: str) -> bool | None:
@@ -166,10 +172,6 @@ def _direction(o: ObjectFacts, value: str, when: str) -> bool | None:
     return _either(heading, False if staying else travel)
 
 
-def _speed(o: ObjectFacts, value: str, when: str) -> bool | None:
-    return None if o.speed is None else value == o.speed
-
-
 def _still(o: ObjectFacts, value: str, when: str) -> bool | None:
     resting = None if o.speed is None else o.speed == "stationary"
     staying = None if o.extent == "unseen" else o.extent == "stays"
@@ -183,78 +185,55 @@ def _extent(o: ObjectFacts, value: str, when: str) -> bool | None:
 
 
 def _sight(o: ObjectFacts, value: str, when: str) -> bool | None:
-    def at(sight: str) -> bool:
-        return sight != "shown" if value == "unseen" else sight == value
-
-    if when == CUT:
-        return at(o.sight)
-    if when == TARGET:
-        return at(o.target_sight)
-    return at(o.sight) or at(o.target_sight)
-
-
-def _leaves(o: ObjectFacts, value: str, when: str) -> bool | None:
-    return None if when == CUT else o.leaves
-
-
-def _enters(o: ObjectFacts, value: str, when: str) -> bool | None:
-    return None if when == CUT else o.enters
+    sights = _at(when, o.sight, o.target_sight)
+    return any(sight != "shown" if value == "unseen" else sight == value for sight in sights)
 
 
 OBJECTS: dict[str, Callable[[ObjectFacts, str, str], bool | None]] = {
     "region": _region,
     "direction": _direction,
-    "speed": _speed,
+    "speed": lambda o, value, when: _same(value, o.speed),
     "still": _still,
     "extent": _extent,
     "sight": _sight,
-    "leaves": _leaves,
-    "enters": _enters,
+    "leaves": lambda o, value, when: None if when == CUT else o.leaves,
+    "enters": lambda o, value, when: None if when == CUT else o.enters,
 }
 """The check of each kind of claim about an object."""
 
 
-def _known(ground: Ground, claim: Claim) -> bool:
-    return all(name in ground.objects for name in claim.subjects)
-
-
-def _any_pair(claim: Claim, pairs: dict[frozenset[str], str | None]) -> bool:
+def _has_pair(pairs: Iterable[frozenset[str]], claim: Claim) -> bool:
+    """Whether a pair contains the subjects of a claim, which may be one object or none."""
     return any(set(claim.subjects) <= pair for pair in pairs)
 
 
 def _course(ground: Ground, claim: Claim) -> bool | None:
-    if not _known(ground, claim):
-        return None
-    if _any_pair(claim, ground.courses):
+    if _has_pair(ground.courses, claim):
         return True
-    if claim.value == COARSE and _any_pair(claim, ground.contacts):
+    if claim.value == COARSE and _has_pair(ground.contacts, claim):
         # "Headed for contact" applies to every pair that meets.
         return True if claim.affirmed else None
     return False
 
 
 def _meeting(ground: Ground, claim: Claim) -> bool | None:
-    if not _known(ground, claim):
-        return None
-    met = [when for pair, when in ground.courses.items() if set(claim.subjects) <= pair]
     if not claim.affirmed and claim.when != BETWEEN:
         # "They have not met yet" does not exclude later meetings.
-        return None if claim.when == CUT else _any_pair(claim, ground.contacts)
-    if _any_pair(claim, ground.contacts) or any(when not in (None, "unseen") for when in met):
+        return None if claim.when == CUT else _has_pair(ground.contacts, claim)
+    met = [when for pair, when in ground.courses.items() if set(claim.subjects) <= pair]
+    if _has_pair(ground.contacts, claim) or any(when not in (None, "unseen") for when in met):
         return True
     return None if "unseen" in met else False
 
 
 def _time(ground: Ground, claim: Claim) -> bool | None:
-    if len(claim.subjects) != 2 or not _known(ground, claim):
-        return None
     pair = frozenset(claim.subjects)
     when = ground.contacts.get(pair) or ground.courses.get(pair)
     return None if when in (None, "unseen") else when == claim.value
 
 
 def _close(ground: Ground, claim: Claim) -> bool | None:
-    if len(claim.subjects) != 2 or not _known(ground, claim) or claim.when != TARGET:
+    if claim.when != TARGET:
         return None
     if any(ground.objects[name].target_sight == OUT_OF_VIEW for name in claim.subjects):
         return None if claim.value == COARSE else False
@@ -263,19 +242,15 @@ def _close(ground: Ground, claim: Claim) -> bool | None:
 
 def _close_region(ground: Ground, claim: Claim) -> bool | None:
     region = ground.close.get(frozenset(claim.subjects))
-    return None if region is None or claim.when != TARGET else _same(claim.value, region)
+    return None if claim.when != TARGET else _same(claim.value, region)
 
 
 def _place_of_either(ground: Ground, claim: Claim) -> bool | None:
-    partner = ground.objects.get(claim.subjects[-1])
-    if partner is None:
-        return None
     region = ground.close.get(frozenset(claim.subjects))
+    partner = ground.objects[claim.subjects[-1]]
     return _either(_same(claim.value, region), _region(partner, claim.value, EITHER))
 
 
-PLACES = ("close region", "place of either")
-"""Kinds of claims about the place of a pair."""
 PAIRS: dict[str, Callable[[Ground, Claim], bool | None]] = {
     "course": _course,
     "meeting": _meeting,
@@ -287,56 +262,40 @@ PAIRS: dict[str, Callable[[Ground, Claim], bool | None]] = {
 """The check of each kind of claim about a pair."""
 
 
-def _shown_region(ground: Ground, claim: Claim) -> bool | None:
-    name = claim.subjects[0]
-    difference = ground.differences[claim.candidate].get(name)
+def _shown_region(
+    facts: ObjectFacts | None, difference: Difference | None, value: str
+) -> bool | None:
     if difference is None or difference.kind == "displaced":
-        facts = ground.objects.get(name)
-        return None if facts is None else _same(claim.value, facts.target_region)
+        return None if facts is None else _same(value, facts.target_region)
     if difference.kind == "region":
-        return _same(claim.value, difference.region)
+        return _same(value, difference.region)
     return None if difference.kind == "extra" else False
 
 
-def _lacks(ground: Ground, claim: Claim) -> bool | None:
-    name = claim.subjects[0]
-    facts = ground.objects.get(name)
-    difference = ground.differences[claim.candidate].get(name)
-    if facts is None or difference is not None:
-        return None if facts is None else difference.kind == "missing"
-    return facts.target_sight != "shown"
+def _lacks(facts: ObjectFacts | None, difference: Difference | None, value: str) -> bool | None:
+    if facts is None:
+        return None
+    return facts.target_sight != "shown" if difference is None else difference.kind == "missing"
 
 
-def _extra(ground: Ground, claim: Claim) -> bool | None:
-    difference = ground.differences[claim.candidate].get(claim.subjects[0])
+def _extra(facts: ObjectFacts | None, difference: Difference | None, value: str) -> bool | None:
     return difference is not None and difference.kind == "extra"
 
 
-def _displaced(ground: Ground, claim: Claim) -> bool | None:
-    difference = ground.differences[claim.candidate].get(claim.subjects[0])
+def _displaced(facts: ObjectFacts | None, difference: Difference | None, value: str) -> bool | None:
     if difference is None or difference.kind == "missing":
         return False
     if difference.kind != "displaced":
         return None
-    if claim.value in ("slightly", "clearly"):
-        return claim.value == difference.extent
-    return True if not claim.value else _same(claim.value, difference.heading)
+    if value in ("slightly", "clearly"):
+        return value == difference.extent
+    return True if not value else _same(value, difference.heading)
 
 
-def _agrees(ground: Ground, claim: Claim) -> bool | None:
-    return ground.candidates[claim.candidate].agrees
-
-
-def _strangers(ground: Ground, claim: Claim) -> bool | None:
-    return ground.candidates[claim.candidate].other_objects
-
-
-CANDIDATE: dict[str, Callable[[Ground, Claim], bool | None]] = {
+SHOWN: dict[str, Callable[[ObjectFacts | None, Difference | None, str], bool | None]] = {
     "region": _shown_region,
     "lacks": _lacks,
     "extra": _extra,
     "displaced": _displaced,
-    "agrees": _agrees,
-    "other objects": _strangers,
 }
-"""The check of each kind of claim about a candidate."""
+"""The check of each kind of claim about an object in a candidate."""

@@ -29,31 +29,29 @@ class SceneReader(SubjectReader):
             if relation.kind == "close":
                 self.close_region(relation, tag)
             return
+        previous, following = self.near(-1).tag, self.near(1).tag
         if self.negated and self._is_kept(tag):
             self.add_claim("region", str(tag.value), True, EITHER, tag)
             return
-        if self.negated and self.near(-1).tag not in ("not", "be", "future", "contrast"):
+        if self.negated and previous not in ("not", "be", "future", "contrast"):
             return
-        if self.near(1).tag == "and" and self.near(2).value in SIDE_WORDS:
+        if following == "and" and self.near(2).value in SIDE_WORDS:
             # "Near the left and the right are ..." gives each object one place.
             return
-        unplaced = self.near(1).tag == "be" and self.word(tag).startswith("the ")
-        if unplaced or self.near(1).tag == "none":
+        if following == "none" or (following == "be" and tag.words.startswith("the ")):
             # "The top is empty", "near the top nothing remains."
             return
-        if any(self.near(-k).tag == "leaves" and self._is_bare(self.near(-k)) for k in (1, 2, 3)):
-            # "Leaves the area near the top."
+        if self._is_left():
             return
-        ahead = self.near(1).tag
-        if self.near(-1).tag in ("semicolon", "break") and ahead in ("pronoun", "object"):
-            if ahead == "object":
+        if previous in ("semicolon", "break") and following in ("pronoun", "object"):
+            if following == "object":
                 self.pending.append(("region", str(tag.value), True, when or self.moment, tag))
             return
         if not when:
             when = TARGET if self.future else CUT if self.past else self.moment
             if self._is_former():
                 when = CUT
-            elif self.near(-1).tag == "object" and self.moment == TARGET:
+            elif previous == "object" and self.moment == TARGET:
                 # "The A near the top will be near the left."
                 when = EITHER
         self.add_claim("region", str(tag.value), not self.negated, when, tag)
@@ -65,14 +63,17 @@ class SceneReader(SubjectReader):
         if tag.tag == "from":
             return previous.tag in ("moves", "moving")
         if previous.tag == "object":
-            return not self.blocked and self.word(self.near(-2)) not in ("is", "are", "be")
-        return any(
-            self.near(-k).tag == "leaves" and self._is_bare(self.near(-k)) for k in (1, 2, 3)
-        )
+            return not self.blocked and self.near(-2).words not in ("is", "are", "be")
+        return self._is_left()
+
+    def _is_left(self) -> bool:
+        """Whether an object leaves the place: "leaves the area near the top"."""
+        verbs = self.sentence.tags[max(0, self.at - 3) : self.at]
+        return any(tag.tag == "leaves" and self._is_bare(tag) for tag in verbs)
 
     def _is_former(self) -> bool:
         """Whether a following word dates the claim before the target: "out of view before"."""
-        return self.near(1).tag == "past" or self.word(self.near(1)) == "before"
+        return self.near(1).tag == "past" or self.near(1).words == "before"
 
     def on_into(self, tag: Tag) -> None:
         self.on_region(tag, CUT if self.moment == CUT and not self.moved else TARGET)
@@ -81,11 +82,10 @@ class SceneReader(SubjectReader):
         self.on_region(tag, CUT)
 
     def on_direction(self, tag: Tag) -> None:
-        if self.word(self.near(-1)) == "from" or self.word(self.near(1)) in ("of", "from"):
+        previous, following = self.near(-1), self.near(1)
+        if self.relation or previous.words == "from" or following.words in ("of", "from"):
             return
-        if self.relation:
-            return
-        if self.negated and self.near(-1).tag not in DENYING:
+        if self.negated and previous.tag not in DENYING:
             return
         when = self.moment
         if when != CUT:
@@ -102,37 +102,34 @@ class SceneReader(SubjectReader):
         self.add_claim("speed", str(tag.value), not self.negated, CUT, tag)
 
     def on_still(self, tag: Tag) -> None:
-        if "not" in self.word(tag).split() and self.near(1).tag in ("direction", "speed"):
+        if "not" in tag.words.split() and self.near(1).tag in ("direction", "speed"):
             # "Does not move east."
             self.negated = self.moved = True
-            self.verb()
+            self.record_verb()
             return
-        if self.word(tag).split()[0] in STILL_VERBS:
-            self.verb()
-        when = self.moment
+        if tag.words.split()[0] in STILL_VERBS:
+            self.record_verb()
+        when = self.still_when
         if when != CUT and (self.staying or self.future):
             when = BETWEEN
-        elif when == TARGET:
-            when = EITHER
         self.add_claim("still", "", not self.negated, when, tag)
 
     def on_rest(self, tag: Tag) -> None:
         if self.near(1).tag in BOUNDARIES:
-            self.verb()
-        if self.near(-1).tag == "object" or self.near(-1).tag == "and":
+            self.record_verb()
+        if self.near(-1).tag in ("object", "and"):
             self.on_still(tag)
 
     def on_moves(self, tag: Tag) -> None:
         self.moved = True
-        self.verb()
+        self.record_verb()
         self.on_moving(tag)
 
     def on_moving(self, tag: Tag) -> None:
         self.moved = True
-        self.slight |= self.word(tag) in ("moved", "traveled", "travelled", "rolled")
+        self.slight |= tag.words in ("moved", "traveled", "travelled", "rolled")
         if self.negated and self.near(1).tag in BOUNDARIES:
-            when = CUT if self.moment == CUT else EITHER
-            self.add_claim("still", "", True, when, tag)
+            self.add_claim("still", "", True, self.still_when, tag)
 
     def on_off(self, tag: Tag) -> None:
         self.moved = True
@@ -144,13 +141,13 @@ class SceneReader(SubjectReader):
 
     def on_across(self, tag: Tag) -> None:
         self.moved = self.slight = True
-        self.verb()
+        self.record_verb()
         self.add_claim("extent", "moves across", not self.negated, BETWEEN, tag)
 
     def on_put(self, tag: Tag) -> None:
-        clause = self.word(tag).split()[0] in ("where", "in", "as", "nearly", "almost", "roughly")
+        clause = tag.words.split()[0] in ("where", "in", "as", "nearly", "almost", "roughly")
         if not clause or self.staying:
-            self.verb()
+            self.record_verb()
             if self.moment == CUT:
                 self.on_still(tag)
                 return
@@ -158,23 +155,23 @@ class SceneReader(SubjectReader):
             self.add_claim("extent", value, not self.negated, BETWEEN, tag)
 
     def on_leaves(self, tag: Tag) -> None:
-        self.verb()
-        if not self._is_bare(tag) or self.near(1).tag in BOUNDARIES:
-            self._event("leaves", tag)
+        self._event("leaves", tag, BOUNDARIES)
+
+    def on_enters(self, tag: Tag) -> None:
+        self._event("enters", tag, BOUNDARIES | {"region"})
 
     def _is_bare(self, tag: Tag) -> bool:
         """Whether a verb such as "leaves" has no object."""
-        return " " not in self.word(tag)
+        return " " not in tag.words
 
-    def _event(self, kind: str, tag: Tag) -> None:
-        # An event that has not happened by the cut may happen later.
-        when = CUT if self.negated and self.moment == CUT and not self.future else BETWEEN
-        self.add_claim(kind, "", not self.negated, when, tag)
-
-    def on_enters(self, tag: Tag) -> None:
-        self.verb()
-        if not self._is_bare(tag) or self.near(1).tag in (*BOUNDARIES, "region"):
-            self._event("enters", tag)
+    def _event(self, kind: str, tag: Tag, ends: set[str]) -> None:
+        """Record that the subject leaves or enters the view; a verb without an object needs one of
+        the tags `ends` behind it."""
+        self.record_verb()
+        if not self._is_bare(tag) or self.near(1).tag in ends:
+            # An event that has not happened by the cut may happen later.
+            when = CUT if self.negated and self.moment == CUT and not self.future else BETWEEN
+            self.add_claim(kind, "", not self.negated, when, tag)
 
     def on_out(self, tag: Tag) -> None:
         self._sight("out of view", tag)
@@ -183,14 +180,14 @@ class SceneReader(SubjectReader):
         self._sight("hidden", tag)
 
     def on_unseen(self, tag: Tag) -> None:
-        if self.word(tag).startswith("cannot"):
-            self.verb()
+        if tag.words.startswith("cannot"):
+            self.record_verb()
         self._sight("unseen", tag)
 
     def on_gone(self, tag: Tag) -> None:
-        words = self.word(tag).split()
+        words = tag.words.split()
         if words[0] in ("is", "are", "cannot"):
-            self.verb()
+            self.record_verb()
         if words[-1] in ("view", "visible", "seen", "shown"):
             self._sight("unseen", tag)
 

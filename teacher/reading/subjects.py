@@ -6,7 +6,7 @@ from itertools import pairwise
 
 from teacher.reading.clauses import ClauseReader
 from teacher.reading.pairs import RELATIONS
-from teacher.reading.reader import BOUNDARIES, END, MAX_OBJECTS, Names
+from teacher.reading.reader import BOUNDARIES, MAX_OBJECTS, Names
 from teacher.reading.tagging import Tag
 
 VERBS = {"be", "moves", "stays", "rest", "future", "across", "leaves", "enters", "still", "past"}
@@ -25,96 +25,82 @@ class SubjectReader(ClauseReader):
     def on_object(self, tag: Tag) -> None:
         previous = self.near(-1)
         relation = self.relation
-        if relation and relation.between and len(relation.partners) < 2:
-            names, _ = self.group(2)
+        if relation and self.is_incomplete():
+            names = self.group(2)
             relation.partners += names
             self.last = names[-1:]
             return
         if self._is_complement(previous):
-            self._complement()
+            self._read_complement()
             return
         self.verbal |= self.finite
         if self._is_relative(previous):
             self.flush()
-            self.last = self.group()[0]
+            self.last = self.group()
             self.inner = previous.tag != "which"
             # The claims in "the A, which the B hits" are ambiguous.
-            self.subjects, self.group_start = self.last if self.inner else [None], 0
-            self.finite = self.blocked = self.denied_subject = self.gapped = False
-            self.pending = []
+            self.start_clause(self.last if self.inner else [None])
+            self.gapped, self.pending = False, []
             return
         fresh = self.finite or not self.subjects or self.denied_subject
         fresh |= self.pronominal or self.gapped
         # "Near the top is the A, and the B ..." states the place of the A only.
-        names, _ = self.group(1 if self.pending and self._parted() else MAX_OBJECTS)
-        self.subjects = names if fresh else [*self.subjects, *names][-MAX_OBJECTS:]
-        self.group_start = 0 if fresh else max(0, len(self.subjects) - len(names))
+        names = self.group(1 if self.pending and self._is_clause_next() else MAX_OBJECTS)
+        subjects = names if fresh else [*self.subjects, *names][-MAX_OBJECTS:]
+        self.start_clause(subjects, max(0, len(subjects) - len(names)))
+        self.finite = bool(self.pending) and previous.tag in INVERTED
         self.last = names[-1:]
-        # "With the A at rest, the B ...": the clause of the A ends with the comma.
         self.absolute = previous.tag == "with"
-        inverted = bool(self.pending) and previous.tag in INVERTED
-        self.finite, self.blocked, self.denied_subject, self.complement = (
-            inverted,
-            False,
-            False,
-            False,
-        )
-        self.pronominal = self.gapped = False
+        self.complement = self.pronominal = self.gapped = False
         if relation and not relation.subjects:
-            relation.subjects = self.subjects
+            relation.subjects = subjects
         # "Near the top, the A and the B are close" states the place of the pair, not of its
         # objects.
-        self._settle(places=not self._is_pair_ahead())
+        end = self.next_of({"comma", "semicolon", "break", "stop", "close"})
+        self._apply_pending(places=end.tag != "close")
 
     def _is_relative(self, previous: Tag) -> bool:
         """Whether the noun phrase is the subject of a clause about another object or a place:
         "the A, which the B hits", "where the B was"."""
-        if self.word(previous) == "where":
+        if previous.words == "where":
             return True
-        step = -2
-        while self.near(step).tag in ("by", "comma"):
-            step -= 1
+        antecedent = self.sentence[self.sentence.skip(self.at - 2, {"by", "comma"}, -1)]
         places = ("object", "region", "into", "from")
-        return previous.tag == "which" and self.near(step).tag in places
+        return previous.tag == "which" and antecedent.tag in places
 
-    def _settle(self, places: bool) -> None:
+    def _apply_pending(self, places: bool) -> None:
         """Apply the claims that precede the subject to it."""
         for pending in self.pending:
             if places or pending[0] != "region":
                 self.add_claim(*pending, subjects=self.subjects)
         self.pending = []
 
-    def _is_pair_ahead(self) -> bool:
-        step = 1
-        while self.near(step).tag not in ("comma", "semicolon", "break", "stop", "close"):
-            step += 1
-        return self.near(step).tag == "close"
-
-    def _parted(self) -> bool:
+    def _is_clause_next(self) -> bool:
+        """Whether the text after the object may begin a clause: "the A, and"."""
         return self.near(1).tag == "comma" and self.near(2).tag == "and"
 
     def _is_complement(self, previous: Tag) -> bool:
         if previous.tag == "with":
             # "With the A near the top, ..." is about the A.
-            return self.near(-2) is not END and self.near(-2).tag not in BOUNDARIES
+            return self.near(-2).tag not in BOUNDARIES
         if previous.tag == "contrast" and self.subjects:
             # "The A, rather than the B, ..."
             return True
-        return previous.tag in TAKERS or self.word(previous) in ASIDE
+        return previous.tag in TAKERS or previous.words in ASIDE
 
-    def _complement(self) -> None:
-        start = self.at
+    def _read_complement(self) -> None:
+        start, previous = self.at, self.near(-1)
         # "Meets the A, and the B ...": the B begins a clause.
-        names, _ = self.group(1 if self._parted() else MAX_OBJECTS)
+        names = self.group(1 if self._is_clause_next() else MAX_OBJECTS)
         if len(names) > 1 and self.near(1).tag in VERBS | {"not", "word", "show", "speed"}:
-            # "meets the A and the B stays": the B is a new subject.
+            # "Meets the A and the B stays": the B is a new subject.
             self.at = start
-            names, _ = self.group(1)
+            names = self.group(1)
         if self.relation and not self.relation.partners:
             self.relation.partners = names
-        elif self.near(-1).tag == "with" or self.sentence[start - 1].tag == "with":
+        elif previous.tag == "with":
             self.companions = names
-        if self.sentence[start - 1].tag != "contrast":
+        if previous.tag != "contrast":
             self.last = names[-1:]
         self.blocked, self.crossed, self.complement = True, False, True
 
@@ -124,50 +110,45 @@ class SubjectReader(ClauseReader):
             self.flush()
             listed = self.subjects[self.group_start :]
             several = len(listed) > 1 and not self.complement
-            if several and self.word(self.near(1)) in ("both", "are"):
+            if several and self.near(1).words in ("both", "are"):
                 # "The A and the B, which both move east."
-                self.subjects = listed
+                self.start_clause(listed)
             else:
-                self.subjects = [None] if several else self.last
-            self.finite = self.blocked = False
-            self.group_start = 0
+                self.start_clause([None] if several else self.last)
 
     def on_pronoun(self, tag: Tag) -> None:
         previous = self.near(-1)
         if previous.tag in ("by", "with", "close", "meet", "passed", "between", "course"):
-            self._refer(previous, tag)
+            self._read_pronoun_complement(previous)
             return
-        if self.word(tag) in ("itself", "themselves") and previous.tag == "comma":
-            # "Pushes the B east, itself going west."
+        # "Pushes the B east, itself going west", "the A pushes it east": the rest is ambiguous.
+        aside = tag.words in ("itself", "themselves") and previous.tag == "comma"
+        done = previous.tag == "word" and previous.words.endswith(("s", "ed", "ing"))
+        if aside or (done and previous.words not in ("joins", "joining")):
             self.subjects, self.group_start = [None], 0
             return
-        done = previous.tag == "word" and self.word(previous).endswith(("s", "ed", "ing"))
-        if done and self.word(previous) not in ("joins", "joining"):
-            # "The A pushes it east": the rest is not about the A.
-            self.subjects, self.group_start = [None], 0
-            return
-        possessive = self.word(tag) in ("its", "their") or self.near(1).tag == "object"
+        possessive = tag.words in ("its", "their") or self.near(1).tag == "object"
         if previous.tag == "object" or possessive or (previous.tag in VERBS and self.subjects):
             return
-        listed = self._listed(previous) if self.word(tag) == "both" else []
+        listed = self._find_listed_pair(previous) if tag.words == "both" else []
         if listed:
             self.subjects, self.group_start, self.blocked = listed, 0, False
             return
         self.verbal |= self.finite
-        self.subjects = [None] if self._is_ahead() else self._antecedent(str(tag.value))
+        self.start_clause(
+            [None] if self._is_object_ahead() else self._find_antecedents(str(tag.value))
+        )
         self.pronominal, self.gapped = True, False
-        self.group_start = 0
-        self.finite = self.blocked = self.denied_subject = False
-        self._settle(places=False)
+        self._apply_pending(places=False)
 
-    def _listed(self, previous: Tag) -> Names:
+    def _find_listed_pair(self, previous: Tag) -> Names:
         """The two listed objects that "both" refers to: "the A and the B, both near the left"."""
         listed = self.subjects[self.group_start :]
         beside = previous.tag == "comma" and self.near(-2).tag == "object"
         safe = len(listed) == 2 and None not in listed and (beside or previous.tag == "which")
         return listed if safe else []
 
-    def _antecedent(self, pronoun: str) -> Names:
+    def _find_antecedents(self, pronoun: str) -> Names:
         """The antecedents of a pronoun, or None if ambiguous."""
         subjects = self.subjects or self.before
         if pronoun == "it":
@@ -177,14 +158,13 @@ class SubjectReader(ClauseReader):
             return [pair[pronoun == "latter"]] if len(pair) == 2 else [None]
         return self.both()
 
-    def _is_ahead(self) -> bool:
+    def _is_object_ahead(self) -> bool:
         """Whether a pronoun may refer to an object that the next clause names: "although it was at
         rest, the A moves"."""
-        opening = self.sentence[: self.at]
-        subordinate = any(t.tag in ("break", "maybe", "by") for t in opening)
-        return subordinate and all(t.tag != "object" for t in opening)
+        opening = {tag.tag for tag in self.sentence.tags[: self.at]}
+        return bool(opening & {"break", "maybe", "by"}) and "object" not in opening
 
-    def _refer(self, previous: Tag, tag: Tag) -> None:
+    def _read_pronoun_complement(self, previous: Tag) -> None:
         """Handle a pronoun that is not a subject."""
         relation = self.relation
         self.complement = True
@@ -199,11 +179,10 @@ class SubjectReader(ClauseReader):
             if self.relation:
                 self.relation.partners = [None]
             return
-        if self.word(tag).endswith("scene") and self.near(-1).tag in ("word", "across", "moves"):
+        if tag.words.endswith("scene") and self.near(-1).tag in ("word", "across", "moves"):
             # "Has crossed the scene."
             return
-        self.subjects, self.group_start = [None], 0
-        self.finite = self.blocked = self.denied_subject = False
+        self.start_clause([None])
 
     def on_all(self, tag: Tag) -> None:
         self.on_rest_of(tag)
@@ -212,7 +191,7 @@ class SubjectReader(ClauseReader):
             t.tag in TAKERS and following.tag == "object"
             for t, following in pairwise(self.sentence)
         )
-        if self.word(tag) == "all of them" and None not in names and len(names) > 1 and not taken:
+        if tag.words == "all of them" and None not in names and len(names) > 1 and not taken:
             self.subjects = names
 
     on_no_other = on_rest_of

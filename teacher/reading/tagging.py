@@ -4,40 +4,47 @@ vocabulary."""
 from __future__ import annotations
 
 import re
+from collections.abc import Container, Iterator, Sequence
 from typing import NamedTuple
 
 from data.records import LETTERS
 from teacher.predicates import REGIONS
-from teacher.reading import nouns, phrases
+from teacher.reading.nouns import (
+    AT,
+    COLOR_WORDS,
+    COLUMNS,
+    IMAGE,
+    MATERIAL_WORDS,
+    MIDDLE,
+    PLACES,
+    PLURALS,
+    RIGHT_ONES,
+    ROWS,
+    SHAPE_WORDS,
+    SIDES,
+    SINGULARS,
+    WAYS,
+)
+from teacher.reading.phrases import COARSE, PHRASES
 
 WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)?|[.,;:!?()—–]")
 ARTICLES = {"the", "a", "an", "its", "their", "that", "this", "some", "any", "another", "such"}
 STILL_WORDS = {"stationary", "still", "resting", "motionless", "static", "unmoving"}
 QUALITIES = STILL_WORDS | {
-    *(
-        "moving",
-        "fast",
-        "slow",
-        "quick",
-        "nearby",
-        "rolling",
-        "same",
-        "struck",
-        "hidden",
-        "visible",
-    ),
-    *("incoming", "approaching", "lone", "only", "distant", "colliding", "remaining", "other"),
+    *("moving", "rolling", "fast", "slow", "quick", "incoming", "approaching", "colliding"),
+    *("struck", "hidden", "visible", "nearby", "distant", "lone", "only", "same", "remaining"),
+    "other",
 }
 """Adjectives allowed before an object's colour."""
 CANDIDATES = frozenset(LETTERS)
 EVENTS = {"pair", "collision", "contact", "course", "slight", "short", "layout", "scene", "motion"}
-STOPS = {".", "!", "?"}
+"""Nouns and adjectives, besides those of an object, before which "A" is an article."""
 LISTED = {"candidate", "candidates", "image", "images", "option", "options", "layout", "answer"}
+"""Words that get no tag, and after which "A" is a candidate."""
 PUNCTUATION = {
-    **dict.fromkeys(STOPS, "stop"),
+    **dict.fromkeys(".!?", "stop"),
     **dict.fromkeys(",()—–", "comma"),
-    ";": "semicolon",
-    ":": "semicolon",
+    **dict.fromkeys(";:", "semicolon"),
 }
 
 
@@ -55,66 +62,109 @@ class Noun(NamedTuple):
     def phrase(self) -> str:
         return " ".join(filter(None, (self.color, self.material, self.shape or "object")))
 
+    def fits(self, name: str) -> bool:
+        """Whether an object's name has all stated attributes."""
+        return {self.color, self.material, self.shape} - {""} <= set(name.split())
+
 
 class Tag(NamedTuple):
-    """A piece of a sentence: its tag, value and position in the text."""
+    """A piece of a sentence: its tag, value, position in the text, and its text in lower case."""
 
     tag: str
     value: str | Noun
     start: int
     stop: int
+    words: str
+
+    @property
+    def last_word(self) -> str:
+        return self.words.split()[-1] if self.words else ""
 
 
-def tags(text: str, start: int, stop: int) -> list[Tag]:
+END = Tag("stop", "", 0, 0, "")
+"""Stands for every tag outside a sentence."""
+
+
+class Sentence:
+    """The tags of a sentence; an index outside it returns END."""
+
+    def __init__(self, text: str, tags: Sequence[Tag]) -> None:
+        """`text`: the whole text, to which the positions of the tags refer."""
+        self.text = text
+        self.tags = tags
+
+    def __getitem__(self, index: int) -> Tag:
+        return self.tags[index] if 0 <= index < len(self.tags) else END
+
+    def __iter__(self) -> Iterator[Tag]:
+        return iter(self.tags)
+
+    def skip(self, index: int, skipped: Container[str], step: int = 1) -> int:
+        """The index of the first tag from `index` on that is not in `skipped`."""
+        while 0 <= index < len(self.tags) and self.tags[index].tag in skipped:
+            index += step
+        return index
+
+    def find(self, index: int, wanted: Container[str], step: int = 1) -> int:
+        """The index of the first tag from `index` on that is in `wanted`; outside if there is
+        none."""
+        while 0 <= index < len(self.tags) and self.tags[index].tag not in wanted:
+            index += step
+        return index
+
+
+def find_tags(text: str, start: int, stop: int) -> list[Tag]:
     """The tags of text[start:stop] in order. Words outside the vocabulary are tagged "word"."""
-    words, raw, spans = _words(text, start, stop)
+    words, raw, spans = _split_words(text, start, stop)
     found: list[Tag] = []
-    i, count = 0, len(words)
-    while i < count:
-        tag, value, end = _at(words, raw, i)
+    i = 0
+    while i < len(spans):
+        tag, value, end = _tag_at(words, raw, i)
         if tag:
-            found.append(Tag(tag, value, spans[i][0], spans[end - 1][1]))
+            first, last = spans[i][0], spans[end - 1][1]
+            found.append(Tag(tag, value, first, last, text[first:last].lower()))
         i = end
     return found
 
 
-def _words(text: str, start: int, stop: int) -> tuple[list[str], list[str], list[tuple[int, int]]]:
+def _split_words(
+    text: str, start: int, stop: int
+) -> tuple[list[str], list[str], list[tuple[int, int]]]:
+    """The words in lower case with "" behind the last, the words as written, and their spans.
+    "Doesn't" becomes "does" and "not"; other endings behind an apostrophe are dropped."""
     words, raw, spans = [], [], []
     for match in WORD.finditer(text, start, stop):
         whole = match[0]
-        word = whole.lower()
-        if "'" in word or "’" in word:
-            word = word.replace("’", "'")
-            if word.endswith("n't"):
-                words.append({"ca": "can", "wo": "will"}.get(word[:-3], word[:-3]))
-                raw.append(whole)
-                spans.append(match.span())
-                word = "not"
-            else:
-                word, whole = word.split("'")[0], whole[0] if whole[0] in CANDIDATES else whole
-        words.append(word)
-        raw.append(whole)
-        spans.append(match.span())
-    return words, raw, spans
+        stem, _, ending = whole.lower().replace("’", "'").partition("'")
+        if ending == "t" and stem.endswith("n"):
+            parts = [{"ca": "can", "wo": "will"}.get(stem[:-1], stem[:-1]), "not"]
+        else:
+            parts = [stem]
+            if ending and whole[0] in CANDIDATES:
+                whole = whole[0]
+        words += parts
+        raw += [whole] * len(parts)
+        spans += [match.span()] * len(parts)
+    return [*words, ""], raw, spans
 
 
-def _at(words: list[str], raw: list[str], i: int) -> tuple[str, str | Noun, int]:
-    """The tag at word i, its value, and the word after it."""
+Found = tuple[str, str | Noun, int]
+"""A tag, its value, and the index of the word behind it."""
+
+
+def _tag_at(words: list[str], raw: list[str], i: int) -> Found:
+    """The tag that begins at word i."""
     word = words[i]
     if word in PUNCTUATION:
         return PUNCTUATION[word], word, i + 1
     if raw[i] in CANDIDATES and not _is_article(words, raw[i], i):
         return "candidate", raw[i], i + 1
-    if word in NOUN_STARTS:
-        noun, end = _noun(words, i)
-        if noun:
-            return "object", noun, end
-    if word in REGION_STARTS:
-        tag, region, end = _region(words, i)
-        if tag:
-            return tag, region, end
-    for phrase, tag, value in phrases.PHRASES.get(word, ()):
-        if len(phrase) == 1 or tuple(words[i : i + len(phrase)]) == phrase:
+    if word in NOUN_STARTS and (found := _find_noun(words, i)):
+        return found
+    if word in REGION_STARTS and (found := _find_region(words, i)):
+        return found
+    for phrase, tag, value in PHRASES.get(word, ()):
+        if tuple(words[i : i + len(phrase)]) == phrase:
             return tag, value, i + len(phrase)
     if word in ARTICLES or word in LISTED:
         return "", "", i + 1
@@ -125,95 +175,76 @@ def _is_article(words: list[str], letter: str, i: int) -> bool:
     """Whether an "A" is an article. In doubt it is a candidate, unlike in
     `teacher.candidate_letters`: a letter taken for an article would assign the following claims to
     another candidate."""
-    following = words[i + 1] if i + 1 < len(words) else "."
-    described = following in ADJECTIVES or following in EVENTS
+    described = words[i + 1] in ADJECTIVES or words[i + 1] in EVENTS
     return letter == "A" and described and not (i > 0 and words[i - 1] in LISTED)
 
 
-def _noun(words: list[str], i: int) -> tuple[Noun | None, int]:
+def _find_noun(words: list[str], i: int) -> Found | None:
+    """A noun phrase for an object from word i on: "the stationary red cube"."""
     still = others = False
-    count = len(words)
-    while i < count and (words[i] in ARTICLES or words[i] in QUALITIES or words[i] == "the"):
+    while words[i] in ARTICLES or words[i] in QUALITIES:
         still |= words[i] in STILL_WORDS
         others |= words[i] in ("other", "another", "remaining")
         i += 1
-    if i < count and words[i] in ("two", "both"):
+    if words[i] in ("two", "both"):
         i += 1
-    color = nouns.COLOR_WORDS.get(words[i], "") if i < count else ""
+    color = COLOR_WORDS.get(words[i], "")
     i += bool(color)
-    material = nouns.MATERIAL_WORDS.get(words[i], "") if i < count else ""
+    material = MATERIAL_WORDS.get(words[i], "")
     i += bool(material)
-    if i >= count:
-        return None, i
-    word = words[i]
-    if word in nouns.SHAPE_WORDS:
-        return Noun(color, material, nouns.SHAPE_WORDS[word], False, still, others), i + 1
-    if word in nouns.PLURALS and (color or material or nouns.PLURALS[word]):
-        return Noun(color, material, nouns.PLURALS[word], True, still, others), i + 1
-    if word in nouns.ANY_SHAPE and (color or material):
-        return Noun(color, material, "", False, still, others), i + 1
-    return None, i
+    shape = SINGULARS.get(words[i], PLURALS.get(words[i]))
+    if shape is None or not (color or material or shape):
+        return None
+    return "object", Noun(color, material, shape, words[i] in PLURALS, still, others), i + 1
 
 
-def _region(words: list[str], i: int) -> tuple[str, str, int]:
-    """A region from word i on as a tag, a value and the index after it: "near the top-left", "to
-    the upper left corner", "the center"."""
-    count, way = len(words), ""
-    prepared = False
-    while i < count and words[i] in nouns.AT:
-        way = nouns.WAYS.get(words[i], way)
-        prepared = True
+def _find_region(words: list[str], i: int) -> Found | None:
+    """A region from word i on: "near the top-left", "to the upper left corner", "the center"."""
+    begin, way = i, "region"
+    while words[i] in AT:
+        way = WAYS.get(words[i], way)
         i += 1
-    article = False
-    while i < count and words[i] in REGION_FILLERS:
-        article |= words[i] in ("the", "its")
+    prepared = i > begin
+    begin = i
+    while words[i] in REGION_FILLERS:
         i += 1
-    row, column, middle, begin = None, None, False, i
-    while i < count:
-        word = words[i]
-        if word in nouns.ROWS and row is None:
-            row = nouns.ROWS[word]
-        elif word in nouns.COLUMNS and column is None:
-            column = nouns.COLUMNS[word]
-        elif word in nouns.MIDDLE and not middle:
+    definite = "the" in words[begin:i] or "its" in words[begin:i]
+    row = column = None
+    middle = False
+    begin = i
+    while True:
+        if words[i] in ROWS and row is None:
+            row = ROWS[words[i]]
+        elif words[i] in COLUMNS and column is None:
+            column = COLUMNS[words[i]]
+        elif words[i] in MIDDLE and not middle:
             middle = True
         else:
             break
         i += 1
     corner = row is not None and column is not None
-    noun = words[i] if i < count else ""
-    named = noun in nouns.PLACES or noun in nouns.SIDES
-    if words[i - 1] == "right" and noun in nouns.RIGHT_ONES:
+    noun = words[i]
+    named = noun in PLACES or noun in SIDES
+    if words[i - 1] == "right" and noun in RIGHT_ONES:
         # "In the right place" is not a region.
-        return "", "", i
-    if i == begin or not (named or corner or (prepared and (article or middle))):
-        return "", "", i
+        return None
+    if i == begin or not (named or corner or (prepared and (definite or middle))):
+        return None
     i += named
-    if words[i : i + 1] == ["of"]:
-        end = i + 2 if words[i + 1 : i + 2] == ["the"] else i + 1
-        if words[end : end + 1] and words[end] in nouns.IMAGE:
+    if words[i] == "of":
+        end = i + 2 if words[i + 1] == "the" else i + 1
+        if words[end] in IMAGE:
             i = end + 1
         elif not named:
-            # "to the left of the cube" is not a region.
-            return "", "", i
+            # "To the left of the cube" is not a region.
+            return None
     region = REGIONS[1 if row is None else row][1 if column is None else column]
-    coarse = noun in nouns.SIDES and not corner
-    return way or "region", (phrases.COARSE if coarse else "") + region, i
+    coarse = noun in SIDES and not corner
+    return way, (COARSE if coarse else "") + region, i
 
 
 REGION_FILLERS = {"the", "its", "very", "far", "area", "region", "near", "same", "around", "of"}
-REGION_STARTS = {
-    *nouns.AT,
-    *nouns.ROWS,
-    *nouns.COLUMNS,
-    *nouns.MIDDLE,
-    "the",
-}
-LOOKS = {
-    *nouns.COLOR_WORDS,
-    *nouns.MATERIAL_WORDS,
-    *nouns.SHAPE_WORDS,
-    *nouns.PLURALS,
-}
+REGION_STARTS = {*AT, *ROWS, *COLUMNS, *MIDDLE, "the"}
+LOOKS = {*COLOR_WORDS, *MATERIAL_WORDS, *SHAPE_WORDS, *PLURALS}
 NOUN_STARTS = ARTICLES | QUALITIES | LOOKS
 ADJECTIVES = LOOKS | QUALITIES - {"still", "only", "same"}

@@ -10,7 +10,7 @@ from teacher.predicates import Predicates
 from teacher.reading.candidates import CandidateReader
 from teacher.reading.grounding import CUT, EITHER, TARGET, Claim, Ground
 from teacher.reading.scenes import SceneReader
-from teacher.reading.tagging import Tag, tags
+from teacher.reading.tagging import Sentence, Tag, find_tags
 from teacher.sections import split_sections
 
 MOMENTS = {
@@ -33,15 +33,14 @@ def extract_claims(text: str, predicates: Predicates) -> tuple[Claim, ...]:
         if name == "Answer":
             claims += _extract_answer(text, start, stop)
             continue
-        scene = SceneReader(text, ground, MOMENTS.get(name, EITHER))
-        candidates = CandidateReader(text, ground, lasting=name == "Candidate analysis")
-        for sentence in _split_sentences(tags(text, start, stop)):
-            if name == "Candidate analysis" or (
-                name == "Outcome" and any(t.tag == "candidate" for t in sentence)
-            ):
-                claims += candidates.read(sentence)
+        scene = SceneReader(ground, MOMENTS.get(name, EITHER))
+        candidates = CandidateReader(ground, lasting=name == "Candidate analysis")
+        for tags in _split_sentences(find_tags(text, start, stop)):
+            names_candidate = any(tag.tag == "candidate" for tag in tags)
+            if name == "Candidate analysis" or (name == "Outcome" and names_candidate):
+                claims += candidates.read(Sentence(text, tags))
             else:
-                claims += scene.read(sentence)
+                claims += scene.read(Sentence(text, tags))
     claims.sort(key=lambda claim: claim.span)
     return tuple(claim._replace(verdict=ground.verdict(claim)) for claim in claims)
 
