@@ -4,8 +4,9 @@
 
 For each number of scenes, the dynapix preset is built with proportional quotas in three stages:
 scenes with their oracle, items and queries, databases. Prints the seconds of each stage, scenes per
-second and worker, and the peak memory of all processes together. An interrupted build resumes in
-FOLDER (store/growth), so only an uninterrupted build is measured correctly.
+second and worker, and the peak memory (GiB) of all processes together. The benchmarks are built in
+FOLDER (store/growth). An interrupted build resumes there, so only an uninterrupted one is measured
+correctly.
 """
 
 from __future__ import annotations
@@ -14,24 +15,26 @@ import argparse
 import logging
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import lru_cache
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
+import pandas as pd
 import psutil
 
 from conf.compose import compose
 from conf.schema import BenchmarkConfig, BuildCommand, Quota
-from data.build import lock_partial_build
+from data import build
 from data.parallel import Workers
-from data.store import load_scene, scene_path
-from data.tracks.build_items import family_quotas, make_items_and_queries
-from data.tracks.retrieval.database import make_databases
-from data.tracks.shortfalls import count_records, find_shortfalls
-from data.world.scenes import make_scenes
+from data.store import open_store
+from data.tracks.build_items import family_quotas
+from data.tracks.shortfalls import summarize_store
 
 PAPER_SCENES = 10_000
+STAGES = ("make_scenes", "make_items_and_queries", "make_databases")
+"""Functions of `data.build` that run the stages."""
 
 
 def scale_preset(scenes: int) -> BenchmarkConfig:
@@ -52,68 +55,58 @@ def scale_preset(scenes: int) -> BenchmarkConfig:
     return cfg
 
 
-class MemoryMonitor:
-    """Samples the memory (GiB) of this process and its children and keeps the maximum."""
-
-    def __init__(self) -> None:
-        self.peak_gib = 0.0
-        threading.Thread(target=self._watch, daemon=True).start()
-
-    def _watch(self) -> None:
-        own = psutil.Process()
-        while True:
-            total = 0
-            for process in (own, *own.children(recursive=True)):
-                try:
-                    total += process.memory_info().rss
-                except psutil.NoSuchProcess:
-                    continue
-            self.peak_gib = max(self.peak_gib, total / 2**30)
-            time.sleep(0.5)
+def watch_memory(row: dict[str, float]) -> None:
+    """Keep the largest memory of this process and its children in `row`."""
+    own = psutil.Process()
+    while True:
+        total = 0
+        for process in (own, *own.children(recursive=True)):
+            with suppress(psutil.NoSuchProcess):
+                total += process.memory_info().rss
+        row["peak GiB"] = max(row["peak GiB"], total / 2**30)
+        time.sleep(0.5)
 
 
-@contextmanager
-def timed(times: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    times[stage] = time.perf_counter() - start
+def measure(scenes: int, folder: Path, workers: int) -> dict[str, float]:
+    """Build a benchmark, print its records, and return the measurements."""
+    cfg = scale_preset(scenes)
+    if (folder / cfg.name).exists():
+        raise SystemExit(
+            f"error: {folder / cfg.name} is already built: delete it to build it again"
+        )
+    row = {"scenes": scenes, "peak GiB": 0.0}
+    threading.Thread(target=watch_memory, args=[row], daemon=True).start()
 
+    def timed(name: str) -> Callable[..., Any]:
+        stage = getattr(build, name)
 
-def measure(scenes: int, folder: Path, workers: int) -> str:
-    cfg, pool, memory = scale_preset(scenes), Workers(workers), MemoryMonitor()
-    times: dict[str, float] = {}
-    with lock_partial_build(cfg, folder / cfg.name) as partial:
-        with timed(times, "scenes"):
-            scene_ids, _ = make_scenes(cfg, partial, pool, strict=True)
-        with timed(times, "items"):
-            items, queries, dropped = make_items_and_queries(cfg, partial, scene_ids, pool)
-        with timed(times, "databases"):
-            scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(partial, name)))
-            queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
-    counts = count_records(scene_ids, items, queries, databases) | dropped | left_out
-    shortfalls = find_shortfalls(cfg, items, queries, databases)
-    print("\n".join(f"  {name:<40}{count:>8,}" for name, count in counts.items()))
-    print("\n".join(f"  below its quota: {cell} has {count}" for cell, count in shortfalls.items()))
-    counterfactual = len(list(partial.glob("scenes/*-without-*.npz")))
-    rate = (scenes + counterfactual) / times["scenes"] / workers
-    row = "".join(f"{times[stage]:>11.1f}" for stage in ("scenes", "items", "databases"))
-    return f"{scenes:>8,}{counterfactual:>16,}{row}{rate:>14.1f}{memory.peak_gib:>10.1f}"
+        def call(*args: Any) -> Any:
+            start = time.perf_counter()
+            result = stage(*args)
+            row[f"{name}, s"] = time.perf_counter() - start
+            return result
+
+        return call
+
+    with patch.multiple(build, **{name: timed(name) for name in STAGES}):
+        build.build(cfg, folder / cfg.name, Workers(workers), strict=True)
+    store = open_store(folder / cfg.name)
+    print(summarize_store(store))
+    row["counterfactual"] = len(list(store.folder.glob("scenes/*-without-*.npz")))
+    row["scenes/s/worker"] = (scenes + row["counterfactual"]) / row["make_scenes, s"] / workers
+    return row
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("scenes", type=int, nargs="+")
     parser.add_argument("--folder", type=Path, default=Path("store/growth"))
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     logging.basicConfig(level=logging.WARNING)
     rows = [measure(scenes, options.folder, options.workers) for scenes in options.scenes]
-    print(
-        f"\n{options.workers} workers; seconds per stage; rate of scenes with counterfactual ones"
-    )
-    head = f"{'scenes':>8}{'counterfactual':>16}{'scenes':>11}{'items':>11}{'databases':>11}"
-    print(head + f"{'scenes/s/core':>14}{'peak GiB':>10}")
-    print("\n".join(rows))
+    print(f"\n{options.workers} workers; the rate includes counterfactual scenes")
+    print(pd.DataFrame(rows).to_string(index=False, float_format="{:.1f}".format))
 
 
 if __name__ == "__main__":

@@ -7,37 +7,45 @@ import ctypes
 import json
 import os
 import resource
-import statistics
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import pandas as pd
 import torch
 from tqdm import tqdm
 from transformers import (
+    AutoModelForImageTextToText,
     PrinterCallback,
     ProgressCallback,
     Qwen3VLConfig,
-    Qwen3VLForConditionalGeneration,
     Trainer,
     TrainerCallback,
 )
 
+from benchmarks.speed import hours
 from conf.errors import UserError
 from conf.runs import Run
 from conf.schema import TrainConfig
 from models.tiny_qwen3_vl import SPECIAL_TOKENS, build_processor
 from train.common.arguments import common_arguments
 
+OURS = "ours"
+"""Name of the variant with our trainer and the preset's settings."""
 SEED = 0
+TRAINING_ONLY = {
+    "eval_strategy": "no", "eval_on_start": False, "save_strategy": "no",
+    "load_best_model_at_end": False, "disable_tqdm": True,
+}  # fmt: skip
+"""Training arguments without evaluations and checkpoints."""
 CONFIGS = Path(__file__).parents[2] / "tests/models/configs"
 """The configurations of the released models."""
 
@@ -55,45 +63,37 @@ class Measurements:
 
 
 class Clock(TrainerCallback):
-    """Records the end time and the loss of each step, and the peak memory."""
+    """Records the end time of each step."""
 
     def __init__(self) -> None:
         self.ends: list[float] = []
-        self.losses: list[float] = []
-        self.peak = 0.0
-
-    def on_train_begin(self, *_: Any, **__: Any) -> None:
-        reset_peak_memory()
 
     def on_step_end(self, *_: Any, **__: Any) -> None:
         if torch.cuda.is_available():
             torch.cuda.synchronize()
         self.ends.append(time.perf_counter())
 
-    def on_log(self, args, state, control, logs=None, **_: Any) -> None:
-        if "loss" in (logs or {}):
-            self.losses.append(logs["loss"])
-
-    def on_train_end(self, *_: Any, **__: Any) -> None:
-        self.peak = peak_memory() / 2**30
-
 
 def train(trainer: Trainer, batch: int) -> Measurements:
-    """Train to the end; `batch` is the number of samples or queries of a step."""
+    """Train without evaluations and checkpoints; `batch` is the number of samples or queries of a
+    step."""
     clock = Clock()
     trainer.add_callback(clock)
     for callback in (ProgressCallback, PrinterCallback):
         trainer.remove_callback(callback)
+    for key, value in TRAINING_ONLY.items():
+        setattr(trainer.args, key, value)
+    reset_peak_memory()
     trainer.train()
+    peak = peak_memory() / 2**30
     seconds = [end - start for start, end in pairwise(clock.ends)]
-    return Measurements(batch * len(seconds) / sum(seconds), clock.peak, clock.losses)
+    losses = [entry["loss"] for entry in trainer.state.log_history if "loss" in entry]
+    return Measurements(batch * len(seconds) / sum(seconds), peak, losses)
 
 
 def timing_arguments(train: TrainConfig, folder: Path) -> dict[str, Any]:
-    """The arguments of a project's trainer, without evaluations and checkpoints."""
-    never = {"eval_strategy": "no", "eval_on_start": False, "save_strategy": "no"}
-    common = common_arguments(train, Run("benchmark", folder), SEED, None)
-    return {**common, **never, "disable_tqdm": True}
+    """The training arguments of the project, without evaluations and checkpoints."""
+    return {**common_arguments(train, Run("benchmark", folder), SEED, None), **TRAINING_ONLY}
 
 
 def run_in_process(
@@ -119,54 +119,49 @@ def add_arguments(parser: argparse.ArgumentParser, steps: int, variants: Sequenc
 
 
 def compare(
+    benchmark: str,
     measure: Callable[[str], Measurements],
     names: Sequence[str],
     reference: str,
     unit: str,
-    rounds: int,
-) -> dict[str, list[Measurements]]:
-    """Measure variants in turns, and print medians and the medians of their ratios.
+    args: argparse.Namespace,
+) -> None:
+    """Measure variants in turns, and print medians over the rounds and medians of their ratios.
+
+    On a GPU, the rate of our trainer with a released preset is recorded.
 
     Args:
+        benchmark: Module of `benchmarks.speed` that measures.
         measure: Measures the variant of a name. One that has too little memory or cannot be
             trained with its settings is left out.
         reference: Variant that all others are compared with.
         unit: What a rate counts, such as samples.
-
-    Returns:
-        The measurements of each variant that was measured, by round.
+        args: Options of `add_arguments`.
     """
-    turns = [name for _ in range(rounds) for name in names]
-    results: dict[str, list[Measurements | str]] = {name: [] for name in names}
-    for name in tqdm(turns, unit="training"):
+    rows, failures = [], {}
+    for turn, name in tqdm(list(product(range(args.rounds), names)), unit="training"):
         try:
-            results[name].append(measure(name))
+            found = measure(name)
         except torch.OutOfMemoryError:
-            results[name].append("out of memory")
+            failures[name] = "out of memory"
         except UserError as error:
-            results[name].append(str(error))
-    print(f"{'':<44}{unit + '/s':>11}{'ratio':>8}{'peak GiB':>10}{'ratio':>8}{'loss':>10}")
-    measured = {}
-    for name, found in results.items():
-        if failures := [result for result in found if isinstance(result, str)]:
-            print(f"{name:<44}{failures[0]}", flush=True)
-            continue
-        measured[name] = found
-        line = f"{name:<44}"
-        for field, width in (("rate", 11), ("peak", 10)):
-            line += f"{statistics.median(getattr(r, field) for r in found):>{width}.2f}"
-            line += f"{median_ratio(found, measured.get(reference, []), field):>8.2f}"
-        print(f"{line}{found[0].losses[-1]:>10.4f}", flush=True)
-    return measured
-
-
-def median_ratio(
-    found: Sequence[Measurements], reference: Sequence[Measurements], field: str
-) -> float:
-    """Median over the rounds of a measurement's ratio to the reference; NaN without a reference."""
-    pairs = zip(found, reference, strict=False)
-    ratios = [getattr(a, field) / getattr(b, field) for a, b in pairs]
-    return statistics.median(ratios) if ratios else float("nan")
+            failures[name] = str(error)
+        else:
+            rows.append((name, turn, found.rate, found.peak, found.losses[-1]))
+    for name, failure in failures.items():
+        print(f"{name}: {failure}")
+    table = pd.DataFrame(rows, columns=["variant", "round", f"{unit}/s", "peak GiB", "loss"])
+    table = table[~table["variant"].isin(failures)].set_index(["round", "variant"])
+    medians = table.groupby("variant", sort=False).median()
+    if reference in medians.index:
+        ratios = table / table.xs(reference, level="variant").reindex(table.index, level="round")
+        medians = medians.join(
+            ratios.groupby("variant").median().drop(columns="loss"), rsuffix=", ratio"
+        )
+    print(medians.to_string(float_format="{:.4f}".format), flush=True)
+    if OURS in medians.index and args.preset != "tiny" and torch.cuda.is_available():
+        rate, card = medians.loc[OURS, f"{unit}/s"], torch.cuda.get_device_name()
+        hours.add_rate(benchmark, args.preset, args.quantization, rate, card)
 
 
 def write_random_base(preset: str, texts: list[str], image_size: int, folder: Path) -> None:
@@ -180,33 +175,21 @@ def write_random_base(preset: str, texts: list[str], image_size: int, folder: Pa
         ("vision_end_token_id", "<|vision_end|>"),
     ):
         setattr(config, key, SPECIAL_TOKENS.index(token))
-    default = torch.get_default_dtype()
-    torch.set_default_dtype(torch.bfloat16)
-    try:
-        with torch.device("cuda" if torch.cuda.is_available() else "cpu"):
-            Qwen3VLForConditionalGeneration(config).save_pretrained(folder)
-    finally:
-        torch.set_default_dtype(default)
+    with torch.device("cuda" if torch.cuda.is_available() else "cpu"):
+        model = AutoModelForImageTextToText.from_config(config, dtype=torch.bfloat16)
+    model.save_pretrained(folder)
     build_processor(texts, 1024, image_size).save_pretrained(folder)
-
-
-def device_name() -> str:
-    if torch.cuda.is_available():
-        return torch.cuda.get_device_name()
-    return f"a CPU with {torch.get_num_threads()} threads"
 
 
 def reset_peak_memory() -> None:
     """Start to count the memory for `peak_memory`."""
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
-    elif sys.platform.startswith("linux"):
-        libc = ctypes.CDLL(None)
-        if hasattr(libc, "malloc_trim"):
-            # Memory that earlier steps freed would hide what this one allocates.
-            libc.malloc_trim(0)
-        with suppress(OSError):
-            Path("/proc/self/clear_refs").write_text("5")
+        return
+    with suppress(OSError, AttributeError):
+        # Memory that earlier steps freed would hide what this one allocates.
+        ctypes.CDLL(None).malloc_trim(0)
+        Path("/proc/self/clear_refs").write_text("5")
 
 
 def peak_memory() -> int:

@@ -10,21 +10,20 @@ rate of our trainer with the preset's settings on a GPU is recorded for benchmar
 The tiny retriever has adapters over the tiny base in 4 bits; a released size has random weights, so
 nothing is downloaded.
 
-The plain library has its own collator and losses, and reads pixels batch by batch, as ours does.
-Its variants have mini-batches by tokens, or this project's attention and memory settings.
+The plain library uses its own collator and losses, and reads pixels batch by batch, as ours does.
+One variant of it limits mini-batches by their tokens, and one has this project's attention and
+memory settings.
 """
 
 from __future__ import annotations
 
 import argparse
-import statistics
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from sentence_transformers import SentenceTransformerTrainer, SentenceTransformerTrainingArguments
 from sentence_transformers.sentence_transformer.data_collator import SentenceTransformerDataCollator
 from sentence_transformers.sentence_transformer.losses import (
@@ -33,9 +32,10 @@ from sentence_transformers.sentence_transformer.losses import (
 )
 from transformers import Trainer, set_seed
 
-from benchmarks.speed import comparison, hours
-from benchmarks.speed.comparison import SEED, Measurements, timing_arguments
+from benchmarks.speed import comparison
+from benchmarks.speed.comparison import OURS, SEED, Measurements, timing_arguments
 from conf.compose import compose
+from conf.runs import Run
 from conf.schema import ContrastiveCommand
 from data.build import ensure_benchmark
 from data.records import RetrievalQuery
@@ -44,9 +44,10 @@ from models import compat
 from models.lora_kernels import fuse
 from models.precision import resolve_precision
 from models.retriever import embedder
-from train.retriever.batches import QueryBatchSampler, batch_columns
-from train.retriever.run import build_loss
-from train.retriever.trainer import NUMBER, IndexCollator, RetrieverTrainer, numbered_rows
+from models.retriever.embedder import Retriever
+from train.retriever.batches import QueryBatchSampler
+from train.retriever.run import build_trainer
+from train.retriever.trainer import NUMBER, numbered_rows
 
 TINY = [
     "retriever=tiny", "retriever.architecture=null", "retriever.model=checkpoints/bases/tiny",
@@ -67,7 +68,7 @@ class Variant:
     """Give the plain library this project's attention and memory settings."""
 
 
-PLAIN, OURS = "plain sentence-transformers", "ours"
+PLAIN = "plain sentence-transformers"
 VARIANTS = {
     PLAIN: Variant(plain=True),
     "plain, by tokens": Variant(plain=True, tokens=3072),
@@ -97,22 +98,17 @@ def main() -> None:
             overrides.append(f"retriever.model={folder}")
         for batch in args.batch:
             print(f"\nbatches of {batch} queries")
-            compare_speed([*overrides, f"train.batch={batch}"], args)
-
-
-def compare_speed(overrides: list[str], args: argparse.Namespace) -> None:
-    results = comparison.compare(
-        lambda name: comparison.run_in_process(measure, overrides, VARIANTS[name], args.steps),
-        args.only or list(VARIANTS),
-        PLAIN,
-        "queries",
-        args.rounds,
-    )
-    if OURS in results and args.preset != "tiny" and torch.cuda.is_available():
-        rate = statistics.median(result.rate for result in results[OURS])
-        hours.add_rate(
-            "contrastive", args.preset, args.quantization, rate, comparison.device_name()
-        )
+            settings = [*overrides, f"train.batch={batch}"]
+            comparison.compare(
+                "contrastive",
+                lambda name, settings=settings: comparison.run_in_process(
+                    measure, settings, VARIANTS[name], args.steps
+                ),
+                args.only or list(VARIANTS),
+                PLAIN,
+                "queries",
+                args,
+            )
 
 
 def measure(overrides: list[str], variant: Variant, steps: int) -> Measurements:
@@ -131,40 +127,24 @@ def measure(overrides: list[str], variant: Variant, steps: int) -> Measurements:
         model = embedder.load_retriever(cfg.retriever, cfg.train.precision, [], Path(folder))
         if not helped:
             model[0].model.set_attn_implementation("sdpa")
-        build = build_plain_trainer if variant.plain else build_own_trainer
-        trainer = build(cfg, model, queries, frames, Path(folder), variant.tokens)
+        if variant.plain:
+            trainer = build_plain_trainer(cfg, model, queries, frames, Path(folder), variant.tokens)
+        else:
+            fuse(model)
+            run, batch = Run("benchmark", Path(folder)), cfg.train.batch
+            # Nothing is evaluated, but the trainer needs a held-out query.
+            trainer = build_trainer(cfg, run, store, model, queries, queries[:1], batch, None)
         return comparison.train(trainer, cfg.train.batch)
 
 
-def shared_options(cfg: ContrastiveCommand, queries: list[RetrievalQuery], folder: Path) -> dict:
-    """The arguments that both trainers share."""
-    train = cfg.train
-    return {
-        "args": SentenceTransformerTrainingArguments(
-            **timing_arguments(train, folder) | {"dataloader_num_workers": 0},
-            per_device_train_batch_size=train.batch,
-            dataloader_drop_last=True,
-        ),
-        "train_dataset": numbered_rows(len(queries)),
-        "sampler": QueryBatchSampler(queries, train.hard_negatives, train.batch, SEED),
-    }
-
-
-def build_own_trainer(cfg, model, queries, frames, folder, tokens) -> Trainer:
-    """The trainer as `train.contrastive` builds it, without evaluations and checkpoints."""
-    fuse(model)
-    return RetrieverTrainer(
-        model=model,
-        **shared_options(cfg, queries, folder),
-        loss=build_loss(cfg.train, cfg.retriever, model, frames),
-        data_collator=IndexCollator(preprocess_fn=model.preprocess),
-        columns_of=lambda numbers: batch_columns(
-            [queries[k] for k in numbers], cfg.train.hard_negatives
-        ),
-    )
-
-
-def build_plain_trainer(cfg, model, queries, frames, folder, tokens) -> Trainer:
+def build_plain_trainer(
+    cfg: ContrastiveCommand,
+    model: Retriever,
+    queries: list[RetrievalQuery],
+    frames: FrameReader,
+    folder: Path,
+    tokens: int | None,
+) -> Trainer:
     """The library's trainer, collator and losses; its collator reads pixels batch by batch."""
     columns = ["query", "target", *(f"negative_{k}" for k in range(cfg.train.hard_negatives))]
     prompts = dict.fromkeys(columns, cfg.retriever.frame_instruction)
@@ -179,9 +159,16 @@ def build_plain_trainer(cfg, model, queries, frames, folder, tokens) -> Trainer:
         mini_batch_size=cfg.train.mini_batch,
         mini_batch_num_tokens=tokens,
     )
-    return PlainTrainer(
+    sampler = QueryBatchSampler(queries, cfg.train.hard_negatives, cfg.train.batch, SEED)
+    return SentenceTransformerTrainer(
         model=model,
-        **shared_options(cfg, queries, folder),
+        args=SentenceTransformerTrainingArguments(
+            **timing_arguments(cfg.train, folder) | {"dataloader_num_workers": 0},
+            per_device_train_batch_size=cfg.train.batch,
+            dataloader_drop_last=True,
+            batch_sampler=lambda *_, **__: sampler,
+        ),
+        train_dataset=numbered_rows(len(queries)),
         loss=MatryoshkaLoss(model, ranking, list(cfg.retriever.widths), cfg.train.width_weights),
         data_collator=collator,
     )
@@ -194,17 +181,6 @@ def load_columns(
     images = (embedder.frame_input(f, frames) for f in (query.target, *query.hard_negatives))
     inputs = [embedder.query_input(query, frames, cfg.retriever), *images]
     return dict(zip(columns, inputs, strict=False))
-
-
-class PlainTrainer(SentenceTransformerTrainer):
-    """The library's trainer on batches of ours."""
-
-    def __init__(self, *args: Any, sampler: QueryBatchSampler, **options: Any) -> None:
-        self._sampler = sampler
-        super().__init__(*args, **options)
-
-    def get_batch_sampler(self, *_: Any, **__: Any) -> QueryBatchSampler:
-        return self._sampler
 
 
 class FrameCollator(SentenceTransformerDataCollator):

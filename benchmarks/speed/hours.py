@@ -22,6 +22,7 @@ from pathlib import Path
 from conf.compose import compose
 from conf.errors import UserError
 from conf.schema import ContrastiveCommand, SftCommand
+from data.tracks.build_items import family_quotas
 
 RATES = Path(__file__).with_name("rates.jsonl")
 REGIMES = ("answer_only", "cot", "cot_no_candidate_analysis", "cot_no_match_layout")
@@ -41,22 +42,13 @@ class Rate:
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """A training run of the paper's scale and the benchmark that measures its rate."""
+    """A training run of the paper's scale."""
 
     name: str
     samples: float
     """Samples or queries, over all epochs."""
-    benchmark: str
-    preset: str
-    quantization: str
-
-    @property
-    def command(self) -> str:
-        """The command that measures the rate."""
-        return (
-            f"python -m benchmarks.speed.{self.benchmark} {self.preset} "
-            f"--quantization {self.quantization}"
-        )
+    measured_by: tuple[str, str, str]
+    """Benchmark, preset and quantization of its rate."""
 
 
 def main() -> None:
@@ -76,43 +68,41 @@ def list_runs(student: str, retriever: str) -> list[TrainingRun]:
     for regime in REGIMES:
         overrides = [f"+exp={regime}", "benchmark=dynapix", f"student={student}"]
         cfg = compose("train.sft", SftCommand, overrides)
-        track = cfg.benchmark.selection
-        items = sum(q.train for f in (track.event, track.time, track.window) for q in f.values())
+        quotas = family_quotas(cfg.benchmark).values()
+        items = sum(quota.train for family in quotas for quota in family.values())
         # A CoT regime has two samples per item: one in answer mode, one in reasoning mode.
         samples = items * (1 if regime == "answer_only" else 2) * cfg.train.epochs
-        name, quantization = f"train.sft +exp={regime}", cfg.student.quantization
-        runs.append(TrainingRun(name, samples, "sft", student, quantization))
+        measured_by = ("sft", student, cfg.student.quantization)
+        runs.append(TrainingRun(f"train.sft +exp={regime}", samples, measured_by))
     overrides = ["benchmark=dynapix", f"retriever={retriever}"]
     cfg = compose("train.contrastive", ContrastiveCommand, overrides)
     queries = sum(quota.train for quota in cfg.benchmark.retrieval.builders.values())
-    samples, quantization = queries * cfg.train.epochs, cfg.retriever.quantization
-    run = TrainingRun("train.contrastive", samples, "contrastive", retriever, quantization)
-    return [*runs, run]
+    measured_by = ("contrastive", retriever, cfg.retriever.quantization)
+    return [*runs, TrainingRun("train.contrastive", queries * cfg.train.epochs, measured_by)]
 
 
 def format_table(runs: list[TrainingRun], rates: list[Rate]) -> str:
     """Format the hours by run and card, and the commands that measure missing rates."""
+    head = f"{'on one GPU':<40}{'samples':>9}{'a second':>10}{'hours':>8}  measured on"
     lines: list[str] = []
-    missing: dict[str, list[str]] = {}
+    missing: dict[tuple[str, str, str], list[str]] = {}
     for run in runs:
-        key = (run.benchmark, run.preset, run.quantization)
         # Later lines of a card replace earlier ones.
-        known = {r.card: r for r in rates if (r.benchmark, r.preset, r.quantization) == key}
+        known = {
+            r.card: r for r in rates if (r.benchmark, r.preset, r.quantization) == run.measured_by
+        }
+        lines += [head] if known and not lines else []
         lines += [
             f"{run.name:<40}{run.samples:>9,.0f}{rate.rate:>10.2f}"
             f"{run.samples / rate.rate / 3600:>8.1f}  {card}, {rate.date}"
             for card, rate in known.items()
         ]
         if not known:
-            missing.setdefault(run.command, []).append(run.name)
-    if lines:
-        lines.insert(
-            0, f"{'on one GPU':<40}{'samples':>9}{'a second':>10}{'hours':>8}  measured on"
-        )
+            missing.setdefault(run.measured_by, []).append(run.name)
     lines += [
-        f"No rate is measured for {', '.join(names)}: run {command} on your GPU, which adds it to "
-        f"{RATES.name}."
-        for command, names in missing.items()
+        f"No rate is measured for {', '.join(names)}: run python -m benchmarks.speed.{benchmark} "
+        f"{preset} --quantization {quantization} on your GPU, which adds it to {RATES.name}."
+        for (benchmark, preset, quantization), names in missing.items()
     ]
     return "\n".join(lines)
 

@@ -23,8 +23,7 @@ import shutil
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -47,28 +46,25 @@ def main() -> None:
         command = commands.add_parser(name)
         command.add_argument("--queries", type=int, default=queries)
         command.add_argument("--frames", type=int, default=frames)
-        command.add_argument("--widths", type=int, nargs="+", default=WIDTHS, help="widest first")
-        command.add_argument("--rounds", type=int, default=3)
-        command.add_argument(
-            "--folder", help="parent of the folder with the embeddings; by default /tmp"
-        )
         command.set_defaults(measure=measure)
+        if measure is measure_ranks:
+            command.add_argument("--rounds", type=int, default=3)
+        else:
+            command.add_argument("--folder", help="parent of the cache's folder, by default /tmp")
     args = parser.parse_args()
     cores = len(os.sched_getaffinity(0))
     print(f"{cores} core(s), OMP_NUM_THREADS={os.environ.get('OMP_NUM_THREADS', 'unset')}")
-    print(f"{args.queries:,} queries, {args.frames:,} frames, widths {args.widths}")
+    print(f"{args.queries:,} queries, {args.frames:,} frames, widths {WIDTHS}")
     args.measure(args)
 
 
 def measure_ranks(args: argparse.Namespace) -> None:
-    database = embed_frames(range(args.frames), args.widths[0])
+    database = embed_frames(range(args.frames))
     queries, targets = embed_queries(args)
     rounds = []
     for _ in range(args.rounds + 1):
         product, _ = timed(lambda: queries @ database.T)
-        ranking, ranks = timed(
-            lambda: exact_ranks(queries, database[targets], [database], args.widths)
-        )
+        ranking, ranks = timed(lambda: exact_ranks(queries, database[targets], [database], WIDTHS))
         rounds.append((product, ranking, ranking / product))
     # The first round warms caches and is not counted.
     product, ranking, ratio = map(statistics.median, zip(*rounds[1:], strict=True))
@@ -78,63 +74,44 @@ def measure_ranks(args: argparse.Namespace) -> None:
 
 def measure_large(args: argparse.Namespace) -> None:
     queries, targets = embed_queries(args)
-    with temporary_folder(args) as folder:
-        writing, cache = timed(lambda: write_embeddings(folder, args))
-        ranking, ranks = timed(lambda: rank_exactly(cache, queries, targets, args))
+    names = [f"{frame // SCENE:06d}/{frame % SCENE}" for frame in range(args.frames)]
+    with tempfile.TemporaryDirectory(prefix="retrieval-", dir=args.folder) as folder:
+        needed, free = 4.2 * args.frames * WIDTHS[0], shutil.disk_usage(folder).free
+        if free < needed:
+            sizes = f"{needed / 2**30:.0f} GiB are needed and {free / 2**30:.0f} free"
+            raise SystemExit(f"error: {sizes}: give another --folder")
+        cache = EmbeddingCache(Path(folder), "frame", {"weights": "random", "entries": WIDTHS[0]})
+        frames = dict(zip(names, range(args.frames), strict=True))
+        writing, _ = timed(lambda: cache.complete(frames, embed_frames, SCENE))
+
+        def rank() -> Ranks:
+            gold = cache.rows([names[k] for k in targets])
+            return exact_ranks(queries, gold, cache.parts(names), WIDTHS)
+
+        ranking, ranks = timed(rank)
     print(f"written in {writing:.0f} s, ranked in {ranking:.1f} s")
     print_ranks(ranks)
 
 
-def rank_exactly(
-    cache: EmbeddingCache, queries: np.ndarray, targets: np.ndarray, args: argparse.Namespace
-) -> Ranks:
-    """The exact ranks of the targets among the frames of a cache."""
-    gold = cache.rows([frame_name(k) for k in targets])
-    parts = cache.parts([frame_name(k) for k in range(args.frames)])
-    return exact_ranks(queries, gold, parts, args.widths)
-
-
-def write_embeddings(folder: Path, args: argparse.Namespace) -> EmbeddingCache:
-    """Write random embeddings in the files of the embedding cache, and open them."""
-    cache = EmbeddingCache(folder, "frame", {"weights": "random", "entries": args.widths[0]})
-    frames = {frame_name(k): k for k in range(args.frames)}
-    cache.complete(frames, lambda part: embed_frames(part, args.widths[0]), SCENE)
-    return cache
-
-
-@contextmanager
-def temporary_folder(args: argparse.Namespace) -> Iterator[Path]:
-    """A folder with room for the embeddings, deleted at the end."""
-    with tempfile.TemporaryDirectory(prefix="retrieval-", dir=args.folder) as folder:
-        needed, free = 4.2 * args.frames * args.widths[0], shutil.disk_usage(folder).free
-        if free < needed:
-            sizes = f"{needed / 2**30:.0f} GiB are needed and {free / 2**30:.0f} free"
-            raise SystemExit(f"error: {sizes}: give another --folder")
-        yield Path(folder)
-
-
-def frame_name(frame: int) -> str:
-    return f"{frame // SCENE:06d}/{frame % SCENE}"
-
-
-def embed_frames(frames: range | list[int], width: int) -> np.ndarray:
-    """(frames, width) embeddings; a frame's row does not depend on the other frames."""
-    rows = np.empty((len(frames), width), np.float32)
-    centers: dict[int, np.ndarray] = {}
+def embed_frames(frames: range | list[int]) -> np.ndarray:
+    """Embeddings of frames; the row of a frame does not depend on the other frames."""
+    rows = np.empty((len(frames), WIDTHS[0]), np.float32)
     for k, frame in enumerate(frames):
-        scene = frame // SCENE
-        if scene not in centers:
-            centers = {scene: np.random.default_rng((0, scene)).standard_normal(width, np.float32)}
-        noise = np.random.default_rng((1, frame)).standard_normal(width, np.float32)
-        rows[k] = centers[scene] + 0.5 * noise
+        if k == 0 or frame // SCENE != frames[k - 1] // SCENE:
+            center = random_vector(0, frame // SCENE)
+        rows[k] = center + 0.5 * random_vector(1, frame)
     return rows
+
+
+def random_vector(*seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal(WIDTHS[0], np.float32)
 
 
 def embed_queries(args: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
     """Query embeddings, and the indices of their target frames."""
     rng = np.random.default_rng(2)
     targets = np.sort(rng.choice(args.frames, args.queries, replace=args.queries > args.frames))
-    rows = embed_frames(targets.tolist(), args.widths[0])
+    rows = embed_frames(targets.tolist())
     return rows + 2 * rng.standard_normal(rows.shape, np.float32), targets
 
 

@@ -10,10 +10,10 @@ and the ratios to our trainer with the preset's settings, whose rate on a GPU is
 benchmarks.speed.hours. A released size has random weights, so nothing is downloaded. Each loss
 follows its trainer's own convention.
 
-TRL runs with its default settings and with each setting that could help it, including the MALLOC_*
-variables, which set what our trainer sets with mallopt. Its own collator supports no videos, so it
-has a collator of ours. It casts adapters over 4-bit weights to bf16. Without TRL only our trainer
-is measured.
+TRL runs with its default settings, and with each setting that could make it faster. Among these are
+the MALLOC_* variables, which have the effect of our trainer's calls of mallopt. TRL's collator does
+not support videos, so TRL uses ours. It casts adapters over 4-bit weights to bf16. Without TRL only
+our trainer is measured.
 
 `--losses` compares the losses of all steps in fp32 over the unquantised base; our trainer then uses
 TRL's convention, the mean over a micro-batch's tokens and over micro-batches.
@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import statistics
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -33,28 +32,26 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.utils.data import SequentialSampler, Subset
-from transformers import ProcessorMixin, Trainer, TrainingArguments, set_seed
+from torch.utils.data import Subset
+from transformers import ProcessorMixin, Trainer, set_seed
 
-from benchmarks.speed import comparison, hours
-from benchmarks.speed.comparison import SEED, Measurements, timing_arguments
+from benchmarks.speed import comparison
+from benchmarks.speed.comparison import OURS, SEED, Measurements, timing_arguments
 from conf.compose import compose
+from conf.runs import Run
 from conf.schema import SftCommand
 from data.build import ensure_benchmark
 from models import compat, loading
 from models.attention import flash_attention
 from models.lora_kernels import fuse
-from models.memory import available_cpu_bytes
 from models.precision import resolve_precision
-from models.student.collator import Collator, encode, letter_ids, pad
+from models.student.collator import Collator, encode, pad
 from models.student.prompts import Sample
 from teacher.narrate import ensure_rationales
 from train.student.dataset import load_datasets, tokenizer_corpus
 from train.student.length_sampler import LengthSampler
-from train.student.metrics import LetterAccuracy
-from train.student.run import prefetch_factor
-from train.student.trainer import StudentTrainer, TrainerCollator, token_mean
-from train.student.vision_cache import VisionCache
+from train.student.run import build_trainer
+from train.student.trainer import token_mean
 
 MALLOC = {
     "MALLOC_MMAP_THRESHOLD_": str(1 << 30),
@@ -75,7 +72,7 @@ class Variant:
     environment: dict[str, str] = field(default_factory=dict)
 
 
-OURS, DEFAULT = "ours", "TRL, default settings"
+DEFAULT = "TRL, default settings"
 KEPT, RECOMPUTED = "gradient_checkpointing=false", "gradient_checkpointing=true"
 TRL_SETTINGS = ("workers=0", "micro_batch=8", KEPT)
 VARIANTS = {
@@ -106,7 +103,7 @@ def main() -> None:
     if args.losses:
         args.precision, args.quantization = "fp32", "none"
     overrides = [
-        "+exp=cot", f"student={args.preset}", f"store={args.store}",
+        "+exp=cot", "train.generated_items=0", f"student={args.preset}", f"store={args.store}",
         f"student.quantization={args.quantization}",
         f"train.precision={resolve_precision(args.precision)}",
     ]  # fmt: skip
@@ -118,25 +115,20 @@ def main() -> None:
             compare_losses(overrides, args.steps)
         else:
             names = [name for name, variant in VARIANTS.items() if has_trl or not variant.trl]
-            compare_speed(overrides, args, args.only or names)
-
-
-def compare_speed(overrides: list[str], args: argparse.Namespace, names: list[str]) -> None:
-    results = comparison.compare(
-        lambda name: measure_in_process(overrides, VARIANTS[name], args.steps),
-        names,
-        OURS,
-        "samples",
-        args.rounds,
-    )
-    if OURS in results and args.preset != "tiny" and torch.cuda.is_available():
-        rate = statistics.median(result.rate for result in results[OURS])
-        hours.add_rate("sft", args.preset, args.quantization, rate, comparison.device_name())
+            comparison.compare(
+                "sft",
+                lambda name: measure_in_process(overrides, VARIANTS[name], args.steps),
+                args.only or names,
+                OURS,
+                "samples",
+                args,
+            )
 
 
 def compare_losses(overrides: list[str], steps: int) -> None:
-    ours = measure_in_process(overrides, VARIANTS[OURS], steps, True)
-    theirs = measure_in_process(overrides, VARIANTS[DEFAULT], steps)
+    # TRL's loss depends on the micro-batch, so both trainers have the same one.
+    ours = measure_in_process(overrides, Variant(TRL_SETTINGS), steps, True)
+    theirs = measure_in_process(overrides, Variant(TRL_SETTINGS, trl=True), steps)
     print(f"{'step':>4}{'ours':>12}{'TRL':>12}{'difference':>12}")
     for step, (loss, other) in enumerate(zip(ours.losses, theirs.losses, strict=True), 1):
         print(f"{step:>4}{loss:>12.6f}{other:>12.6f}{abs(loss - other):>12.1e}")
@@ -160,49 +152,21 @@ def measure(overrides: list[str], variant: Variant, steps: int, trl_loss: bool) 
         compat.keep_freed_memory()
     set_seed(SEED)
     model, processor = loading.load_student(cfg.student, cfg.train.precision, list)
-    training, _ = load_datasets(cfg, store, rationales)
-    lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
-    order = LengthSampler(lengths, cfg.train.batch, cfg.seed)
-    samples = Subset(training, list(islice(order, (steps + 1) * cfg.train.batch)))
+    training, validation = load_datasets(cfg, store, rationales)
     with tempfile.TemporaryDirectory() as folder:
         if variant.trl:
+            lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
+            order = LengthSampler(lengths, cfg.train.batch, cfg.seed)
+            samples = Subset(training, list(islice(order, (steps + 1) * cfg.train.batch)))
             trainer = build_trl_trainer(cfg, model, processor, samples, Path(folder), variant.flash)
         else:
-            trainer = build_own_trainer(cfg, model, processor, samples, Path(folder), trl_loss)
+            fuse(model)
+            run = Run("benchmark", Path(folder))
+            trainer = build_trainer(cfg, run, model, processor, training, validation, None)
+            if trl_loss:
+                micro_batches = cfg.train.batch // cfg.train.micro_batch
+                trainer.compute_loss_func = partial(mean_of_means, micro_batches)
         return comparison.train(trainer, cfg.train.batch)
-
-
-def build_own_trainer(
-    cfg: SftCommand,
-    model: torch.nn.Module,
-    processor: ProcessorMixin,
-    samples: Subset,
-    folder: Path,
-    trl_loss: bool,
-) -> Trainer:
-    """Return the trainer that `train.sft` builds, without evaluations and checkpoints."""
-    train, accumulation = cfg.train, cfg.train.batch // cfg.train.micro_batch
-    fuse(model)
-    collator = Collator(processor, cfg.student.max_length)
-    cache = None
-    if train.reuse_features:
-        cache = VisionCache(model, train.precision, available_cpu_bytes() // 2)
-    return StudentTrainer(
-        model=model,
-        args=TrainingArguments(
-            **timing_arguments(train, folder),
-            per_device_train_batch_size=train.micro_batch,
-            gradient_accumulation_steps=accumulation,
-            dataloader_prefetch_factor=prefetch_factor(train.workers, accumulation),
-            label_names=["labels"],
-        ),
-        data_collator=TrainerCollator(collator, cache is not None),
-        train_dataset=samples,
-        compute_loss_func=partial(mean_of_means, accumulation) if trl_loss else token_mean,
-        sampler=SequentialSampler(samples),
-        accuracy=LetterAccuracy(letter_ids(processor)),
-        vision_cache=cache,
-    )
 
 
 def mean_of_means(
