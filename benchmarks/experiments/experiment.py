@@ -7,21 +7,17 @@ they resume, so an interrupted experiment resumes when its script is started aga
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import pandas as pd
 
 Job = tuple[str, int]
 """A variant and a seed."""
-WRITING = Lock()
 
 
 def create_parser(description: str, benchmark: str, record: Path) -> argparse.ArgumentParser:
@@ -31,7 +27,6 @@ def create_parser(description: str, benchmark: str, record: Path) -> argparse.Ar
     parser.add_argument("--store", default="store")
     parser.add_argument("--checkpoints", type=Path, default=Path("checkpoints"))
     parser.add_argument("--record", type=Path, default=record, help="file of recorded results")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time; they share the cores")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--table", action="store_true", help="only print the recorded results")
     return parser
@@ -68,46 +63,29 @@ class Experiment:
         return table if seeds is None else table[table.seed < seeds]
 
     def run(
-        self, jobs: Iterable[Job], evaluate: Callable[[Job, int], list[dict[str, Any]]]
+        self, jobs: Sequence[Job], evaluate: Callable[[Job], list[dict[str, Any]]]
     ) -> pd.DataFrame:
         """Run the jobs that are not recorded, and return all results.
 
         Args:
-            jobs: The runs to compare.
-            evaluate: Returns a run's rows of the record; it runs with a number of threads.
+            evaluate: Returns the rows of a job in the record.
         """
         if not self.args.table:
             run_command(["data.build", *self.shared[:2]])
             recorded = self.read_results()
             done = set(zip(recorded[self.variant], recorded.seed, strict=True))
-            threads = max(1, (os.cpu_count() or 1) // self.args.jobs)
-            with ThreadPoolExecutor(self.args.jobs) as pool:
-                missing = [job for job in jobs if job not in done]
-                for future in [
-                    pool.submit(self._record, evaluate, job, threads) for job in missing
-                ]:
-                    future.result()
+            for variant, seed in (job for job in jobs if job not in done):
+                shared = {**self.identity, self.variant: variant, "seed": seed}
+                rows = pd.DataFrame([shared | row for row in evaluate((variant, seed))])
+                table = pd.concat([pd.read_parquet(self.args.record), rows])
+                table.to_parquet(self.args.record, index=False, compression="zstd")
         results = self.read_results(self.args.seeds)
         if results.empty:
             raise SystemExit("error: no results are recorded: run without --table")
         return results
 
-    def _record(
-        self, evaluate: Callable[..., list[dict[str, Any]]], job: Job, threads: int
-    ) -> None:
-        variant, seed = job
-        shared = {**self.identity, self.variant: variant, "seed": seed}
-        rows = pd.DataFrame([shared | row for row in evaluate(job, threads)])
-        with WRITING:
-            table = pd.concat([pd.read_parquet(self.args.record), rows])
-            table.to_parquet(self.args.record, index=False, compression="zstd")
-
     def train_and_evaluate(
-        self,
-        name: str,
-        training: Sequence[str] | None,
-        evaluation: Sequence[str],
-        threads: int,
+        self, name: str, training: Sequence[str] | None, evaluation: Sequence[str] = ()
     ) -> Path:
         """Train and evaluate a run, and return the folder of its evaluation.
 
@@ -117,25 +95,22 @@ class Experiment:
         """
         shared = [*self.shared, f"run={name}"]
         if training is not None:
-            run_command([self.trainer, *training, *shared], threads)
+            run_command([self.trainer, *training, *shared])
             kind = self.trainer.partition(".")[2]
             evaluation = [*evaluation, f"model={self.args.checkpoints / kind / name}"]
         folder = self.args.checkpoints / self.evaluator.partition(".")[2] / name
         if not (folder / "metrics.json").exists():
-            run_command([self.evaluator, *evaluation, *shared], threads)
+            run_command([self.evaluator, *evaluation, *shared])
         return folder
 
 
-def run_command(command: Sequence[str], threads: int | None = None) -> None:
+def run_command(command: Sequence[str]) -> None:
     """Run `python -m` with a command and wait for it.
 
     Raises:
         SystemExit: The command fails; the message holds the end of its standard error.
     """
     print("python -m", *command, flush=True)
-    environment = {**os.environ, **({"OMP_NUM_THREADS": str(threads)} if threads else {})}
-    done = subprocess.run(
-        [sys.executable, "-m", *command], env=environment, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-m", *command], capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"error: {' '.join(command)} failed:\n{done.stderr[-2000:]}")

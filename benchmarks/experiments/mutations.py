@@ -20,6 +20,8 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from data.records import COLORS, LETTERS
 from data.store import open_store
 from teacher.narrator import write_rationale
@@ -28,11 +30,6 @@ from teacher.predicates import (
     REGIONS,
     SPEEDS,
     VERY_FAST,
-    CandidateFacts,
-    Closeness,
-    Difference,
-    Meeting,
-    ObjectFacts,
     Predicates,
     extract_predicates,
 )
@@ -99,18 +96,7 @@ def is_contradicted(text: str, predicates: Predicates) -> bool:
 
 def parse_predicates(record: dict[str, Any]) -> Predicates:
     """Rebuild predicates from the JSON form of their `to_dict`."""
-    kinds = {"objects": ObjectFacts, "courses": Meeting, "contacts": Meeting, "close": Closeness}
-    parsed = {name: tuple(value) for name, value in record.items() if isinstance(value, list)}
-    for name, kind in kinds.items():
-        rows = (
-            {k: tuple(v) if isinstance(v, list) else v for k, v in r.items()} for r in record[name]
-        )
-        parsed[name] = tuple(kind(**row) for row in rows)
-    parsed["candidates"] = tuple(
-        CandidateFacts(**{**c, "differences": tuple(Difference(**d) for d in c["differences"])})
-        for c in record["candidates"]
-    )
-    return Predicates(**{**record, **parsed})
+    return TypeAdapter(Predicates).validate_python(record)
 
 
 def replace_words(
@@ -118,7 +104,8 @@ def replace_words(
 ) -> Iterator[Mutation]:
     """Replace each of `words` by another one of them.
 
-    With `predicates`, words after an object of unknown motion stay: no word for it is false.
+    With `predicates`, words about an object of unknown motion are not replaced, because no word
+    about it would be false.
     """
     pattern = "|".join(sorted(words, key=len, reverse=True))
     for match in re.finditer(rf"\b(?:{pattern})\b(?!-)", text):

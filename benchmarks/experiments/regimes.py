@@ -55,7 +55,7 @@ def main() -> None:
     identity = {"base": base, "benchmark": args.benchmark}
     experiment = Experiment(args, identity, "regime", "train.sft", "evaluation.select")
 
-    def evaluate(job: Job, threads: int) -> list[dict[str, Any]]:
+    def evaluate(job: Job) -> list[dict[str, Any]]:
         regime, seed = job
         student = f"student={args.student}"
         training = [f"+exp={regime}", f"seed={seed}", student]
@@ -65,11 +65,10 @@ def main() -> None:
             f"{args.benchmark}-{base[:8]}-{regime}-{seed}",
             None if zero_shot else training,
             [student, "batch=64", *(["modes=[reasoning,answer]"] if zero_shot else [])],
-            threads,
         )
         return read_letters(folder, Path(args.store), args.benchmark, regime)
 
-    # Seed by seed: a comparison over fewer seeds is complete early.
+    # Ordered by seed, so that an interrupted experiment compares all regimes over fewer seeds.
     trained = [regime for regime in MODES if regime != "zero-shot"]
     jobs = [("zero-shot", 0), *((r, seed) for seed in range(args.seeds) for r in trained)]
     print_tables(experiment.run(jobs, evaluate))

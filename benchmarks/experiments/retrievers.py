@@ -38,10 +38,10 @@ def main() -> None:
     identity = {"benchmark": args.benchmark}
     experiment = Experiment(args, identity, "variant", "train.contrastive", "evaluation.retrieve")
 
-    def evaluate(job: Job, threads: int) -> list[dict[str, Any]]:
+    def evaluate(job: Job) -> list[dict[str, Any]]:
         variant, seed = job
         name, training = f"{args.benchmark}-{variant}-{seed}", [*VARIANTS[variant], f"seed={seed}"]
-        return read_ranks(experiment.train_and_evaluate(name, training, [], threads))
+        return read_ranks(experiment.train_and_evaluate(name, training))
 
     jobs = [(variant, seed) for seed, variant in product(range(args.seeds), VARIANTS)]
     print_table(experiment.run(jobs, evaluate))
