@@ -39,7 +39,7 @@ from data.store import (
 from data.tracks.build_items import family_quotas, item_families, make_items_and_queries, suite_name
 from data.tracks.retrieval import future
 from data.tracks.retrieval.database import make_databases
-from data.tracks.shortfalls import count_records, find_shortfalls, summarize_store
+from data.tracks.shortfalls import count_records, summarize_store
 from data.world.scenes import make_scenes
 from data.world.standins import generator_version
 
@@ -100,7 +100,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
     with lock_partial_build(cfg, folder) as partial:
         if partial is None:
             return
-        scene_ids, unread = make_scenes(cfg, partial, workers, strict)
+        scene_ids, invalid = make_scenes(cfg, partial, workers, strict)
         items, queries, dropped = make_items_and_queries(cfg, partial, scene_ids, workers)
         scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(partial, name)))
         queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
@@ -115,17 +115,15 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         save_rows([q.to_row() for q in queries], partial / "retrieval.parquet")
         rows = [{**vars(f), "database": name} for name in databases for f in databases[name]]
         save_rows(rows, partial / "database.parquet")
+        counts, shortfalls = count_records(cfg, scene_ids, items, queries, databases)
         manifest = {
             "name": cfg.name,
             "suite": suite_name(cfg),
             "seed": cfg.seed,
             **component_versions(asdict(cfg)),
             "config": asdict(cfg),
-            "counts": count_records(scene_ids, items, queries, databases)
-            | unread
-            | dropped
-            | left_out,
-            "shortfalls": find_shortfalls(cfg, items, queries, databases),
+            "counts": counts | invalid | dropped | left_out,
+            "shortfalls": shortfalls,
             "scenes": scene_ids,
             "files": hash_files(partial),
         }

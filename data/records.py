@@ -113,22 +113,9 @@ class Scene:
         "in_view", "visible_fraction",
     )  # fmt: skip
 
-    def __post_init__(self) -> None:
-        shapes = {name: getattr(self, name).shape for name in self.ARRAYS}
-        if any(shape[:2] != (self.frames, len(self.objects)) for shape in shapes.values()):
-            raise ValueError(
-                f"scene {self.scene_id}: expected arrays of "
-                f"{self.frames} frames and {len(self.objects)} objects, but they have the shapes "
-                f"{shapes}"
-            )
-
     @property
     def frames(self) -> int:
         return self.positions.shape[0]
-
-    def speeds(self) -> np.ndarray:
-        """(F, N) lengths of the linear velocities, simulator units per second."""
-        return np.linalg.norm(self.velocities, axis=-1)
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ video, and of every array, is simulated frame i + 1. The time of a contact count
 It is a float in Kubric's format. TensorFlow Datasets truncates it, so that only the next simulated
 frame is certainly at or after the contact.
 
-Every contact point is listed at every substep. An index of no object (-1, or 65535 if unsigned) is
-the floor, or an object that is never visible.
+Every contact point is listed at every substep. An index that names no object (-1, or 65535 if
+unsigned) stands for the floor, or for an object that is never visible.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from pydantic import BeforeValidator, Field
 from data.records import Landing, Scene, SceneObject
 from data.releases.tfrecord import feature_values, read_example, record_ranges
 from data.releases.validation import (
+    FLOOR_HEIGHT,
+    UPRIGHT,
     Layout,
     RecordError,
     check_unique_scenes,
@@ -40,10 +42,6 @@ FOLDER_CONTENTS = (
     "a folder per scene with metadata.json, events.json and rgba_00000.png and so on, or "
     "movi_a-train.tfrecord-00000-of-00512 and so on"
 )
-FLOOR = 0.05
-"""Greatest height of a contact with the floor, simulator units."""
-UPRIGHT = 0.7
-"""Least vertical share of a floor contact's normal."""
 FRAMES, FPS = 24, 12
 SHAPES = ("cube", "cylinder", "sphere")
 MATERIALS = ("metal", "rubber")
@@ -236,7 +234,7 @@ def _find_landings(
     the floor in the first frame does not land."""
     on_floor = (
         (is_object.sum(axis=1) == 1)
-        & (np.abs(contacts["position"][:, 2]) < FLOOR)
+        & (np.abs(contacts["position"][:, 2]) < FLOOR_HEIGHT)
         & (np.abs(contacts["contact_normal"][:, 2]) > UPRIGHT)
     )
     first: dict[int, int] = {}

@@ -9,9 +9,9 @@ counts frames, and the caller sets `Scene.fps`. Later versions add a suffix to t
 per-camera datasets (`_img_cam0`) and start at frame 0001.
 
 Events are found from the contacts that each frame lists. Early files have no `states` of
-collisions, and `env_collisions` mixes walls and floor. The `labels` are not used:
-`target_on_ground` is set when the contacts with the floor change, and `target_delta_position`
-accumulates.
+collisions, and `env_collisions` does not distinguish walls from the floor. The `labels` are not
+used, because they do not describe single frames: `target_on_ground` is set when the contacts with
+the floor change, and `target_delta_position` accumulates.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from PIL import Image
 
 from data.records import Collision, Landing, Scene, SceneObject
 from data.releases.validation import (
+    FLOOR_HEIGHT,
+    UPRIGHT,
     RecordError,
     check_unique_scenes,
     decode_image,
@@ -60,10 +62,6 @@ ABSENT_FRAMES = 5
 """In a file without states, a pair listed before this frame is in contact from the start."""
 AIR_FRAMES = 5
 """Least number of frames without contact before a landing."""
-UPRIGHT = 0.7
-"""Least upward share of a floor contact's normal."""
-FLOOR = 0.05
-"""Greatest height of a contact with the floor, metres."""
 VECTORS = {"positions": 3, "rotations": 4, "velocities": 3, "angular_velocities": 3}
 
 
@@ -225,7 +223,7 @@ def _find_on_floor(environment: h5py.Group, touching: list[int], positions: np.n
     """
     contacts = _read_array(environment, "contacts", (-1, 2, 3))
     normals, points = contacts[:, 0], contacts[:, 1]
-    floor = points[(normals[:, 1] > UPRIGHT) & (np.abs(points[:, 1]) < FLOOR)]
+    floor = points[(normals[:, 1] > UPRIGHT) & (np.abs(points[:, 1]) < FLOOR_HEIGHT)]
     if not touching:
         return set()
     distances = np.linalg.norm((floor[:, None] - positions[touching])[..., [0, 2]], axis=-1)

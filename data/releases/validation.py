@@ -14,6 +14,11 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from conf.errors import UserError
 
+FLOOR_HEIGHT = 0.05
+"""Greatest height of a contact with the floor, simulator units."""
+UPRIGHT = 0.7
+"""Least vertical share of the normal of a contact with the floor."""
+
 
 class RecordError(UserError):
     """A record that does not have the published layout, or cannot be read.

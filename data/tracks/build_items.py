@@ -51,21 +51,15 @@ def make_items_and_queries(
     for name in filter(_is_query_cell, quotas):
         train, test = (math.ceil(QUERY_RESERVE * n) for n in astuple(quotas[name]))
         quotas[name] = Quota(train, test)
-    inputs = {
-        "versions": [GENERATOR_VERSION, BUILDERS_VERSION],
-        "seed": cfg.seed,
-        "scenes": scene_ids,
-        "least": cfg.selection.min_displacement,
-        "hard negatives": cfg.retrieval.hard_negatives,
-    }
+    settings = cfg.seed, cfg.selection.min_displacement, cfg.retrieval.hard_negatives
+    inputs = [GENERATOR_VERSION, BUILDERS_VERSION, scene_ids, *settings]
     paths = {
-        name: part_path(folder, [inputs, name, asdict(quota)]) for name, quota in quotas.items()
+        name: part_path(folder, [*inputs, name, asdict(quota)]) for name, quota in quotas.items()
     }
     # Largest quotas first, so that no single worker is left with a large job at the end.
     jobs = {}
     for name, quota in sorted(quotas.items(), key=lambda job: -job[1].train):
-        least, negatives = cfg.selection.min_displacement, cfg.retrieval.hard_negatives
-        cell = CellInputs(scene_ids, partial(_load, folder), quota, cfg.seed, least, negatives)
+        cell = CellInputs(scene_ids, partial(_load, folder), quota, *settings)
         jobs[paths[name]] = partial(_run_job, cfg, name, cell, paths[name])
     workers.write_files(jobs, "making items and queries", "cell")
     items: list[SelectionItem] = []

@@ -25,7 +25,7 @@ class CellInputs:
     Attributes:
         scene_ids: Scene ids by split.
         scene_of: Loads a scene by its id.
-        least: Minimum displacement between two candidates, px at 336 x 336.
+        min_displacement: Minimum displacement between two candidates, px at 336 x 336.
         hard_negatives: Number of hard negatives of a query.
     """
 
@@ -33,7 +33,7 @@ class CellInputs:
     scene_of: Callable[[str], Scene]
     quota: Quota
     seed: int
-    least: float
+    min_displacement: float
     hard_negatives: int = 0
 
 
@@ -49,7 +49,7 @@ def fill_quota(subtype: str, family: Family, cell: CellInputs) -> tuple[list[Sel
     items, dropped = [], 0
     for split in SPLITS:
         scene_ids = cell.scene_ids[split]
-        picker = DistractorPicker(cell.least, scene_ids, cell.scene_of)
+        picker = DistractorPicker(cell.min_displacement, scene_ids, cell.scene_of)
         rng = named_rng(cell.seed, subtype, split)
         made: list[SelectionItem] = []
         for index in rng.permutation(len(scene_ids)):
@@ -60,8 +60,8 @@ def fill_quota(subtype: str, family: Family, cell: CellInputs) -> tuple[list[Sel
             order = rng.permutation(len(timings))
             attempts = (family.make_item(subtype, scene, timings[k], rng, picker) for k in order)
             made += islice(filter(None, attempts), 1)
-        # Each letter is the answer equally often. Letters are counted from a random one, because
-        # otherwise the first letters would be the answer more often in small cells.
+        # Each letter is the answer equally often, starting at a random letter: otherwise the first
+        # letters would be the answer more often in small cells.
         positions = rng.permutation((np.arange(len(made)) + rng.integers(4)) % 4)
         for item, position in zip(made, positions.tolist(), strict=True):
             target, *distractors = item.candidates
@@ -91,7 +91,8 @@ def round_robin(queues: Iterable[Iterable[Element]]) -> Iterator[Element]:
 
 
 def interleave(elements: Iterable[Element], key: Callable[[Element], Hashable]) -> list[Element]:
-    """The first element of each key, then the second of each, and so on; stable otherwise."""
+    """Sort elements by their position among those of the same key: the first one of every key,
+    then the second ones, and so on."""
     turns: dict[Hashable, Iterator[int]] = defaultdict(count)
     # `sorted` calls its key once for each element, in order.
     return sorted(elements, key=lambda element: next(turns[key(element)]))

@@ -8,39 +8,35 @@ from conf.schema import BenchmarkConfig
 from data.records import SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from data.store import Store
 from data.tracks.build_items import builder_name, cell_quotas
-from data.tracks.controls import MATCHED_ANCHOR, pair_items
+from data.tracks.controls import MATCHED_ANCHOR
 
 
 def count_records(
+    cfg: BenchmarkConfig,
     scene_ids: dict[str, list[str]],
     items: list[SelectionItem],
     queries: list[RetrievalQuery],
     databases: dict[str, list[FrameRef]],
-) -> dict[str, int]:
-    """Count scenes, items by family, queries by builder and frames by database."""
-    tally = Counter({f"scenes/{split}": len(names) for split, names in scene_ids.items()})
-    for i in items:
-        track = MATCHED_ANCHOR if i.suite == MATCHED_ANCHOR else "selection"
-        tally[f"{track}/{i.family}/{i.split}"] += 1
-    tally.update(f"retrieval/{builder_name(q.builder)}/{q.split}" for q in queries)
-    tally["retrieval/standard test"] = sum(q.standard for q in queries)
-    tally.update({f"database/{name}": len(frames) for name, frames in databases.items()})
-    return dict(tally)
+) -> tuple[dict[str, int], dict[str, str]]:
+    """Count a benchmark's records.
 
-
-def find_shortfalls(
-    cfg: BenchmarkConfig,
-    items: list[SelectionItem],
-    queries: list[RetrievalQuery],
-    databases: dict[str, list[FrameRef]],
-) -> dict[str, str]:
-    """Cells, builders and databases with fewer records than their quotas, as "n of quota"."""
-    own = [item for item in items if item.suite != MATCHED_ANCHOR]
-    pairs = pair_items([item for item in items if item.suite == MATCHED_ANCHOR])
-    counts = Counter(f"{item.family}/{item.subtype}/{item.split}" for item in own)
-    counts.update(f"{MATCHED_ANCHOR}/{item.split}" for item, _ in pairs)
-    counts.update(f"{builder_name(query.builder)}/{query.split}" for query in queries)
-    wanted = {
+    Returns:
+        Counts of scenes, items by family, queries by builder and frames by database; and the cells,
+        builders and databases with fewer records than their quotas, as "n of quota".
+    """
+    counts = Counter({f"scenes/{split}": len(names) for split, names in scene_ids.items()})
+    cells: Counter[str] = Counter()
+    for item in items:
+        is_own = item.suite != MATCHED_ANCHOR
+        track = "selection" if is_own else MATCHED_ANCHOR
+        counts[f"{track}/{item.family}/{item.split}"] += 1
+        cells[f"{item.family}/{item.subtype}/{item.split}"] += is_own
+    for split in SPLITS:
+        cells[f"{MATCHED_ANCHOR}/{split}"] = counts[f"{MATCHED_ANCHOR}/event/{split}"]
+    cells.update(f"{builder_name(query.builder)}/{query.split}" for query in queries)
+    counts.update(f"retrieval/{builder_name(query.builder)}/{query.split}" for query in queries)
+    counts["retrieval/standard test"] = sum(query.standard for query in queries)
+    quotas = {
         f"{cell}/{split}": getattr(quota, split)
         for cell, quota in cell_quotas(cfg).items()
         for split in SPLITS
@@ -48,11 +44,12 @@ def find_shortfalls(
     track = cfg.retrieval
     sizes = (track.database, track.source, track.counterfactual_source)
     for (name, frames), size in zip(databases.items(), sizes, strict=True):
-        counts[f"database/{name}"] = len(frames)
-        wanted[f"database/{name}"] = size if frames else 0
-    return {
-        name: f"{counts[name]} of {quota}" for name, quota in wanted.items() if counts[name] < quota
+        counts[f"database/{name}"] = cells[f"database/{name}"] = len(frames)
+        quotas[f"database/{name}"] = size if frames else 0
+    shortfalls = {
+        name: f"{cells[name]} of {quota}" for name, quota in quotas.items() if cells[name] < quota
     }
+    return dict(counts), shortfalls
 
 
 def summarize_store(store: Store) -> str:

@@ -45,14 +45,11 @@ class Camera:
         return np.stack([x, y, np.ones_like(x)], axis=-1) @ self.axes
 
 
-STANDARD_CAMERA = Camera()
-
-
 @dataclass(frozen=True)
 class View:
     """The camera, floor colour and light of scenes."""
 
-    camera: Camera = STANDARD_CAMERA
+    camera: Camera = Camera()
     """Its eye must lie in the x-z plane."""
     floor: tuple[float, float, float] = (158.0, 156.0, 152.0)
     """RGB colour of the fully lit floor, 0 to 255."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from conf.schema import BenchmarkConfig
 from data.records import COLORS, FPS, MATERIALS, SHAPES, Scene, SceneObject
-from data.world.camera import STANDARD_CAMERA, Camera
+from data.world.camera import STANDARD_VIEW, Camera
 from data.world.physics import STANDARD_PHYSICS, Body, Motion, Physics, shared_simulator
 from data.world.shapes import BOUNDING_RADIUS, RADIUS
 from data.world.visibility import compute_visibility
@@ -149,7 +149,7 @@ def _resting(added: SceneObject, motion: Motion, rng: np.random.Generator) -> Bo
 
 
 def is_on_screen(
-    place: np.ndarray, height: float = RADIUS, camera: Camera = STANDARD_CAMERA
+    place: np.ndarray, height: float = RADIUS, camera: Camera = STANDARD_VIEW.camera
 ) -> bool:
     """Whether a point above a ground position is on screen, with a margin of 20 px."""
     pixel, depth = camera.project(np.array([*place, height]))
@@ -169,11 +169,6 @@ def format_scene_id(seed: int, index: int) -> str:
     return f"s{seed}-{index:06d}"
 
 
-def simulate_scene(seed: int, index: int, split: str, limits: BenchmarkConfig) -> Scene:
-    """Simulate scene `index` of `seed` with its complete oracle."""
-    return record_scene(format_scene_id(seed, index), split, *sample_bodies(seed, index, limits))
-
-
 def simulate_without(name: str, split: str, bodies: list[Body], removed: int) -> Scene:
     """Simulate a scene again without object `removed`.
 
@@ -189,7 +184,7 @@ def record_scene(
     bodies: list[Body],
     motion: Motion,
     physics: Physics = STANDARD_PHYSICS,
-    camera: Camera = STANDARD_CAMERA,
+    camera: Camera = STANDARD_VIEW.camera,
     scenario: str = "",
 ) -> Scene:
     """Record a motion as a scene, with projection and visibility by a camera."""

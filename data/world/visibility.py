@@ -9,8 +9,8 @@ from data.world.camera import Camera
 from data.world.shapes import BOUNDING_RADIUS, intersect_rays
 
 STRIDE = 2
-"""Step in px between the rays that measure visibility: with a quarter of the rays, the fraction of
-a visible object is within 2% of that over all pixels."""
+"""Step in px between the rays that measure visibility. With one ray for every four pixels, the
+fraction of a visible object is within 2% of the one from a ray for each pixel."""
 
 
 def compute_visibility(

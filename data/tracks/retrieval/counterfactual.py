@@ -16,7 +16,7 @@ from data.tracks.retrieval.queries import fill_query_quota
 from data.tracks.selection.time import spell_seconds
 from data.world.displacement import DIAGONAL, on_screen_positions
 
-LONGEST = 2 * FPS
+LATEST_STOP = 2 * FPS
 """Latest frame at which a prefix ends."""
 HORIZONS = (1, 2, 3)
 """Seconds from the prefix's end to the target."""
@@ -40,7 +40,7 @@ def absent_id(scene_id: str, removed: int) -> str:
 
 def _prefix_stop(scene: Scene, removed: int) -> int | None:
     contacts = [c.frame for c in scene.collisions if removed in c.objects]
-    stop = min(LONGEST, contacts[0] - 1) if contacts else -1
+    stop = min(LATEST_STOP, contacts[0] - 1) if contacts else -1
     return stop if stop >= FPS else None
 
 
@@ -71,7 +71,7 @@ def make_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
         stop = _prefix_stop(scene, removed)
         for seconds in HORIZONS:
             target = stop + seconds * FPS
-            if target < scene.frames and displacement[target] >= cell.least:
+            if target < scene.frames and displacement[target] >= cell.min_displacement:
                 yield RetrievalQuery(
                     query_id=f"counterfactual-{absent}-{stop}-{target}",
                     split=scene.split,

@@ -26,23 +26,23 @@ AFTER_COLLISION = (
 )
 AFTER_NEXT_COLLISION = "Which frame shows the scene half a second after the next collision?"
 
-Choice = tuple[str, int, int, int]
+TimedQuestion = tuple[str, int, int, int]
 """A question about a scene, the first and last frame of its prefix, and its target frame."""
 
 
-def _clip_end(scene: Scene) -> Iterator[Choice]:
+def _clip_end(scene: Scene) -> Iterator[TimedQuestion]:
     for seconds in (2, 3, 4):
         text = "Which frame shows the scene at the end of the clip, {} after the observation ends?"
         yield text.format(spell_seconds(5 - seconds)), 0, seconds * FPS, scene.frames - 1
 
 
-def _clock(scene: Scene) -> Iterator[Choice]:
+def _clock(scene: Scene) -> Iterator[TimedQuestion]:
     for seconds in (1, 2, 3):
         text = f"Which frame shows the scene {spell_seconds(seconds)} after the observation ends?"
         yield text, 0, 2 * FPS, (2 + seconds) * FPS
 
 
-def _next_event(scene: Scene) -> Iterator[Choice]:
+def _next_event(scene: Scene) -> Iterator[TimedQuestion]:
     for event in collision_frames(scene)[:EVENTS_PER_SCENE]:
         # The prefix ends before the event, which is the target.
         for stop in range(event - 1, event - 7, -1):
@@ -50,7 +50,7 @@ def _next_event(scene: Scene) -> Iterator[Choice]:
                 yield NEXT_COLLISION, stop - FPS, stop, event
 
 
-def _around_event(lead: int, text: str, scene: Scene) -> Iterator[Choice]:
+def _around_event(lead: int, text: str, scene: Scene) -> Iterator[TimedQuestion]:
     """The prefix ends `lead` frames before an event, and the target is one second later."""
     for event in collision_frames(scene):
         stop = event - lead
@@ -62,7 +62,7 @@ def _is_next(scene: Scene, stop: int, event: int) -> bool:
     return min((c.frame for c in scene.collisions if c.frame > stop), default=None) == event
 
 
-BUILDERS: dict[int, Callable[[Scene], Iterator[Choice]]] = {
+BUILDERS: dict[int, Callable[[Scene], Iterator[TimedQuestion]]] = {
     1: _clip_end,
     2: _clock,
     3: _next_event,

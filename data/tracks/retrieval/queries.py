@@ -69,7 +69,7 @@ def add_hard_negatives(
 ) -> RetrievalQuery | None:
     """Complete a query's hard negatives with wrong-time frames of its target's scene.
 
-    All of them differ from the target and from each other by `cell.least` px at 336 x 336.
+    All of them differ from the target and from each other by `cell.min_displacement`.
 
     Returns:
         The query, or None where there are too few such frames.
@@ -83,12 +83,15 @@ def add_hard_negatives(
     for frame in [*rng.permutation(preferred), *rng.permutation(dense)]:
         if len(chosen) == count:
             break
-        if 0 <= frame < scene.frames and displacements[frame, chosen].min() >= cell.least:
+        if (
+            0 <= frame < scene.frames
+            and displacements[frame, chosen].min() >= cell.min_displacement
+        ):
             chosen.append(int(frame))
     wrong = chosen[1:]
     if len(chosen) < count or any(
         cross_scene_displacement(cell.scene_of(given.scene_id), given.frame, scene, frame)
-        < cell.least
+        < cell.min_displacement
         for given in query.hard_negatives
         for frame in wrong
     ):

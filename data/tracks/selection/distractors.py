@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, islice
 from typing import Any
 
 import numpy as np
@@ -57,13 +57,14 @@ class DistractorPicker:
     """Makes items whose candidates differ visibly from each other.
 
     Attributes:
-        least: Minimum displacement of some object between two candidates, px at 336 x 336.
+        min_displacement: Minimum displacement of some object between two candidates, px at
+            336 x 336.
         scene_ids: Scenes of the split; cross-scene distractors come from these.
         scene_of: Loads a scene by its id.
         dropped: Number of targets that had too few such distractors.
     """
 
-    least: float
+    min_displacement: float
     scene_ids: list[str]
     scene_of: Callable[[str], Scene]
     dropped: int = 0
@@ -80,7 +81,7 @@ class DistractorPicker:
         suite: str = "dynapix",
         **fields: Any,
     ) -> SelectionItem | None:
-        """Make an item from the first distractors of each pool that differ by `least` px.
+        """Make an item from the first distractors of each pool that differ by `min_displacement`.
 
         Args:
             about: Indices of the objects that must differ; any object by default.
@@ -94,7 +95,16 @@ class DistractorPicker:
         for k, (pool, count) in enumerate(pools):
             if len(chosen) + sum(most for _, most in pools[k:]) < 4:
                 break
-            self._extend(chosen, pool, min(len(chosen) + count, 4), about)
+            fitting = (
+                candidate
+                for candidate in pool
+                if all(
+                    self._displacement(candidate, c, about) >= self.min_displacement for c in chosen
+                )
+            )
+            # Lazy: each candidate is compared with those that were chosen before it.
+            for candidate in islice(fitting, min(count, 4 - len(chosen))):
+                chosen.append(candidate)
         if len(chosen) < 4:
             self.dropped += 1
             return None
@@ -120,19 +130,6 @@ class DistractorPicker:
         names = rng.choice(self.scene_ids, min(count + 1, len(self.scene_ids)), replace=False)
         scenes = [self.scene_of(str(name)) for name in names if name != scene.scene_id]
         return sorted(scenes, key=lambda s: -len({*scene.objects} & {*s.objects}))
-
-    def _extend(
-        self,
-        chosen: list[Candidate],
-        pool: Iterable[Candidate],
-        size: int,
-        about: tuple[int, ...] | None,
-    ) -> None:
-        """Append the first frames of a pool that differ from all chosen ones, up to `size`."""
-        pool = iter(pool)
-        while len(chosen) < size and (candidate := next(pool, None)) is not None:
-            if all(self._displacement(candidate, c, about) >= self.least for c in chosen):
-                chosen.append(candidate)
 
     def _displacement(
         self, one: FrameRef, two: FrameRef, about: tuple[int, ...] | None = None

@@ -39,7 +39,7 @@ def make_item(
 ) -> SelectionItem | None:
     """Make an item whose distractors are other frames after the prefix.
 
-    Its question gives the whole seconds from the prefix's end to the target, as its subtype does.
+    The question and the subtype state the whole seconds from the prefix's end to the target.
     """
     horizon = timing.target - timing.stop
     seconds = horizon // SELECTION_SECOND

@@ -55,7 +55,8 @@ def timings(subtype: str, scene: Scene) -> list[Timing]:
 def make_item(
     subtype: str, scene: Scene, timing: Timing, rng: np.random.Generator, picker: DistractorPicker
 ) -> SelectionItem | None:
-    """Make an item at a window; None where the window is of another group or shows no subject."""
+    """Make an item at a window; None if the window is of another group, or if its prefix shows none
+    of the objects that the item is about."""
     cell = CELLS[subtype]
     if window_group(scene, timing.start, timing.stop, cell.horizon) != cell.group:
         return None

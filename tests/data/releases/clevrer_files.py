@@ -14,6 +14,20 @@ from tests.data.releases.pictures import picture
 
 def clevrer_annotation(index: int = 0, frames: int = 128) -> dict[str, Any]:
     """A cube at rest at the origin, and a sphere that rolls along y and out of view."""
+
+    def states(f: int) -> list[dict[str, Any]]:
+        still, zero = (
+            {"location": [0.0, 0.0, 0.0], "orientation": [0.3, -0.5, 1.1]},
+            [0.0, 0.0, 0.0],
+        )
+        rolling = {"location": [0.5, 0.05 * f - 1, 0.2], "orientation": [-0.25 * f, 0.0, 0.0]}
+        still |= {"velocity": zero, "angular_velocity": zero}
+        rolling |= {"velocity": [0.0, 1.25, 0.0], "angular_velocity": [-6.25, 0.0, 0.0]}
+        return [
+            {"object_id": 0, "inside_camera_view": True, **still},
+            {"object_id": 1, "inside_camera_view": f < 90, **rolling},
+        ]
+
     return {
         "scene_index": index,
         "video_filename": f"video_{index:05d}.mp4",
@@ -21,30 +35,7 @@ def clevrer_annotation(index: int = 0, frames: int = 128) -> dict[str, Any]:
             {"object_id": 0, "color": "red", "material": "metal", "shape": "cube"},
             {"object_id": 1, "color": "blue", "material": "rubber", "shape": "sphere"},
         ],
-        "motion_trajectory": [
-            {
-                "frame_id": f,
-                "objects": [
-                    {
-                        "object_id": 0,
-                        "location": [0.0, 0.0, 0.0],
-                        "orientation": [0.3, -0.5, 1.1],
-                        "velocity": [0.0, 0.0, 0.0],
-                        "angular_velocity": [0.0, 0.0, 0.0],
-                        "inside_camera_view": True,
-                    },
-                    {
-                        "object_id": 1,
-                        "location": [0.5, 0.05 * f - 1, 0.2],
-                        "orientation": [-0.25 * f, 0.0, 0.0],
-                        "velocity": [0.0, 1.25, 0.0],
-                        "angular_velocity": [-6.25, 0.0, 0.0],
-                        "inside_camera_view": f < 90,
-                    },
-                ],
-            }
-            for f in range(frames)
-        ],
+        "motion_trajectory": [{"frame_id": f, "objects": states(f)} for f in range(frames)],
         "collision": [{"object_ids": [1, 0], "frame_id": 20, "location": [0.25, 0.0, 0.2]}],
     }
 

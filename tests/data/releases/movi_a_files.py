@@ -12,6 +12,9 @@ from data.releases.tfrecord import example_class
 from tests.data.releases.pictures import picture, png
 
 MOVI_COLORS = ["blue", "brown", "cyan", "gray", "green", "purple", "red", "yellow"]
+ARRAYS = (
+    "positions", "quaternions", "velocities", "angular_velocities", "image_positions", "visibility",
+)  # fmt: skip
 
 
 def movi_example(contacts: list[tuple[float, int, int, float, float]] | None = None) -> dict:
@@ -39,29 +42,23 @@ def movi_example(contacts: list[tuple[float, int, int, float, float]] | None = N
 
 def write_movi_folder(folder: Path, example: dict) -> Path:
     folder.mkdir(parents=True)
-    arrays = ("positions", "quaternions", "velocities", "angular_velocities", "image_positions")
     instances = [
         {
-            "mass": 1.0, "friction": 0.4, "restitution": 0.3, "size": 1.4, "color": [0.5, 0.1, 0.1],
+            "size": 1.4, "color": [0.5, 0.1, 0.1],
             "shape": shape, "size_label": size, "material": material, "color_label": color,
-            "visibility": example["visibility"][k].tolist(),
-            **{key: example[key][k].tolist() for key in arrays},
+            **{key: example[key][k].tolist() for key in ARRAYS},
         }
         for k, (shape, size, material, color) in enumerate(example["appearances"])
     ]  # fmt: skip
     metadata = {
-        "flags": {},
-        "metadata": {
-            "resolution": [256, 256], "frame_rate": 12, "step_rate": 240, "gravity": [0, 0, -9.81],
-            "num_frames": 24, "num_instances": len(instances),
-        },
-        "camera": {"focal_length": 35.0, "sensor_width": 32.0, "field_of_view": 0.857},
+        "metadata": {"resolution": [256, 256], "frame_rate": 12, "num_frames": 24},
+        "camera": {"focal_length": 35.0},
         "instances": instances,
     }  # fmt: skip
     collisions = [
         {
-            "instances": [one, two], "frame": frame, "force": 0.01, "position": [0.0, 0.0, height],
-            "image_position": [0.5, 0.5], "contact_normal": [(1 - up**2) ** 0.5, 0.0, up],
+            "instances": [one, two], "frame": frame, "position": [0.0, 0.0, height],
+            "contact_normal": [(1 - up**2) ** 0.5, 0.0, up],
         }
         for frame, one, two, height, up in example["contacts"]
     ]  # fmt: skip
@@ -78,25 +75,18 @@ def movi_features(example: dict) -> dict[str, Any]:
     """Return the example's features as TensorFlow Datasets flattens them, by name."""
     contacts = example["contacts"]
     shapes, sizes, materials, colors = zip(*example["appearances"], strict=True)
-    arrays = ("positions", "quaternions", "velocities", "angular_velocities", "image_positions")
     return {
-        "metadata/video_name": [b"123"],
         "metadata/width": [256],
         "metadata/height": [256],
         "metadata/num_frames": [24],
         "metadata/num_instances": [len(example["appearances"])],
-        "metadata/depth_range": [0.5, 20.0],
-        **{f"instances/{key}": example[key].ravel().tolist() for key in arrays},
-        "instances/visibility": example["visibility"].ravel().tolist(),
-        "instances/bboxes/ragged_flat_values": [0.0, 0.1, 0.2, 0.3],
-        "instances/bboxes/ragged_row_lengths_0": [1, 0, 0],
+        **{f"instances/{key}": example[key].ravel().tolist() for key in ARRAYS},
         "instances/shape_label": [["cube", "cylinder", "sphere"].index(s) for s in shapes],
         "instances/size_label": [["small", "large"].index(s) for s in sizes],
         "instances/material_label": [["metal", "rubber"].index(m) for m in materials],
         "instances/color_label": [MOVI_COLORS.index(c) for c in colors],
         "events/collisions/frame": [int(c[0]) for c in contacts],
         "events/collisions/instances": [i % 65536 for c in contacts for i in c[1:3]],
-        "events/collisions/force": [0.01 for _ in contacts],
         "events/collisions/position": [v for c in contacts for v in (0.0, 0.0, c[3])],
         "events/collisions/contact_normal": [
             v for c in contacts for v in ((1 - c[4] ** 2) ** 0.5, 0.0, c[4])

@@ -53,7 +53,6 @@ def write_physion(
         static["object_ids"] = np.array(IDS)
         static["model_names"] = trial["models"]
         static["object_segmentation_colors"] = COLORS
-        static["mass"] = np.ones(3, np.float32)
         groups = file.create_group("frames")
         for k in range(len(trial["positions"])):
             _write_frame(groups.create_group(f"{k + first:04d}"), trial, k, states, suffix)
@@ -75,9 +74,6 @@ def _write_frame(group: h5py.Group, trial: dict, k: int, states: bool, suffix: s
         objects[key] = trial[key][k]
     collisions = group.create_group("collisions")
     collisions["object_ids"] = np.array(trial["pairs"][k], np.int32).reshape(-1, 2)
-    collisions["relative_velocities"] = np.zeros((len(trial["pairs"][k]), 3), np.float32)
-    # One point more than pairs: the points of all collisions are joined.
-    collisions["contacts"] = np.zeros((len(trial["pairs"][k]) + 1, 2, 3), np.float32)
     if states:
         listed = np.array(trial["states"][k], "S5")
         collisions["states"] = listed if len(listed) else listed.reshape(0, 1)
@@ -88,6 +84,3 @@ def _write_frame(group: h5py.Group, trial: dict, k: int, states: bool, suffix: s
     cameras = group.create_group("camera_matrices")
     for key, matrix in zip(("camera_matrix", "projection_matrix"), trial["camera"], strict=True):
         cameras[key + suffix] = np.float32(matrix).ravel()
-    labels = group.create_group("labels")
-    labels["target_delta_position"] = np.float32([9, 9, 9])
-    labels["target_on_ground"] = True

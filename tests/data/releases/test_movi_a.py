@@ -163,9 +163,7 @@ def test_missing_and_damaged_files_of_a_folder_are_named(tmp_path: Path) -> None
 RECORD_DEFECTS: dict[str, tuple[Callable[[dict], object], str]] = {
     "no positions": (lambda f: f.pop("instances/positions"), "'instances/positions'"),
     "a value less": (lambda f: f["instances/positions"].pop(), "215"),
-    "MoVi-B's shapes": (
-        lambda f: f.update({"instances/shape_label": [0, 9, 1]}), "shape_label"
-    ),
+    "MoVi-B's shapes": (lambda f: f["instances/shape_label"].__setitem__(1, 9), "shape_label"),
     "a frame less": (lambda f: f["video"].pop(), "23"),
 }  # fmt: skip
 

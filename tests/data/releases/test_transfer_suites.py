@@ -68,7 +68,7 @@ def items_of(
     suite: str, family: str, subtype: str, scenes: dict[str, Scene]
 ) -> list[SelectionItem]:
     scene_ids = {"train": [], "test": list(scenes)}
-    cell = CellInputs(scene_ids, scenes.__getitem__, Quota(0, 24), seed=0, least=LEAST)
+    cell = CellInputs(scene_ids, scenes.__getitem__, Quota(0, 24), seed=0, min_displacement=LEAST)
     return fill_quota(subtype, TRANSFER_SUITES[suite][family], cell)[0]
 
 
@@ -130,12 +130,11 @@ def test_an_event_items_prefix_ends_before_its_event(suite: str, items: list) ->
     gap, step = (5, 10) if suite.endswith("movi_a") else (10, 20)
     events_of = {
         "contact": lambda s: [c.frame for c in s.collisions],
-        "A1_contact": lambda s: [c.frame for c in s.collisions],
-        "A2_motion": lambda s: [frame for frame, _ in find_motion_onsets(s)],
-        "A3_landing": lambda s: [landing.frame for landing in s.landings],
+        "motion": lambda s: [frame for frame, _ in find_motion_onsets(s)],
+        "landing": lambda s: [landing.frame for landing in s.landings],
     }
     for item in items:
-        events = events_of[item.subtype]
+        events = events_of[item.subtype.rpartition("_")[2]]
         assert item.target_frame == item.event_frame
         assert item.event_frame in events(SCENES[suite][item.scene_id])
         assert (item.framing, item.gap) == ("future", gap)

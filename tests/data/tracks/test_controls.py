@@ -31,20 +31,14 @@ def test_matched_pair_differs_only_in_its_anchor(benchmark_store) -> None:
 
 
 @pytest.mark.parametrize("count", [2, 5, 12])
-def test_shuffled_prefix_has_the_same_frames_in_another_order(benchmark_store, count) -> None:
+def test_controls_shuffle_or_remove_the_prefix(benchmark_store, count) -> None:
     for item in benchmark_store.selection("test"):
         frames = sample_prefix_frames(item.prefix_start, item.prefix_stop, count)
         shuffled = prefix_under_control(item, count, "shuffled_prefix")
         assert shuffled != frames
         assert sorted(shuffled) == frames
         assert prefix_under_control(item, count, "shuffled_prefix") == shuffled
+        assert prefix_under_control(item, count, "candidate_only") == []
+        assert prefix_under_control(item, count, None) == frames
     other = replace(item, item_id="another")
     assert count == 2 or prefix_under_control(other, count, "shuffled_prefix") != shuffled
-
-
-def test_candidate_only_items_have_no_prefix(benchmark_store) -> None:
-    item = benchmark_store.selection("test")[0]
-    assert prefix_under_control(item, 12, "candidate_only") == []
-    assert prefix_under_control(item, 12, None) == sample_prefix_frames(
-        item.prefix_start, item.prefix_stop, 12
-    )

@@ -29,6 +29,12 @@ def items(benchmark_store: Store) -> list[SelectionItem]:
     return benchmark_store.selection()
 
 
+@pytest.fixture(scope="module")
+def least(benchmark_store: Store) -> float:
+    """The minimum displacement between two candidates, px."""
+    return benchmark_store.manifest["config"]["selection"]["min_displacement"]
+
+
 def timing(item: SelectionItem) -> Timing:
     return Timing(item.prefix_start, item.prefix_stop, item.target_frame)
 
@@ -51,8 +57,7 @@ def test_items_and_queries_have_the_split_of_their_scene(benchmark_store, items)
         assert record.scene_id in (train if record.split == "train" else test)
 
 
-def test_candidates_differ_by_the_minimum_displacement(benchmark_store, items) -> None:
-    least = benchmark_store.manifest["config"]["selection"]["min_displacement"]
+def test_candidates_differ_by_the_minimum_displacement(benchmark_store, items, least) -> None:
     for item in items:
         gaps = []
         for a, b in combinations(item.candidates, 2):
@@ -76,9 +81,8 @@ def test_event_items_match_a_collision(benchmark_store, items) -> None:
         assert item.target_frame <= 127 - 10
 
 
-def test_event_distractors_match_their_source(benchmark_store, items) -> None:
+def test_event_distractors_match_their_source(benchmark_store, items, least) -> None:
     split = {s: set(benchmark_store.scene_ids(s)) for s in ("train", "test")}
-    least = benchmark_store.manifest["config"]["selection"]["min_displacement"]
     for item in (i for i in items if i.family == "event"):
         scene = benchmark_store.scene(item.scene_id)
         wrong = [c for c in item.candidates if c.source != "target"]
@@ -122,8 +126,7 @@ def test_window_items_match_their_group_and_horizon(benchmark_store, items) -> N
         assert item.subtype == f"{group}_{family}_h{item.horizon}_{item.difficulty}"
 
 
-def test_candidates_of_families_b_and_c_differ_in_their_subjects(benchmark_store, items) -> None:
-    least = benchmark_store.manifest["config"]["selection"]["min_displacement"]
+def test_candidates_of_b_and_c_differ_in_their_subjects(benchmark_store, items, least) -> None:
     counts = Counter()
     for item in (i for i in items if i.window_family in ("B", "C")):
         scene = benchmark_store.scene(item.scene_id)
@@ -146,8 +149,7 @@ def test_candidates_of_families_b_and_c_differ_in_their_subjects(benchmark_store
     assert min(counts["B"], counts["C"]) > 2
 
 
-def test_candidates_differ_in_an_object_visible_in_the_prefix(benchmark_store, items) -> None:
-    least = benchmark_store.manifest["config"]["selection"]["min_displacement"]
+def test_candidates_differ_in_a_visible_object(benchmark_store, items, least) -> None:
     for item in items:
         scene = benchmark_store.scene(item.scene_id)
         gaps = frame_displacements(scene, visible_objects(scene, timing(item)))
@@ -226,9 +228,8 @@ def test_hard_negatives_are_wrong_time_frames_of_the_scene(benchmark_store) -> N
         assert min(gaps[a, b] for a, b in combinations(frames, 2)) >= 12
 
 
-def test_counterfactual_targets_differ_from_the_factual_scene(benchmark_store) -> None:
+def test_counterfactual_targets_differ_from_the_factual_scene(benchmark_store, least) -> None:
     queries = benchmark_store.retrieval(pool="counterfactual")
-    least = benchmark_store.manifest["config"]["selection"]["min_displacement"]
     assert {q.split for q in queries} == {"train", "test"}
     for q in queries:
         scene, absent = benchmark_store.scene(q.scene_id), benchmark_store.scene(q.target.scene_id)

@@ -8,13 +8,12 @@ import sys
 import numpy as np
 import pytest
 
-from conf.schema import BenchmarkConfig
 from data.records import FPS, Scene, SceneObject
 from data.world.physics import STANDARD_PHYSICS, Body, _has_repeated, shared_simulator
-from data.world.sampling import record_scene, sample_bodies, simulate_scene, simulate_without
+from data.world.sampling import record_scene, sample_bodies, simulate_without
 from tests.children import run_child
+from tests.data.simulated import LIMITS, simulate_scene
 
-LIMITS = BenchmarkConfig(name="laws")
 CUBE = SceneObject("cube", "rubber", "red")
 
 
@@ -24,10 +23,10 @@ def fingerprint(scene: Scene) -> str:
 
 
 def test_scenes_are_bit_identical_in_another_process_and_order() -> None:
-    first = [fingerprint(simulate_scene(3, k, "train", LIMITS)) for k in (2, 0, 1)]
+    first = [fingerprint(simulate_scene(3, k)) for k in (2, 0, 1)]
     code = (
         "from tests.data.world.test_physics import *\n"
-        "for k in (0, 1, 2): print(fingerprint(simulate_scene(3, k, 'train', LIMITS)))"
+        "for k in (0, 1, 2): print(fingerprint(simulate_scene(3, k)))"
     )
     second = run_child([sys.executable, "-c", code], check=True).stdout.split()
     assert [first[1], first[2], first[0]] == second[-3:]
@@ -64,7 +63,7 @@ def test_contacts_within_the_gap_are_one_collision() -> None:
 
 @pytest.mark.parametrize("index", range(4))
 def test_scenes_respect_the_limits(index: int) -> None:
-    scene = simulate_scene(1, index, "train", LIMITS)
+    scene = simulate_scene(1, index)
     assert LIMITS.min_objects <= len(scene.objects) <= LIMITS.max_objects
     assert 1 <= len(scene.collisions) <= LIMITS.max_collisions
     pairs = [c.objects for c in scene.collisions]

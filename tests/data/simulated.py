@@ -1,0 +1,15 @@
+"""Simulated scenes with the default numbers of objects and collisions."""
+
+from __future__ import annotations
+
+from conf.schema import BenchmarkConfig
+from data.records import Scene
+from data.world.sampling import format_scene_id, record_scene, sample_bodies
+
+LIMITS = BenchmarkConfig(name="limits")
+
+
+def simulate_scene(seed: int, index: int) -> Scene:
+    """Simulate scene `index` of a seed."""
+    bodies, motion = sample_bodies(seed, index, LIMITS)
+    return record_scene(format_scene_id(seed, index), "train", bodies, motion)
