@@ -25,7 +25,6 @@ COLUMNS = OmegaConf.to_container(
     OmegaConf.create((files("data.publish") / "columns.yaml").read_text())
 )
 DESCRIPTIONS: dict[str, str] = COLUMNS.pop("descriptions")
-CONFIGURATIONS = tuple(COLUMNS)
 ENCODED_FRAMES = 1_000
 """Encoded frames kept in memory, at up to 100 KB each."""
 Record = SelectionItem | RetrievalQuery | FrameRef

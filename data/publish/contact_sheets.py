@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from PIL import Image
 
@@ -15,16 +14,11 @@ from data.store import Store
 from data.tracks.retrieval.counterfactual import removal_displacement
 from data.world.displacement import cross_scene_displacement
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-INK, GREEN, PINK = "#222222", "#1a7f37", "#ff00aa"
+INK, GREEN = "#222222", "#1a7f37"
 CELL_WIDTH, CAPTION_HEIGHT, HEADING_HEIGHT = 2.3, 0.5, 0.6
 """Sizes in inches."""
 GAP = 0.12
 """Width between the prefix and the candidates, as a share of a cell's."""
-RING = 28
-"""Diameter of a ring in points."""
 DPI = 100
 PREFIX_FRAMES = 4
 """Number of frames that represent a prefix on a sheet."""
@@ -34,21 +28,18 @@ AXES = ("framing", "gap", "horizon", "group", "window_family", "difficulty")
 
 @dataclass(frozen=True)
 class Cell:
-    """A frame with the lines of its caption, and the centre of a ring in px of the image."""
+    """A frame with the lines of its caption."""
 
     image: Image.Image
     caption: tuple[str, ...]
     is_answer: bool = False
-    ring: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
 class Row:
     """The heading of an item or query, frames of its prefix, and its candidates."""
 
-    name: str
-    details: str
-    question: str
+    heading: str
     prefix: Sequence[Cell]
     candidates: Sequence[Cell]
 
@@ -71,33 +62,25 @@ def draw_sheet(rows: Sequence[Row]) -> bytes:
         },
     }  # fmt: skip
     for row, strip in zip(rows, strips, strict=True):
-        heading = f"{row.name}    {row.details}\n{row.question}"
-        strip.suptitle(heading, x=0.01, y=0.96, ha="left", va="top", fontsize=11)
+        strip.suptitle(row.heading, x=0.01, y=0.96, ha="left", va="top", fontsize=11)
         grid = strip.subplots(1, columns + 1, **layout)
         for axes in grid:
             axes.set_axis_off()
         padding = [None] * (prefix + 1 - len(row.prefix))
         for axes, cell in zip(grid, [*row.prefix, *padding, *row.candidates], strict=False):
-            if cell:
-                draw_cell(axes, cell)
+            if cell is None:
+                continue
+            axes.set_axis_on()
+            axes.imshow(cell.image)
+            axes.set(xticks=[], yticks=[])
+            for spine in axes.spines.values():
+                spine.set(visible=cell.is_answer, color=GREEN, linewidth=4)
+            axes.set_xlabel("\n".join(cell.caption), loc="left", labelpad=6, fontsize=9)
+            axes.xaxis.label.set_color(GREEN if cell.is_answer else INK)
     buffer = io.BytesIO()
     # Without the version of matplotlib, equal sheets have equal bytes.
     figure.savefig(buffer, metadata={"Software": None})
     return buffer.getvalue()
-
-
-def draw_cell(axes: Axes, cell: Cell) -> None:
-    """Draw a frame with its caption, and its answer mark and ring if it has them."""
-    axes.set_axis_on()
-    axes.imshow(cell.image)
-    axes.set(xticks=[], yticks=[])
-    for spine in axes.spines.values():
-        spine.set(visible=cell.is_answer, color=GREEN, linewidth=4)
-    axes.set_xlabel("\n".join(cell.caption), loc="left", labelpad=6, fontsize=9)
-    axes.xaxis.label.set_color(GREEN if cell.is_answer else INK)
-    if cell.ring:
-        axes.autoscale(False)
-        axes.plot(*cell.ring, "o", mfc="none", mec=PINK, markersize=RING, mew=3)
 
 
 class SheetRows:
@@ -126,48 +109,38 @@ class SheetRows:
             caption = f"{_describe_frame(item, candidate)}, {distance:.0f} px from {nearest}"
             source, is_answer = f"{letter}: {candidate.source}", letter == item.letter
             cells.append(self._cell(candidate, source, caption, is_answer=is_answer))
-        return Row(item.item_id, ", ".join(details), item.question, self._prefix(item), cells)
+        heading = f"{item.item_id}    {', '.join(details)}\n{item.question}"
+        return Row(heading, self._prefix(item), cells)
 
     def _query(self, query: RetrievalQuery) -> Row:
         """The prefix, the target and the hard negatives of a query.
 
         The first hard negative of a counterfactual query is the factual frame: the query's own
-        scene at the target's moment. A ring marks the object that the counterfactual scene lacks.
+        scene at the target's moment.
         """
         caption = _describe_frame(query, query.target)
         cells = [self._cell(query.target, "target", caption, is_answer=True)]
-        negatives, removed = list(query.hard_negatives), None
+        negatives = list(query.hard_negatives)
         if query.removed_object is not None:
             scene = self._store.scene(query.scene_id)
             without = self._store.scene(query.target.scene_id)
             removed = [o.noun_phrase for o in scene.objects].index(query.removed_object)
             shift = removal_displacement(scene, without, removed)[query.target.frame]
             caption = f"others differ by {shift:.0f} px"
-            cells.insert(0, self._cell(negatives.pop(0), "factual", caption, ring_on=removed))
+            cells.insert(0, self._cell(negatives.pop(0), "factual", caption))
         for frame in negatives:
             distance = f"{self._displacement(query.target, frame):.0f} px away"
             caption = f"{_describe_frame(query, frame)}, {distance}"
             cells.append(self._cell(frame, "wrong time", caption))
-        details = f"{query.split}, anchor {query.anchor}"
-        return Row(query.query_id, details, query.question, self._prefix(query, removed), cells)
+        heading = f"{query.query_id}    {query.split}, anchor {query.anchor}\n{query.question}"
+        return Row(heading, self._prefix(query), cells)
 
-    def _prefix(
-        self, record: SelectionItem | RetrievalQuery, ring_on: int | None = None
-    ) -> list[Cell]:
+    def _prefix(self, record: SelectionItem | RetrievalQuery) -> list[Cell]:
         frames = sample_prefix_frames(record.prefix_start, record.prefix_stop, PREFIX_FRAMES)
-        return [
-            self._cell(FrameRef(record.scene_id, f), f"frame {f}", ring_on=ring_on) for f in frames
-        ]
+        return [self._cell(FrameRef(record.scene_id, f), f"frame {f}") for f in frames]
 
-    def _cell(
-        self, frame: FrameRef, *caption: str, is_answer: bool = False, ring_on: int | None = None
-    ) -> Cell:
-        image, ring = self._frames.image(frame.scene_id, frame.frame), None
-        if ring_on is not None:
-            scene = self._store.scene(frame.scene_id)
-            x, y = scene.image_positions[frame.frame, ring_on] / scene.image_size
-            ring = (x * image.width, y * image.height)
-        return Cell(image, caption, is_answer, ring)
+    def _cell(self, frame: FrameRef, *caption: str, is_answer: bool = False) -> Cell:
+        return Cell(self._frames.image(frame.scene_id, frame.frame), caption, is_answer)
 
     def _displacement(self, one: FrameRef, two: FrameRef) -> float:
         scenes = self._store.scene(one.scene_id), self._store.scene(two.scene_id)

@@ -44,8 +44,6 @@ GROUP_ROWS = 5_000
 """Rows of a row group without images."""
 SHARD_GROUPS = 10
 """Row groups of a shard."""
-SIZES = {1e3: "n<1K", 1e4: "1K<n<10K", 1e5: "10K<n<100K", 1e6: "100K<n<1M"}
-"""The Hub's words for fewer rows than these numbers."""
 Shard = dict[str, Any]
 """A written file, as export.json describes it: configuration, split, path relative to the export's
 folder, rows, bytes and sha256."""
@@ -147,14 +145,12 @@ def render_card(store: Store, shards: Sequence[Shard], images: bool) -> str:
     rows: dict[str, Counter[str]] = {}
     for shard in shards:
         rows.setdefault(shard["configuration"], Counter())[shard["split"]] += shard["rows"]
-    total = sum(shard["rows"] for shard in shards)
     items = store.selection()
     queries = [q for pool in POOLS for q in store.retrieval(pool=pool)]
     text = (files("data.publish") / "templates/dataset_card.md").read_text()
     return Template(text).render(
         store=store,
         images=images,
-        size=next((name for size, name in SIZES.items() if total < size), "1M<n<10M"),
         scene=store.scene(store.scene_ids("test")[0]),
         scenes={split: len(store.scene_ids(split)) for split in SPLITS},
         families=_count_rows(items, "family"),
@@ -205,12 +201,10 @@ def _verify(folder: Path, plan: dict[str, Any]) -> None:
     expected = {CARD: record["card"]} | {s["path"]: s["sha256"] for s in record["shards"]}
     for name, sha256 in expected.items():
         path = folder / name
-        missing = not path.exists()
-        if missing or hash_file(path) != sha256:
+        problem = "missing" if not path.exists() else "damaged" if hash_file(path) != sha256 else ""
+        if problem:
             raise UserError(
-                f"{path} is {'missing' if missing else 'damaged'}: delete {folder} and export "
-                "again",
-                code="missing-file" if missing else "damaged-file",
+                f"{path} is {problem}: delete {folder} and export again", code=f"{problem}-file"
             )
 
 

@@ -1,7 +1,7 @@
 """Statistics of a benchmark's scenes and selection items, and the accuracy of baselines.
 
-Baselines answer selection items from the oracle without a prediction. A baseline with high accuracy
-reveals a shortcut in the construction of the items.
+Baselines answer selection items from the oracle, without predicting the future. A high accuracy of
+a baseline shows that items can be answered by a shortcut.
 """
 
 from __future__ import annotations

@@ -20,7 +20,6 @@ log = logging.getLogger(__name__)
 
 RECORD = "frames.json"
 """File with the options and results of the last prerendering."""
-GB = 1e9
 
 
 def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: Workers) -> None:
@@ -28,7 +27,7 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
 
     Args:
         which: `all`, `none`, or `named` for those that items, queries and databases refer to.
-        limit_gb: Largest disk space for frames; the remaining scenes are left out.
+        limit_gb: Maximum size of all frames on the disk. Scenes that exceed it are not rendered.
     """
     options = {"frames": which, "bound_gb": limit_gb, "renderer": store.manifest["renderer"]}
     path = store.folder / FRAMES_FOLDER / RECORD
@@ -41,7 +40,7 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
     }
     total, rendered = 0.0, 0
     for scene, size in workers.run(jobs, "rendering scenes", "scene"):
-        if limit_gb is not None and total + size > limit_gb * GB:
+        if limit_gb is not None and total + size > limit_gb * 1e9:
             frames_path(store.folder, scene).unlink()
             log.info(
                 "frames_gb=%g: the frames of %d of %d scenes are on disk; the others are rendered "
