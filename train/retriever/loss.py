@@ -162,6 +162,10 @@ def identical_frames(frames: Sequence[FrameRef], targets: torch.Tensor) -> torch
 def prefetched(load: Callable[[In], Out], items: Sequence[In], ahead: int) -> Iterator[Out]:
     """Yield `load(item)` of each item in order, up to `ahead` of them loaded in advance by a single
     thread: several must not share a tokenizer."""
+    if not ahead:
+        # Without a thread: its own pool of OpenMP threads would compete with the model's for cores.
+        yield from map(load, items)
+        return
     with ThreadPoolExecutor(1) as pool:
         waiting: deque[Future[Out]] = deque()
         for item in items:
