@@ -152,6 +152,11 @@ class ClauseReader(PairReader):
 
     on_show = on_be
 
+    def on_halts(self, tag: Tag) -> None:
+        # "Slows near the top": the object may be elsewhere at the cut and at the target.
+        self.record_verb()
+        self.maybe = True
+
     def on_stays(self, tag: Tag) -> None:
         self.staying = True
         self.record_verb()

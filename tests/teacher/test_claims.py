@@ -72,6 +72,15 @@ def test_ambiguous_claims_are_not_contradicted(section, plain, ambiguous):
     assert "contradicted" not in verdicts(section, ambiguous.format(RED, BLUE)).values()
 
 
+@pytest.mark.parametrize("verb", ["stops", "slows", "settles", "comes to rest"])
+def test_place_of_a_halt_is_not_assigned_to_the_next_object(verb):
+    for sentence in (
+        f"The {RED} {verb} near the top, the {BLUE} stays.",
+        f"It {verb} near the top.",
+    ):
+        assert not any("near the top" in claim for claim in verdicts("P", sentence))
+
+
 def test_most_claims_of_true_sentences_are_supported():
     detected = [
         v for truth, s, text in CASES if truth == "true" for v in verdicts(s, text).values()
