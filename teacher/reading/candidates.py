@@ -4,8 +4,7 @@ agrees."""
 from __future__ import annotations
 
 from teacher.reading.grounding import TARGET
-from teacher.reading.reader import BOUNDARIES
-from teacher.reading.tagging import Tag
+from teacher.reading.tagging import BOUNDARIES, Tag
 from teacher.reading.topics import TopicReader
 
 ERRORS = {"error", "errors", "mistake", "mistakes", "fault", "faults", "flaw", "flaws"}

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from itertools import dropwhile
 
 from teacher.reading.grounding import Claim
-from teacher.reading.tagging import Sentence, Tag
+from teacher.reading.tagging import BOUNDARIES, Sentence, Tag
 
 PLAIN_WORDS = """
 all back both just only quite same too very we see straight directly simply well alike
@@ -29,7 +29,6 @@ LISTING = {"and", "comma", "object", "region", "not", "all"}
 """Tags allowed between the objects of a list."""
 BESIDE_NOT = {"be", "future", "moves", "moving", "show", "pronoun", "stays", "past", "by", "close"}
 """Tags allowed between a negation and what it denies."""
-ENDS = {"comma", "semicolon", "break", "stop", "and"}
 KEPT = {"leaves", "moves", "moving", "stays"}
 """Tags whose negation keeps the stated place: "has not left its place"."""
 PAIRED = {"meeting", "course", "close", "time", "close region", "place of either"}
@@ -38,7 +37,7 @@ UNBOUND = {"region", "direction", "displaced", "close region", "place of either"
 NAMING = {"lack", "gone", "adds", "extra", "misplace", "passed"}
 """Tags after which an object is one that a candidate lacks, adds or displaces."""
 CLOSING = {"stop", "semicolon", "break", "which", "show", "lack", "adds", "extra", "candidate"}
-"""Tags that may follow a list without ending it before its last object."""
+"""Tags behind a list that do not make its last object the subject of another clause."""
 COMPARED = {"slight", "clear", "off", "direction"}
 """Tags after words such as "gone" that make them verbs of motion: "has gone slightly too far"."""
 
@@ -179,11 +178,11 @@ class CertaintyCheck:
     def _is_denied(self, at: int, kept: set[str]) -> bool:
         """Whether the clause that ends here contains a negation: "cannot be near the top yet",
         but not "near the left, not near the top"."""
-        opening = self.sentence.find(at - 1, ENDS | kept, -1) + 1
+        opening = self.sentence.find(at - 1, BOUNDARIES | kept, -1) + 1
         for i in range(at - 1, opening - 1, -1):
             tag = self.tags[i]
             if tag.tag == "not" and tag.words not in ("nor", "no", "hardly"):
-                return self.sentence[i - 1].tag not in ENDS
+                return self.sentence[i - 1].tag not in BOUNDARIES
         return False
 
 

@@ -4,8 +4,8 @@ and records the claims about its subject."""
 from __future__ import annotations
 
 from teacher.reading.pairs import PairReader
-from teacher.reading.reader import BOUNDARIES, Names
-from teacher.reading.tagging import Tag
+from teacher.reading.reader import Names
+from teacher.reading.tagging import BOUNDARIES, Tag
 
 PRECEDING = {"from", "region", "direction", "speed", "still", "moving", "rest", "out", "hidden"}
 """Tags of claims that may precede the name of their object."""
@@ -24,7 +24,7 @@ class ClauseReader(PairReader):
         """The subjects at the end of the previous sentence."""
         self.begin_pairs()
         self.group_start = 0
-        """The index in `subjects` from which an afterthought behind a comma applies."""
+        """The index of the first subject that words behind a comma refer to."""
         self.pending: list[tuple[str, str, bool, str, Tag]] = []
         """Claims that precede their subject."""
         self.finite = False

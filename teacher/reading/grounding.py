@@ -129,7 +129,7 @@ class Ground:
 
 
 def _same(value: str, actual: str | None) -> bool | None:
-    """Whether a word holds; a coarse word is false only if none of its parts holds."""
+    """Whether the stated value is the actual one; a coarse value is false only if it is far off."""
     if actual is None:
         return None
     if not value.startswith(COARSE):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from teacher.reading.grounding import BETWEEN, CUT, EITHER, TARGET, Ground
-from teacher.reading.reader import BOUNDARIES, Names, Reader
-from teacher.reading.tagging import Tag
+from teacher.reading.reader import Names, Reader
+from teacher.reading.tagging import BOUNDARIES, Tag
 
 RELATIONS = {"course", "meet", "contact", "passed", "close"}
 LIMITS = {"moment", "yet", "then", "before", "until", "far"}

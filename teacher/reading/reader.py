@@ -9,8 +9,6 @@ from teacher.reading.certainty import CertaintyCheck
 from teacher.reading.grounding import CUT, EITHER, Claim, Ground
 from teacher.reading.tagging import Noun, Sentence, Tag
 
-BOUNDARIES = {"comma", "semicolon", "and", "break", "stop"}
-"""Tags that may end a clause."""
 MAX_OBJECTS = 9
 """The largest number of objects tracked at a time."""
 

@@ -6,9 +6,8 @@ from teacher.reading.grounding import BETWEEN, CUT, EITHER, TARGET
 from teacher.reading.nouns import COLUMNS, MIDDLE, ROWS
 from teacher.reading.pairs import RELATIONS
 from teacher.reading.phrases import COARSE
-from teacher.reading.reader import BOUNDARIES
 from teacher.reading.subjects import SubjectReader
-from teacher.reading.tagging import Tag
+from teacher.reading.tagging import BOUNDARIES, Tag
 
 STILL_VERBS = {
     *("does", "do", "did", "is", "are", "has", "have", "shows", "show", "keeps", "keep"),

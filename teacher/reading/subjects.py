@@ -6,14 +6,14 @@ from itertools import pairwise
 
 from teacher.reading.clauses import ClauseReader
 from teacher.reading.pairs import RELATIONS
-from teacher.reading.reader import BOUNDARIES, MAX_OBJECTS, Names
-from teacher.reading.tagging import Tag
+from teacher.reading.reader import MAX_OBJECTS, Names
+from teacher.reading.tagging import BOUNDARIES, Tag
 
 VERBS = {"be", "moves", "stays", "rest", "future", "across", "leaves", "enters", "still", "past"}
 """Tags of possible verbs of a clause."""
 INVERTED = {"be", "still", "rest", "future", "expected", "word"}
 """Tags of a verb before its subject: "near the top is the A"."""
-TAKERS = {"by", "close", "meet", "passed", "contact", "between", "course", "show"}
+BEFORE_COMPLEMENT = {"by", "close", "meet", "passed", "contact", "between", "course", "show"}
 """Tags before a noun phrase that is not a subject."""
 ASIDE = {"unlike", "besides", "despite", "except", "excepting", "apart", "beside", "given"}
 """Words before a noun phrase that is only contrasted with the subject."""
@@ -86,7 +86,7 @@ class SubjectReader(ClauseReader):
         if previous.tag == "contrast" and self.subjects:
             # "The A, rather than the B, ..."
             return True
-        return previous.tag in TAKERS or previous.words in ASIDE
+        return previous.tag in BEFORE_COMPLEMENT or previous.words in ASIDE
 
     def _read_complement(self) -> None:
         start, previous = self.at, self.near(-1)
@@ -188,7 +188,7 @@ class SubjectReader(ClauseReader):
         self.on_rest_of(tag)
         names = list(dict.fromkeys(self.mentioned))
         taken = any(
-            t.tag in TAKERS and following.tag == "object"
+            t.tag in BEFORE_COMPLEMENT and following.tag == "object"
             for t, following in pairwise(self.sentence)
         )
         if tag.words == "all of them" and None not in names and len(names) > 1 and not taken:

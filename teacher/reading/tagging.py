@@ -81,6 +81,8 @@ class Tag(NamedTuple):
         return self.words.split()[-1] if self.words else ""
 
 
+BOUNDARIES = {"comma", "semicolon", "and", "break", "stop"}
+"""Tags that may end a clause."""
 END = Tag("stop", "", 0, 0, "")
 """Stands for every tag outside a sentence."""
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from teacher.reading.grounding import TARGET, Claim, Ground
-from teacher.reading.reader import BOUNDARIES, Names, Reader
-from teacher.reading.tagging import Tag
+from teacher.reading.reader import Names, Reader
+from teacher.reading.tagging import BOUNDARIES, Tag
 
 ASIDE = {"unlike", "like", "than", "besides", "beyond", "except"}
 """Words before a candidate that is never the topic."""
