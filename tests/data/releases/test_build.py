@@ -79,14 +79,11 @@ def test_a_release_may_move_after_the_build(movi, tmp_path) -> None:
     np.testing.assert_array_equal(frame, np.asarray(picture(candidate.frame, (256, 256))))
 
 
-def test_settings_that_do_not_fit_a_release_are_refused(movi, tmp_path) -> None:
+def test_a_release_without_its_folder_is_refused(tmp_path) -> None:
     with raises_user_error("missing-setting", contains="benchmark.folder=FOLDER"):
         ensure_items(config(None), tmp_path, Workers(1))
     with raises_user_error("missing-folder", contains="nowhere"):
         ensure_items(config(tmp_path / "nowhere"), tmp_path, Workers(1))
-    cells = SelectionConfig(event={"A1_contact": Quota(0, 1)})
-    with raises_user_error("unknown-option", contains="event.A1_contact"):
-        ensure_items(config(movi, selection=cells), tmp_path, Workers(1))
 
 
 def test_clevrers_scenes_have_the_items_of_dynapix(tmp_path) -> None:
