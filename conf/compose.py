@@ -92,8 +92,8 @@ def options(command: str, schema: type) -> dict[str, list[str]]:
     for group in OVERLAYS:
         paths = {name: files("conf") / group / f"{name}.yaml" for name in groups[group]}
         groups[group] = [name for name, p in paths.items() if f"{command} " in p.read_text()]
-    taken = {*OVERLAYS, *(field.name for field in fields(schema))}
-    return {group: names for group, names in groups.items() if names and group in taken}
+    used = {*OVERLAYS, *(field.name for field in fields(schema))}
+    return {group: names for group, names in groups.items() if names and group in used}
 
 
 def validate_settings(cfg: DictConfig, schema: type) -> Any:
@@ -126,7 +126,12 @@ def open_hydra(command: str, schema: type) -> Iterator[ConfigLoader]:
 
 
 def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.RUN) -> DictConfig:
-    """Compose the settings of a command and of Hydra, with clearer messages for two errors."""
+    """Compose the settings of a command and of Hydra.
+
+    Raises:
+        SettingsError: A group of presets is null, or a key is inside a group that is null. Hydra's
+            own errors for these two name no key.
+    """
     hydra = GlobalHydra.instance().hydra
     try:
         return hydra.compose_config(config_name(command), overrides, mode, from_shell=False)
@@ -147,9 +152,8 @@ def _settings_error(command: str, error: Exception) -> SettingsError:
         r"Could not override '(?!exp'|sweep')(\S+)'. No match", text
     )
     if unknown:
-        preset = re.match(r"In '(\S+)': ", text)
-        problem = _unknown_key(command, unknown[1])
-        return SettingsError(f"{preset[0] if preset else ''}{problem}", code="unknown-key")
+        preset = re.match(r"In '\S+': |", text)[0]
+        return SettingsError(preset + _unknown_key(command, unknown[1]), code="unknown-key")
     text = re.sub(r" (full_key:|See https).*", "", text).removeprefix("Error merging override ")
     text = text.replace(" Available options", "; available options")
     if cause is not error:
@@ -179,11 +183,9 @@ def nearest_key(key: str, known: Iterable[str]) -> str | None:
     """
 
     def similarity(other: str) -> float:
-        last, other_last = key.rpartition(".")[2], other.rpartition(".")[2]
-        return (
-            SequenceMatcher(None, key, other).ratio()
-            + 2 * SequenceMatcher(None, last, other_last).ratio()
-        )
+        last_parts = key.rpartition(".")[2], other.rpartition(".")[2]
+        whole, last = (SequenceMatcher(None, *pair).ratio() for pair in ((key, other), last_parts))
+        return whole + 2 * last
 
     best = max(sorted(known), key=similarity)
     return best if similarity(best) > 1.8 else None

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+from types import ModuleType
+
 
 class UserError(Exception):
     """A mistake that the user can correct.
@@ -27,3 +30,17 @@ class SettingsError(UserError):
 
     def __init__(self, message: str, code: str = "invalid-setting") -> None:
         super().__init__(message, code)
+
+
+def import_extra(name: str, setting: str) -> ModuleType:
+    """Import the package of an extra that has the same name.
+
+    Raises:
+        UserError: It is not installed; the message names the `setting` that needs it.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise UserError(
+            f"{setting} needs {name}: pip install -e '.[{name}]'", code="missing-package"
+        ) from error

@@ -21,21 +21,14 @@ MAIN_RANK_GRACE = 3.0
 PEER_ENDED = r"gloo.*(by peer|[Bb]roken pipe)"
 """Error of a rank that waits for the others after one of them has ended."""
 FAILED_WRITE = r"PytorchStreamWriter|unexpected pos|\(os error (27|28|122)\)"
-"""Errors of torch and safetensors for a file that they cannot write; torch names no cause."""
+"""Messages of torch and safetensors about a file that they cannot write. torch gives no cause."""
 FULL_DISK_BYTES = 1 << 20
 """Free space below which a disk counts as full."""
-WRITE_ERRORS = (
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EFBIG,
-    errno.EROFS,
-    errno.EACCES,
-    errno.EPERM,
-    errno.ENOTDIR,
-    errno.EISDIR,
-    errno.EEXIST,
-    errno.ENAMETOOLONG,
-)
+WRITE_ERRORS = {
+    "ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EACCES", "EPERM", "ENOTDIR", "EISDIR", "EEXIST",
+    "ENAMETOOLONG",
+}  # fmt: skip
+"""Errors of the operating system that the user can correct, by their names in `errno`."""
 
 
 @contextmanager
@@ -56,13 +49,13 @@ def report_failures(folder: str = ".") -> Iterator[None]:
     except KeyboardInterrupt:
         _exit(130, "interrupted; run the same command again to resume")
     except OSError as error:
-        if error.errno not in WRITE_ERRORS:
+        if errno.errorcode.get(error.errno) not in WRITE_ERRORS:
             raise
         _exit_after_failed_write(str(error.filename or folder), str(error.strerror))
     except Exception as error:
         if world_size() > 1 and re.search(PEER_ENDED, str(error)):
             _end_process(1)
-        if _is_disk_full(folder):
+        if os.path.exists(folder) and shutil.disk_usage(folder).free < FULL_DISK_BYTES:
             _exit_after_failed_write(folder, os.strerror(errno.ENOSPC))
         if not re.search(FAILED_WRITE, str(error)):
             raise
@@ -96,7 +89,3 @@ def _end_process(status: int) -> NoReturn:
         sys.stderr.flush()
         os._exit(status)
     sys.exit(status)
-
-
-def _is_disk_full(folder: str) -> bool:
-    return os.path.exists(folder) and shutil.disk_usage(folder).free < FULL_DISK_BYTES

@@ -76,7 +76,7 @@ def run_name(run: str | None, overrides: Sequence[str]) -> str:
     # The sort is stable: of two values of one key, the later one takes effect.
     ordered = sorted((o.lstrip("+") for o in overrides), key=_key)
     ordered = [o for o in ordered if _key(o) not in RESULT_NEUTRAL_KEYS]
-    # Characters that an override such as model=NAME takes without quotes; "=" and "," are syntax.
+    # Keep only characters that need no quotes in an override such as model=NAME.
     name = re.sub(r"[^A-Za-z0-9_.+-]", "-", "+".join(ordered)) or "default"
     if len(name) > 120:
         digest = hashlib.sha256(name.encode()).hexdigest()[:8]
@@ -89,7 +89,7 @@ def _key(override: str) -> str:
 
 
 def resolve_run_name(run: str, folder: str) -> str:
-    """Name of a run in `folder`, from its name or from the path of its own folder."""
+    """Name of a run in `folder`; `run` is this name or the path of the run's folder."""
     return os.path.relpath(run, folder) if is_inside(run, folder) else os.path.normpath(run)
 
 
@@ -126,26 +126,34 @@ def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[s
 
     Raises:
         SettingsError: The folder contains results of a run with other settings.
-        UserError: The folder cannot be written.
     """
-    if other := differences(run.folder, settings):
+    if other := changed_settings(run.folder, settings):
         if {path.name for path in run.folder.iterdir()} - BOOKKEEPING_FILES:
             raise other_settings_error(f"{run.folder} contains a run", other)
         (run.folder / "run.json").unlink(missing_ok=True)
-    try:
-        run.folder.mkdir(parents=True, exist_ok=True)
-        write_text(run.folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(settings)))
-        write_json(run.folder / "run.json", _record(run.folder, settings, command, overrides))
-    except OSError as error:
-        raise UserError(
-            f"cannot write the run's folder {run.folder}: {error.strerror}", code="write-failed"
-        ) from error
+    run.folder.mkdir(parents=True, exist_ok=True)
+    write_text(run.folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(settings)))
+    path = run.folder / "run.json"
+    earlier = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+    record = {
+        "command": command,
+        "overrides": overrides,
+        "seeds": {k: v for k, v in flatten(settings).items() if k.rpartition(".")[2] == "seed"},
+        "ranks": world_size(),
+        "git": _git(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "packages": {name: version(name) for name in PACKAGES},
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "earlier_starts": [*earlier["earlier_starts"], earlier["started"]] if earlier else [],
+    }
+    write_json(path, record)
 
 
-def other_settings_error(subject: str, differences: Sequence[str]) -> SettingsError:
+def other_settings_error(subject: str, changes: Sequence[str]) -> SettingsError:
     """Error for a folder whose content (`subject`) was created with other settings."""
     return SettingsError(
-        f"{subject} with other settings: {'; '.join(differences[:3])}. Choose another folder with "
+        f"{subject} with other settings: {'; '.join(changes[:3])}. Choose another folder with "
         "run=NAME, or delete this one.",
         code="other-settings",
     )
@@ -183,12 +191,12 @@ def wait_for_lock(handle: int, busy: str) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX)
 
 
-def differences(folder: Path, settings: dict[str, Any]) -> list[str]:
-    """Each setting that differs from those of the run in `folder`, as a phrase with both values."""
+def changed_settings(folder: Path, settings: dict[str, Any]) -> list[str]:
+    """`compare_settings` of the run in `folder`, if there is one, and of `settings`."""
     path = folder / "config.yaml"
     if not path.exists():
         return []
-    return setting_differences(OmegaConf.to_container(OmegaConf.load(path)), settings)
+    return compare_settings(OmegaConf.to_container(OmegaConf.load(path)), settings)
 
 
 def flatten(value: Any, key: str = "") -> dict[str, Any]:
@@ -202,8 +210,9 @@ def flatten(value: Any, key: str = "") -> dict[str, Any]:
     }
 
 
-def setting_differences(before: Any, now: Any) -> list[str]:
-    """Each setting that differs between two nested dicts, as a phrase with both values."""
+def compare_settings(before: Any, now: Any) -> list[str]:
+    """A phrase with both values for each setting that differs between two nested dicts and may
+    change the result of a run."""
     before, now = (
         {key: json.dumps(value) for key, value in flatten(settings).items()}
         for settings in (before, now)
@@ -233,7 +242,8 @@ def write_json_lines(path: Path, rows: Iterable[dict[str, Any]]) -> None:
 
 
 def read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the objects in a file of JSON lines, without a line that a kill cut off."""
+    """Yield the objects in a file of JSON lines; skip damaged lines, such as one that a kill cut
+    off."""
     with open(path, encoding="utf-8", errors="replace") as file:
         for line in file:
             try:
@@ -242,25 +252,6 @@ def read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
                 continue
             if isinstance(row, dict):
                 yield row
-
-
-def _record(
-    folder: Path, settings: dict[str, Any], command: str, overrides: list[str]
-) -> dict[str, Any]:
-    path = folder / "run.json"
-    earlier = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
-    return {
-        "command": command,
-        "overrides": overrides,
-        "seeds": {k: v for k, v in flatten(settings).items() if k.rpartition(".")[2] == "seed"},
-        "ranks": world_size(),
-        "git": _git(),
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "packages": {name: version(name) for name in PACKAGES},
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "earlier_starts": [*earlier["earlier_starts"], earlier["started"]] if earlier else [],
-    }
 
 
 def run_id(run: Run) -> str:
@@ -272,17 +263,12 @@ def run_id(run: Run) -> str:
 
 def _git() -> dict[str, Any] | None:
     """The commit of the code and whether the code has changed since; None outside a repository."""
+
+    def git(*arguments: str) -> str:
+        command, folder = ["git", *arguments], Path(__file__).parent
+        return subprocess.check_output(command, cwd=folder, stderr=subprocess.DEVNULL, text=True)
+
     try:
-        commit, changes = (
-            subprocess.run(
-                ["git", *arguments],
-                cwd=Path(__file__).parent,
-                capture_output=True,
-                text=True,
-                check=True,
-            ).stdout.strip()
-            for arguments in (["rev-parse", "HEAD"], ["status", "--porcelain"])
-        )
+        return {"commit": git("rev-parse", "HEAD").strip(), "dirty": bool(git("status", "-s"))}
     except (OSError, subprocess.CalledProcessError):
         return None
-    return {"commit": commit, "dirty": bool(changes)}

@@ -16,7 +16,7 @@ from typing import Any
 from conf.compose import nearest_key
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
-from conf.runs import setting_differences, wait_for_lock
+from conf.runs import compare_settings, wait_for_lock
 from conf.schema import BenchmarkConfig, BuildCommand
 from data.parallel import Workers
 from data.records import SPLITS
@@ -196,9 +196,9 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
 
 def check_same_settings(old: dict[str, Any], new: dict[str, Any], folder: Path) -> None:
     """Raises UserError where the nested settings of two builds differ."""
-    if differences := setting_differences(old, new):
+    if changes := compare_settings(old, new):
         raise UserError(
-            f"{folder} was built with another setting: {differences[0]}. Use the earlier setting, "
+            f"{folder} was built with another setting: {changes[0]}. Use the earlier setting, "
             f"choose another name with benchmark.name=NAME, or delete {folder}",
             code="different-settings",
         )

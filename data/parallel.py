@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-from conf.errors import UserError
+from conf.errors import UserError, import_extra
 
 log = logging.getLogger(__name__)
 
@@ -121,13 +121,9 @@ def _worker_died(engine: str) -> tuple[type[Exception], ...]:
 
 @cache
 def _join_cluster(count: int) -> None:
-    try:
-        import ray
-        from ray.util.joblib import register_ray
-    except ImportError as error:
-        raise UserError(
-            "parallel=ray needs Ray: pip install -e '.[ray]'", code="missing-package"
-        ) from error
+    ray = import_extra("ray", "parallel=ray")
+    from ray.util.joblib import register_ray
+
     if not ray.is_initialized():
         local = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": count}
         ray.init(log_to_driver=False, include_dashboard=False, **local)

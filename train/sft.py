@@ -22,8 +22,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     if (metrics := finished_metrics(run)) is not None:
         log.info("%s is finished; to train again, delete it or give run=NAME", run.folder)
         return metrics
-    check_trackers(cfg.train.report_to)
     restrict_to_one_gpu()
+    check_trackers(cfg.train.report_to)
 
     from transformers import set_seed
 

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from conf.errors import UserError
+from conf.errors import UserError, import_extra
 from conf.gpus import visible_gpus
 
 log = logging.getLogger(__name__)
 
 POLL = 0.05
-"""Time (s) between two looks at the child processes."""
+"""Interval (s) at which child processes are polled."""
 CLUSTER_POLL = 0.5
-"""Time (s) between two looks at submitit's jobs; it queries the cluster less often."""
+"""Interval (s) at which submitit's jobs are polled. submitit queries the cluster less often."""
 GRACE = 10.0
 """Time (s) for a terminated child process to end before it is killed."""
 
@@ -69,7 +69,7 @@ class ProcessLauncher:
 
 
 class SubmititLauncher:
-    """Submits all jobs to a cluster and waits for them; leaving early cancels them.
+    """Submits all jobs to a cluster and waits for them.
 
     Args:
         cluster: slurm, or local for processes of this machine.
@@ -83,7 +83,7 @@ class SubmititLauncher:
         self.parameters = {name: v for name, v in parameters.items() if v is not None}
 
     def run(self, jobs: list[Job]) -> Iterator[tuple[Job, bool]]:
-        """Run jobs like `ProcessLauncher.run`."""
+        """Run jobs like `ProcessLauncher.run`. Closing the iterator cancels unfinished jobs."""
         if not jobs:
             return
         handles = dict(zip(self._submit(jobs), jobs, strict=True))
@@ -105,13 +105,8 @@ class SubmititLauncher:
                 handle.cancel(check=False)
 
     def _submit(self, jobs: list[Job]) -> list[Any]:
-        typed = f"hydra/launcher=submitit_{self.cluster}"
-        try:
-            import submitit
-        except ImportError as error:
-            raise UserError(
-                f"{typed} needs submitit: pip install -e '.[submitit]'", code="missing-package"
-            ) from error
+        setting = f"hydra/launcher=submitit_{self.cluster}"
+        submitit = import_extra("submitit", setting)
         try:
             executor = submitit.AutoExecutor(folder=self.folder, cluster=self.cluster)
             executor.update_parameters(**self.parameters)
@@ -120,7 +115,7 @@ class SubmititLauncher:
             )
         # No cluster on this machine, an unknown parameter, or one that the cluster refuses.
         except (RuntimeError, NameError) as error:
-            raise UserError(f"{typed}: {error}", code="cluster-refused") from error
+            raise UserError(f"{setting}: {error}", code="cluster-refused") from error
 
 
 def run_command(command: list[str], output: Path) -> int:
@@ -156,7 +151,7 @@ def end_processes(processes: list[subprocess.Popen]) -> None:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(max(0.0, deadline - time.monotonic()))
     finally:
-        # A second Ctrl-C arrives here too.
+        # Also after a second Ctrl-C.
         for process in processes:
             process.kill()
             process.wait()

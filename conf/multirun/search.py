@@ -1,8 +1,8 @@
 """Search for settings with Optuna: each job's settings depend on the results of earlier jobs.
 
 study.json in the sweep's folder records the settings of each trial before its job starts; the
-results are in the jobs' folders. A search that was killed resumes with the jobs that it had
-started and then tries what it would have tried without the interruption.
+results are in the jobs' folders. A killed search resumes with the jobs that it had started, and
+then samples the same trials as an uninterrupted search.
 """
 
 from __future__ import annotations
@@ -18,16 +18,19 @@ from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.types import Override, RangeSweep
 
-from conf.errors import SettingsError, UserError
+from conf.errors import SettingsError, UserError, import_extra
 from conf.gpus import visible_gpus
 from conf.multirun.table import is_lower_better
-from conf.runs import other_settings_error, setting_differences, write_json
+from conf.runs import compare_settings, other_settings_error, write_json
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
+    from optuna.study import Study
 
 log = logging.getLogger(__name__)
 
+RunJobs = Callable[[list[list[str]], int], list[dict[str, Any]]]
+"""Runs jobs with the overrides of each, numbered from a first number, and returns their records."""
 STUDY_FILE = "study.json"
 METRICS = {"train.sft": "answer_letter_accuracy", "train.contrastive": "mrr"}
 """Default of hydra.sweeper.metric for each command."""
@@ -45,19 +48,11 @@ class Search:
     """Sweeps of a preset, which `conf.multirun.sweep.Sweep` adds to the overrides."""
 
     def run(
-        self,
-        command: str,
-        overrides: dict[str, Override],
-        folder: Path,
-        run_jobs: Callable[[list[list[str]], int], list[dict[str, Any]]],
+        self, command: str, overrides: dict[str, Override], folder: Path, run_jobs: RunJobs
     ) -> None:
-        """Run trials until the study has `n_trials`.
+        """Run trials in the sweep's folder until the study has `n_trials`.
 
-        Args:
-            overrides: The swept and the fixed overrides of the jobs, by key.
-            folder: The sweep's folder.
-            run_jobs: Runs the jobs with these overrides, numbered from a first number, and returns
-                their records.
+        `overrides` are the swept and the fixed overrides of the jobs, by key.
         """
         metric = self.metric or METRICS.get(command)
         if metric is None:
@@ -74,30 +69,17 @@ class Search:
                 code="nothing-to-search",
             )
         fixed = [str(o.input_line) for key, o in overrides.items() if key not in swept]
-        optuna = _import_optuna()
+        optuna = import_extra("optuna", "hydra/sweeper=optuna")
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
         space = {key: distribution(override) for key, override in swept.items()}
         direction = "minimize" if is_lower_better(metric) else "maximize"
         study = optuna.create_study(direction=direction)
-
-        def run_trials(first: int) -> None:
-            # A finished job is skipped. A failed job has no result, so that a restart repeats it.
-            trials = study.trials[first:]
-            jobs = [[*fixed, *(f"{k}={v}" for k, v in t.params.items())] for t in trials]
-            for trial, job in zip(trials, run_jobs(jobs, first) if jobs else [], strict=True):
-                if job["status"] == "failed":
-                    continue
-                value = _read_metric(job["metrics"], metric)
-                if math.isfinite(value):
-                    study.tell(trial.number, value)
-                else:
-                    study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
-
         settings = {key: str(o.input_line).partition("=")[2] for key, o in overrides.items()}
         for params in _recorded_trials(folder, settings):
             study.enqueue_trial(params)
             study.ask(space)
         log.info("search by %s: %d jobs", metric, self.n_trials)
-        run_trials(first=0)
+        _run_trials(study, 0, fixed, metric, run_jobs)
         batch = max(1, self.n_jobs or len(visible_gpus()))
         while (first := len(study.trials)) < self.n_trials:
             for number in range(first, min(first + batch, self.n_trials)):
@@ -108,11 +90,38 @@ class Search:
             folder.mkdir(parents=True, exist_ok=True)
             record = {"settings": settings, "trials": [trial.params for trial in study.trials]}
             write_json(folder / STUDY_FILE, record)
-            run_trials(first)
+            _run_trials(study, first, fixed, metric, run_jobs)
         if any(trial.value is not None for trial in study.trials):
             best = study.best_trial
             params = " ".join(f"{key.lstrip('+')}={value}" for key, value in best.params.items())
             log.info("best: #%d %s, %s %.4g", best.number, params, metric, best.value)
+
+
+def _run_trials(study: Study, first: int, fixed: list[str], metric: str, run_jobs: RunJobs) -> None:
+    """Run the jobs of the trials from number `first` on, and report their metrics to the study.
+
+    A trial whose job failed gets no result, so that the same command runs it again.
+
+    Raises:
+        UserError: A job has no such metric.
+    """
+    from optuna.trial import TrialState
+
+    trials = study.trials[first:]
+    jobs = [[*fixed, *(f"{k}={v}" for k, v in t.params.items())] for t in trials]
+    for trial, job in zip(trials, run_jobs(jobs, first) if jobs else [], strict=True):
+        if job["status"] == "failed":
+            continue
+        if metric not in job["metrics"]:
+            raise UserError(
+                f"hydra.sweeper.metric={metric} is not a metric of this command; the options are "
+                f"{', '.join(sorted(job['metrics'])) or 'none'}",
+                code="unknown-metric",
+            )
+        if math.isfinite(value := job["metrics"][metric]):
+            study.tell(trial.number, value)
+        else:
+            study.tell(trial.number, state=TrialState.FAIL)
 
 
 def _recorded_trials(folder: Path, settings: dict[str, str]) -> list[dict[str, Any]]:
@@ -121,19 +130,9 @@ def _recorded_trials(folder: Path, settings: dict[str, str]) -> list[dict[str, A
     if not path.exists():
         return []
     record = json.loads(path.read_text(encoding="utf-8"))
-    if other := setting_differences(record["settings"], settings):
+    if other := compare_settings(record["settings"], settings):
         raise other_settings_error(f"{folder} contains a search", other)
     return record["trials"]
-
-
-def _read_metric(metrics: dict[str, float], name: str) -> float:
-    if name not in metrics:
-        raise UserError(
-            f"hydra.sweeper.metric={name} is not a metric of this command; the options are "
-            f"{', '.join(sorted(metrics)) or 'none'}",
-            code="unknown-metric",
-        )
-    return metrics[name]
 
 
 def distribution(override: Override) -> BaseDistribution:
@@ -159,14 +158,3 @@ def distribution(override: Override) -> BaseDistribution:
         return CategoricalDistribution(list(override.sweep_string_iterator()))
     except ValueError as error:
         raise SettingsError(f"{override.input_line}: {error}", code="invalid-interval") from error
-
-
-def _import_optuna() -> Any:
-    try:
-        import optuna
-    except ImportError as error:
-        raise UserError(
-            "hydra/sweeper=optuna needs Optuna: pip install -e '.[optuna]'", code="missing-package"
-        ) from error
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    return optuna

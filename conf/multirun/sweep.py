@@ -22,7 +22,7 @@ from conf.errors import SettingsError
 from conf.multirun.launchers import Job
 from conf.multirun.search import Search
 from conf.multirun.table import JOB_FILE, read_job, read_jobs, write_sweep_table
-from conf.runs import differences, run_name, write_json
+from conf.runs import changed_settings, run_name, write_json
 
 log = logging.getLogger(__name__)
 
@@ -57,8 +57,8 @@ class Sweep:
     Attributes:
         hydra: Hydra's settings.
         overrides: The swept and the fixed overrides of the jobs, by key.
-        jobs: The overrides of each job. A search chooses its own jobs; for the check, these contain
-            each of its values.
+        jobs: The overrides of each job. A search chooses its own jobs; for it, these are jobs
+            that contain every value at least once, to check all values before the start.
     """
 
     def __init__(self, command: str, schema: type, overrides: list[str]) -> None:
@@ -134,7 +134,7 @@ class Sweep:
         if not (job.folder / "metrics.json").exists():
             return False
         settings = compose(self.command, self.schema, job.overrides)
-        if differences(job.folder, asdict(settings)):
+        if changed_settings(job.folder, asdict(settings)):
             return False
         log.info("%s: already finished, skipped", job.title)
         _record(job, "done")

@@ -12,7 +12,8 @@ from conf.runs import write_text
 
 JOB_FILE = "job.json"
 AT_START_SUFFIX = "_at_start"
-"""End of the name of a metric that is measured before the first step of a run."""
+"""End of the name of a metric that is measured before the first step of a run, and that most jobs
+of a sweep share."""
 LOWER_IS_BETTER = r"loss|_rank$|set_aside|too_short|reject"
 
 
@@ -27,12 +28,8 @@ def read_job(folder: Path) -> dict[str, Any]:
     job = json.loads((folder / JOB_FILE).read_text())
     path = folder / "metrics.json"
     metrics = json.loads(path.read_text()) if job["status"] == "done" and path.exists() else {}
-    return {"job": int(folder.name), "metrics": final_metrics(metrics), **job}
-
-
-def final_metrics(metrics: dict[str, float]) -> dict[str, float]:
-    """The metrics of a run without those of its start, which most jobs of a sweep share."""
-    return {name: value for name, value in metrics.items() if not name.endswith(AT_START_SUFFIX)}
+    final = {name: value for name, value in metrics.items() if not name.endswith(AT_START_SUFFIX)}
+    return {"job": int(folder.name), "metrics": final, **job}
 
 
 def write_sweep_table(folder: Path) -> str:

@@ -20,8 +20,8 @@ from conf.schema.commands import (
     StatisticsCommand,
 )
 from conf.schema.evaluation import (
+    EmbedderConfig,
     ExportStudyCommand,
-    MatcherConfig,
     ReportCommand,
     RetrieveCommand,
     SelectCommand,

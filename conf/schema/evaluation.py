@@ -35,27 +35,34 @@ class ItemsCommand(CommandConfig):
 
 
 @dataclass
-class SelectCommand(ItemsCommand):
+class GenerationCommand(CommandConfig):
+    """Settings of the commands that measure a model by its generated text."""
+
     benchmark: BenchmarkConfig = MISSING
     student: StudentConfig = MISSING
     server: ServerConfig = field(default_factory=ServerConfig)
     train: SftTrainConfig = field(default_factory=SftTrainConfig)
-    """The preset's training recipe. A base uses only its precision and its regime's prompt."""
+    """The preset's training recipe. A base uses only its precision and, in evaluation.select, its
+    regime's prompt."""
     model: str | None = None
     """Run folder of train.sft or folder that train.export wrote, with its own student and recipe;
     null measures the student's base."""
+    batch: int = setting(16, least=1)
+    """Items, queries or frames per forward pass."""
+    seed: int = setting(0, least=0)
+    """Seed of every sample: of items, of responses and of the bootstrap."""
+
+
+@dataclass
+class SelectCommand(GenerationCommand, ItemsCommand):
     modes: list[str] | None = None
     """Response modes to measure: reasoning (rationale, then answer), answer (only the answer),
     record (structured record) and constrained (record, with decoding constrained to its JSON
     schema). null uses the modes that the student was trained in; for a base, record and
     constrained."""
-    batch: int = setting(16, least=1)
-    """Items per forward pass."""
-    seed: int = setting(0, least=0)
-    """Seed of the items that `limit` samples, of sampled responses and of the bootstrap."""
     control: str | None = setting(None, ("candidate_only", "shuffled_prefix", None))
     """candidate_only leaves out the prefix, shuffled_prefix shuffles its frames; each control is
-    measured beside the unchanged items. null measures only the unchanged items."""
+    measured in addition to the unchanged items. null measures only the unchanged items."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)
@@ -63,18 +70,24 @@ class SelectCommand(ItemsCommand):
 
 
 @dataclass
-class EmbeddingCommand(CommandConfig):
-    """Settings of the commands that measure a retriever."""
+class EmbedderConfig(Settings):
+    """A retriever to measure, or the frozen encoder that matches texts to the database."""
 
-    benchmark: BenchmarkConfig = MISSING
     retriever: RetrieverConfig = MISSING
     train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
     """The preset's training recipe, of which only the precision is used."""
     model: str | None = None
     """Run folder of train.contrastive or folder that train.export wrote, with its own retriever and
-    recipe; null measures the preset's released model."""
+    recipe; null uses the preset's released model."""
     batch: int = setting(64, least=1)
-    """Queries, prefixes or frames per forward pass."""
+    """Queries, prefixes, texts or frames per forward pass."""
+
+
+@dataclass
+class EmbeddingCommand(EmbedderConfig, CommandConfig):
+    """Settings of the commands that measure a retriever."""
+
+    benchmark: BenchmarkConfig = MISSING
     seed: int = setting(0, least=0)
     """Seed of every sample, including the bootstrap's."""
 
@@ -109,39 +122,13 @@ class ReportCommand(CommandConfig):
 
 
 @dataclass
-class MatcherConfig(Settings):
-    """Frozen encoder that matches written texts to the database: the preset of any retriever."""
-
-    retriever: RetrieverConfig = MISSING
-    train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
-    """The preset's training recipe, of which only the precision is used."""
-    model: str | None = None
-    """Run folder of train.contrastive or folder that train.export wrote, with its own retriever and
-    recipe; null uses the preset's released model."""
-    batch: int = setting(64, least=1)
-    """Texts or frames per forward pass."""
-
-
-@dataclass
-class TwoStageCommand(CommandConfig):
-    benchmark: BenchmarkConfig = MISSING
-    student: StudentConfig = MISSING
-    server: ServerConfig = field(default_factory=ServerConfig)
-    train: SftTrainConfig = field(default_factory=SftTrainConfig)
-    """The preset's training recipe, of which a base uses only the precision."""
-    model: str | None = None
-    """Writing model: run folder of train.sft or folder that train.export wrote, with its own
-    student and recipe; null uses the student's base."""
-    matcher: MatcherConfig = field(default_factory=MatcherConfig)
+class TwoStageCommand(GenerationCommand):
+    matcher: EmbedderConfig = field(default_factory=EmbedderConfig)
     routes: list[str] | None = None
     """Routes to measure: cot_text (the future state in a rationale, matched to frames),
     predict_caption (a description of the future frame, matched to the same model's descriptions of
     the database's frames) and predict_image (that description, matched to frames). null uses
     cot_text for a student, and all three for a base."""
-    batch: int = setting(16, least=1)
-    """Queries or frames per forward pass of the writing model."""
-    seed: int = setting(0, least=0)
-    """Seed of sampled texts and of the bootstrap."""
 
     def find_problems(self, group: str) -> list[str]:
         return check_choices("routes", self.routes, ROUTES)

@@ -73,8 +73,8 @@ class TeacherConfig(ServersConfig):
     name: str = MISSING
     """Name of the teacher, recorded with every rationale."""
     seed: int = setting(0, least=0)
-    """Seed of the built-in narrator's phrasing. A server does not receive it, but is asked again
-    for every rationale when it changes."""
+    """Seed of the built-in narrator's phrasing. It is not sent to a server, but with another seed
+    every rationale is requested again."""
     min_words: int = 80
     """Minimum length of a rationale (words)."""
     max_words: int = 250

@@ -48,7 +48,7 @@ class Settings:
                 for name, nested in value.items():
                     problems += nested.check(f"{key}.{name}.")
             else:
-                problems += check_value(key, value, **entry.metadata)
+                problems += _check_value(key, value, **entry.metadata)
         return [*problems, *self.find_problems(group)]
 
     def find_problems(self, group: str) -> Iterable[str]:
@@ -56,10 +56,9 @@ class Settings:
         return ()
 
 
-def check_value(
+def _check_value(
     key: str, value: Any, options: Sequence[str | None] = (), bounds: Mapping[str, float] = {}
 ) -> list[str]:
-    """A value that is not one of its options, or is outside its bounds."""
     if options and value not in options:
         return [f"{key}={value}: the options are {', '.join(o or 'null' for o in options)}"]
     if value is None or all(BOUNDS[name][0](value, bound) for name, bound in bounds.items()):

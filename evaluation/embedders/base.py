@@ -16,7 +16,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from conf.runs import Run
-from conf.schema import ContrastiveCommand, MatcherConfig, RetrieverConfig
+from conf.schema import ContrastiveCommand, EmbedderConfig, RetrieverConfig
 from conf.schema.evaluation import EmbeddingCommand
 from data.build import ensure_benchmark
 from data.records import FrameRef, RetrievalQuery, SelectionItem
@@ -170,7 +170,7 @@ def open_retriever(
 
 def open_embedders(
     folder: Path | None,
-    trained: ContrastiveCommand | EmbeddingCommand | MatcherConfig,
+    trained: ContrastiveCommand | EmbedderConfig,
     store: Store,
     run: Path,
     batch: int,

@@ -57,9 +57,3 @@ def test_other_settings_are_refused_with_both_values(tmp_path):
     (run.folder / "metrics.jsonl").touch()
     with raises_user_error("other-settings", contains="train.lr was 1.0 and is now 2.0"):
         open_run(run, SETTINGS | {"train": {"lr": 2.0}}, "train.sft", [])
-
-
-def test_folder_that_cannot_be_written_is_named(tmp_path):
-    (tmp_path / "file").write_text("")
-    with raises_user_error("write-failed", contains="file/r"):
-        open_run(Run("r", tmp_path / "file" / "r"), SETTINGS, "train.sft", [])

@@ -7,26 +7,24 @@ import shutil
 import signal
 import sys
 import time
-from importlib.resources import files
 from pathlib import Path
 
 import psutil
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import OmegaConf
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from conf.compose import compose
+from conf.errors import import_extra
 from conf.gpus import visible_gpus
-from conf.multirun.search import STUDY_FILE, _import_optuna, distribution
+from conf.multirun.search import STUDY_FILE, distribution
 from conf.multirun.sweep import Sweep
-from conf.multirun.table import is_lower_better, varying_overrides
+from conf.multirun.table import is_lower_better
 from conf.schema import ContrastiveCommand, SftCommand
 from conf.schema.training import REGIMES
 from tests.conf.toy_process import NO_GPU, run_toy, start_toy
 from tests.user_errors import raises_user_error
 
-PRESETS = Path(str(files("conf"))) / "sweep"
 SEARCH = ("-m", "x=interval(0.5,3.0)", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=2")
 BY_LOSS = "hydra.sweeper.metric=loss"
 TWO_GPUS = {**os.environ, "CUDA_VISIBLE_DEVICES": "0,1"}
@@ -52,8 +50,8 @@ def searched(tmp_path_factory) -> Path:
     done = run_toy(folder, *SEARCH, BY_LOSS, "run=s")
     assert done.returncode == 0, done.stderr
     table = rows(folder / "checkpoints/toy/s")
-    lowest = min(table, key=lambda row: float(row["loss"]))
-    assert f"best: #{lowest['job']} x={lowest['x']}, loss" in done.stderr
+    best = min(table, key=lambda row: float(row["loss"]))
+    assert f"best: #{best['job']} x={best['x']}, loss" in done.stderr
     assert all(0.5 <= float(row["x"]) <= 3 for row in table)
     return folder
 
@@ -114,20 +112,10 @@ def test_one_job_runs_on_each_gpu(folder):
     assert sorted(line[-1] for line in gpus) == ["0", "1"]
 
 
-@pytest.mark.parametrize(
-    ("visible", "gpus"),
-    [
-        ("", []),
-        ("-1", []),
-        ("NoDevFiles", []),
-        ("3", ["3"]),
-        ("0, 2", ["0", "2"]),
-        ("0,-1,1", ["0"]),
-        ("GPU-a1,MIG-b2", ["GPU-a1", "MIG-b2"]),
-    ],
-)
-def test_environment_limits_the_visible_gpus(monkeypatch, visible, gpus):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+@pytest.mark.parametrize("rest", ["", "-1", "NoDevFiles", "-1,1"])
+@pytest.mark.parametrize("gpus", [[], ["3"], ["0", "2"], ["GPU-a1", "MIG-b2"]])
+def test_gpus_before_the_first_invalid_one_are_visible(monkeypatch, gpus, rest):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", ", ".join([*gpus, rest]))
     assert visible_gpus() == gpus
 
 
@@ -242,10 +230,10 @@ def test_invalid_search_is_one_sentence(folder, arguments, code):
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_search_without_optuna_is_a_user_error(monkeypatch):
+def test_extra_that_is_not_installed_is_a_user_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
-    with raises_user_error("missing-package", contains=".[optuna]"):
-        _import_optuna()
+    with raises_user_error("missing-package", contains=("hydra/sweeper=optuna", ".[optuna]")):
+        import_extra("optuna", "hydra/sweeper=optuna")
 
 
 @pytest.mark.parametrize(
@@ -270,33 +258,28 @@ def test_direction_follows_from_the_metric():
     assert {m for m in (*lower, "mrr", "accuracy") if is_lower_better(m)} == lower
 
 
-def test_table_has_columns_for_varying_overrides_only():
-    jobs = [["+exp=cot", "x=1", "y=3"], ["+exp=cot", "x=2", "y=3"]]
-    assert varying_overrides(jobs) == [{"x": "1"}, {"x": "2"}]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "command", "schema", "model"),
     [
-        ("regimes", "train.sft", SftCommand, "student=qwen3_vl_8b"),
-        ("lr_rank", "train.sft", SftCommand, "student=qwen3_vl_8b"),
-        ("retriever_lr_rank", "train.contrastive", ContrastiveCommand, "retriever=qwen3_vl_emb_8b"),
+        ("+sweep=regimes", "train.sft", SftCommand, "student=qwen3_vl_8b"),
+        ("+sweep=lr_rank", "train.sft", SftCommand, "student=qwen3_vl_8b"),
+        (
+            "+sweep=retriever_lr_rank",
+            "train.contrastive",
+            ContrastiveCommand,
+            "retriever=qwen3_vl_emb_8b",
+        ),
     ],
 )
 def test_presets_compose_around_the_papers_values(preset, command, schema, model):
-    Sweep(command, schema, [f"+sweep={preset}", model])
-    paper = compose(command, schema, [model])
-    params = OmegaConf.load(PRESETS / f"{preset}.yaml").hydra.sweeper.params
-    parsed = OverridesParser.create().parse_overrides([f"{k}={v}" for k, v in params.items()])
-    values = {o.key_or_group: list(o.sweep_iterator()) for o in parsed}
-    if preset == "regimes":
-        assert set(values["train.regime"]) == set(REGIMES) - {"describe"}
-        return
+    jobs = [compose(command, schema, job) for job in Sweep(command, schema, [preset, model]).jobs]
     group = model.partition("=")[0]
+    paper, loras = compose(command, schema, [model]), [getattr(job, group).lora for job in jobs]
     lora = getattr(paper, group).lora
-    assert paper.train.lr in values["train.lr"]
-    scales = {value["rank"]: value["alpha"] / value["rank"] for value in values[f"{group}.lora"]}
-    assert set(scales.values()) == {lora.alpha / lora.rank}
-    assert lora.rank in scales
-    assert len(scales) == 3
+    assert (paper.train.lr, lora) in zip([job.train.lr for job in jobs], loras, strict=True)
+    assert {other.alpha / other.rank for other in loras} == {lora.alpha / lora.rank}
+    if preset == "+sweep=regimes":
+        assert {job.train.regime for job in jobs} == set(REGIMES) - {"describe"}
+    else:
+        assert len({other.rank for other in loras}) == 3

@@ -10,7 +10,7 @@ import pytest
 
 from conf.schema import (
     ContrastiveCommand,
-    MatcherConfig,
+    EmbedderConfig,
     ReportCommand,
     SelectCommand,
     SftCommand,
@@ -148,7 +148,7 @@ def test_settings_that_a_trained_model_cannot_use_are_refused(
     for refused in ("student=qwen3_vl_8b", "student.lora.rank=8", "++train.regime=cot"):
         with raises_user_error("unused-setting", contains="student.temperature"):
             resolve_model(cfg, micro, SftCommand, "student", (*typed, refused))
-    matcher = MatcherConfig(model=str(trained_retriever))
+    matcher = EmbedderConfig(model=str(trained_retriever))
     resolve = (matcher, micro, ContrastiveCommand, "retriever")
     resolve_model(*resolve, ("student.frames=2", "matcher.model=RUN"), "matcher.model")
     for refused in ("matcher=clip", "matcher.retriever.image_size=64"):

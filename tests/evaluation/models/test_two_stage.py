@@ -15,8 +15,8 @@ from transformers import CLIPVisionModel
 
 from conf.schema import (
     ContrastiveTrainConfig,
+    EmbedderConfig,
     LateConfig,
-    MatcherConfig,
     RetrieverConfig,
     ServerConfig,
     StudentConfig,
@@ -63,7 +63,7 @@ def store(tmp_path, micro_store) -> Store:
 def matcher(clip, store, tmp_path) -> Embedder:
     train = ContrastiveTrainConfig(precision="fp32")
     [embedder] = open_embedders(
-        None, MatcherConfig(retriever=clip, train=train), store, tmp_path, 16
+        None, EmbedderConfig(retriever=clip, train=train), store, tmp_path, 16
     )
     return embedder
 
@@ -173,7 +173,7 @@ def measure(tmp_path, micro, store, clip) -> Callable[..., tuple[dict, dict]]:
         run = new_run(tmp_path / name, *overrides)
         cfg = TwoStageCommand(
             benchmark=micro, student=SERVED, store=str(store.folder.parent),
-            matcher=MatcherConfig(retriever=clip, batch=16),
+            matcher=EmbedderConfig(retriever=clip, batch=16),
         )  # fmt: skip
         metrics = two_stage.main.__wrapped__(replace(cfg, **settings), run)
         report = json.loads((run.folder / "report.json").read_text())
@@ -225,7 +225,7 @@ def test_a_students_texts_serve_every_matcher(
 
     # Another matcher loads no student: without its configuration none could be loaded.
     (folder / "student" / "config.json").unlink()
-    other = MatcherConfig(retriever=replace(clip, name="narrow", widths=[12]))
+    other = EmbedderConfig(retriever=replace(clip, name="narrow", widths=[12]))
     again, _ = measure("three", *overrides, **settings, matcher=other)
     assert set(again) == set(metrics)
 
@@ -249,7 +249,7 @@ def test_texts_of_a_server_are_requested_once(measure, store, start_server) -> N
 def test_a_late_interaction_matcher_is_refused(measure) -> None:
     late = RetrieverConfig(name="late", model="unused", late=LateConfig(width=24))
     with raises_user_error("unsupported-matcher", contains="retriever.late"):
-        measure(matcher=MatcherConfig(retriever=late))
+        measure(matcher=EmbedderConfig(retriever=late))
 
 
 def test_a_student_without_rationales_is_refused(measure, trained_student, tmp_path) -> None:
