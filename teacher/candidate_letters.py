@@ -15,7 +15,8 @@ FOLLOWS_LETTER = re.compile(
     "and|or|nor|alone|also|too|then|still|never|always|only|itself|again|cannot|can|will|would"
     "|should|could|must|may|might|did|had|now|likewise|here|thus|therefore|instead|however|meanwhile"
 )
-"""Words after a letter at the start of a sentence, besides verbs in -s and punctuation."""
+"""Words before which an "A" at the start of a sentence is a letter and not the article. The same
+holds before verbs in -s and punctuation."""
 
 
 def find_letters(text: str) -> list[tuple[int, int]]:

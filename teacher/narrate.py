@@ -24,7 +24,7 @@ from data.records import Rationale, SelectionItem
 from teacher.narrator import write_rationale
 from teacher.predicates import extract_predicates
 from teacher.rationale_log import Journal, save_accepted
-from teacher.report import Figures, rejection_kinds, select_accepted, summarize, write_report
+from teacher.report import Figures, rejection_reasons, select_accepted, summarize, write_report
 from teacher.servers.responses import Response
 from teacher.validation.grader import RationaleGrader
 
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 JOURNAL_FILE = "rationales.jsonl"
 LISTED_REASONS = 3
-"""Most frequent reasons for rejections that the bar lists."""
+"""Number of reasons for rejections in the progress bar: the most frequent ones."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,8 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
     """Request the missing rationales, and save the accepted ones to rationales.parquet too.
 
     Raises:
-        UserError: rationales.jsonl is damaged or belongs to another benchmark, or the servers fail
-            for good.
+        UserError: rationales.jsonl is damaged or belongs to another benchmark, or the servers
+            cannot be used.
     """
     items = store.selection("train")
     grader = RationaleGrader(cfg)
@@ -111,7 +111,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
         def is_settled(item: SelectionItem) -> bool:
             return any(r.accepted for r in responses[item.item_id])
 
-        # Finished items are left out, so that none occupies a slot of the requests in flight.
+        # Without the finished items, every concurrent job has a request to send.
         jobs = [
             (item, attempts)
             for item in items
@@ -129,22 +129,18 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
             if cfg.url is None:
                 for item, attempt in jobs:
                     record(_write_rationales(item, store, grader, attempt))
-                    progress.finish_item()
+                    progress.bar.update()
             elif jobs:
                 from teacher.server_narrator import request_rationales
 
-                asyncio.run(request_rationales(jobs, store, grader, record, progress.finish_item))
+                asyncio.run(request_rationales(jobs, store, grader, record, progress.bar.update))
         if cfg.fallback:
             for item in items:
                 if not is_settled(item) and len(responses[item.item_id]) >= cfg.attempts:
-                    fallbacks = _write_rationales(item, store, grader)
-                    record(
-                        [
-                            replace(r, fallback=True, attempt=cfg.attempts + r.attempt)
-                            for r in fallbacks
-                            if r.accepted
-                        ]
-                    )
+                    *_, last = _write_rationales(item, store, grader)
+                    if last.accepted:
+                        attempt = cfg.attempts + last.attempt
+                        record([replace(last, fallback=True, attempt=attempt)])
         rationales = select_accepted(items, responses)
         save_accepted(rationales, store.folder / "rationales.parquet")
     return Narration(rationales, summarize(items, responses))
@@ -162,15 +158,12 @@ class Progress:
     def add_responses(self, responses: list[Rationale]) -> None:
         self.accepted += sum(r.accepted for r in responses)
         self.tokens += sum(r.completion_tokens or 0 for r in responses)
-        self.rejected.update(kind for r in responses for kind in rejection_kinds(r))
+        self.rejected.update(kind for r in responses for kind in rejection_reasons(r))
         words = [f"{self.accepted} accepted"]
         words += [f"{n} {kind}" for kind, n in self.rejected.most_common(LISTED_REASONS)]
         if self.tokens:
             words.append(f"{self.tokens / (time.monotonic() - self.started):,.0f} tokens/s")
         self.bar.set_postfix_str(", ".join(words), refresh=False)
-
-    def finish_item(self) -> None:
-        self.bar.update()
 
 
 def check_items(journal: Journal, items: list[SelectionItem]) -> None:

@@ -1,14 +1,17 @@
 """Built-in narrator: writes rationales from predicates with templates, without a model.
 
-Each statement has a few phrasings over a small vocabulary, so that a small student can learn it.
+Each statement has a few phrasings (templates/phrases.yaml) over a small vocabulary, so that a small
+student can learn it.
 """
 
 from __future__ import annotations
 
 import hashlib
-from typing import NamedTuple
+from importlib.resources import files
+from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 
 from data.records import Scene, SelectionItem
 from teacher.predicates import (
@@ -22,26 +25,24 @@ from teacher.predicates import (
     extract_facts,
 )
 
+PHRASES = yaml.safe_load((files("teacher") / "templates" / "phrases.yaml").read_text())
 NARRATOR_VERSION = "5"
-FEW_WORDS, MOST_WORDS = 110, 250
-"""A rationale of fewer words is rewritten in full detail, one of more words in brief. The lower
-bound is well above the minimum length, 80 words (paper, Rationale construction)."""
+SHORT, LONG = 110, 250
+"""A rationale of fewer words than SHORT is rewritten in full detail, one of more than LONG in
+brief. SHORT is well above the minimum length, 80 words (paper, Rationale construction)."""
 
 
 class Detail(NamedTuple):
-    """The highest numbers of objects and pairs that the parts of a text name.
-
-    Attributes:
-        parsed: Objects in the scene parse.
-        analysed: Moving objects in the motion analysis.
-        predicted: Objects in the prediction.
-        pairs: Pairs of objects in each part.
-    """
+    """Maximum numbers of objects and pairs that a text mentions."""
 
     parsed: int
+    """Objects in the scene parse."""
     analysed: int
+    """Moving objects in the motion analysis."""
     predicted: int
+    """Objects in the prediction."""
     pairs: int
+    """Pairs of objects in each section."""
 
 
 BRIEF, SPARSE, FULL = Detail(3, 1, 1, 1), Detail(4, 1, 2, 1), Detail(6, 4, 6, 2)
@@ -56,9 +57,9 @@ def write_rationale(
     """
     keys = (seed, item.item_id, attempt)
     text = _Writer(predicates, SPARSE, *keys).text()
-    if len(text.split()) > MOST_WORDS:
+    if len(text.split()) > LONG:
         text = _Writer(predicates, BRIEF, *keys).text()
-    if len(text.split()) < FEW_WORDS:
+    if len(text.split()) < SHORT:
         text = _Writer(predicates, FULL, *keys, padded=True).text()
     return text
 
@@ -86,8 +87,8 @@ def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str,
 def most_discriminative_object(predicates: Predicates) -> ObjectFacts:
     """Return the object whose place distinguishes the largest number of wrong candidates.
 
-    Of tied objects, the first in order of relevance is returned. The candidate analysis states the
-    place of this object in every candidate before it judges the candidate.
+    Of tied objects, the most relevant is returned. The candidate analysis says where each candidate
+    shows this object before it judges the candidate.
     """
     wrong = [c.differences for c in predicates.candidates if not c.agrees]
 
@@ -119,7 +120,7 @@ def _toward(heading: str | None) -> str:
 
 
 def _rank_objects(facts: Facts) -> list[ObjectFacts]:
-    """Return the objects in order of relevance: first those of a `Meeting`, then moving ones."""
+    """The objects by relevance: first those that meet or may meet another, then moving ones."""
     met = {name for m in (*facts.courses, *facts.contacts) for name in m.objects}
     return sorted(
         facts.objects,
@@ -128,12 +129,12 @@ def _rank_objects(facts: Facts) -> list[ObjectFacts]:
 
 
 class _Writer:
-    """Writes the parts of a text.
+    """Writes the sections of a text.
 
     Args:
-        facts: What to write about; a text about predicates analyses their candidates.
-        detail: How many objects and pairs each part names.
-        keys: Seed of the random choices of phrasing.
+        facts: Content of the text. Predicates add the candidate analysis and the answer.
+        detail: How many objects and pairs each section mentions.
+        keys: Seed of the random choice of phrasings.
         padded: Whether to add two general sentences that lengthen a short text.
     """
 
@@ -147,52 +148,42 @@ class _Writer:
         self.target_regions = {o.object: o.target_region for o in facts.objects}
         self.key = most_discriminative_object(facts) if isinstance(facts, Predicates) else None
 
-    def pick(self, *options: str) -> str:
-        return options[self.rng.integers(len(options))]
+    def say(self, statement: str, **values: Any) -> str:
+        """A random phrasing of a statement in PHRASES."""
+        phrasings = PHRASES[statement]
+        return phrasings[self.rng.integers(len(phrasings))].format(**values)
 
     def text(self) -> str:
-        """Return a rationale of predicates, or a description of facts without candidates."""
+        """A rationale from predicates, or a description from facts without candidates."""
         facts, answer = self.facts, None
         sections = {
-            "Scene parse": self.parse(),
-            "Motion analysis": self.motion(),
+            "Scene parse": self.scene_parse(),
+            "Motion analysis": self.motion_analysis(),
             "Prediction": self.prediction(),
         }
         if isinstance(facts, Predicates):
             answer = facts.answer
-            sections["Candidate analysis"] = [self.candidate(c) for c in facts.candidates]
+            sections["Candidate analysis"] = [
+                f"candidate {c.letter} {self.judgement(c)}" for c in facts.candidates
+            ]
         sections["Outcome"] = self.outcome(answer)
         lines = [f"{name}: {_sentences(parts)}" for name, parts in sections.items()]
         return "\n".join([*lines, f"Answer: {answer}"] if answer else lines)
 
-    def parse(self) -> list[str]:
+    def scene_parse(self) -> list[str]:
         parts = [self.observed(o) for o in self.ranked[: self.detail.parsed]]
         parts[0] = f"{self.facts.instant}, {parts[0]}"
         courses = self.facts.courses[: self.detail.pairs]
         parts += [f"{_pair(course.objects)} are on a collision course" for course in courses]
-        if not courses:
-            parts.append(
-                self.pick("no pair is on a collision course", "no pair is heading for contact")
-            )
-        return parts
+        return parts if courses else [*parts, self.say("no_course")]
 
     def observed(self, o: ObjectFacts) -> str:
         if o.sight != "shown":
             return _unseen(o.object, "is", o.sight, o.region)
-        if o.speed == "stationary":
-            return self.pick(
-                f"the {o.object} is stationary {o.region}",
-                f"the {o.object} rests {o.region}",
-                f"the {o.object} is {o.region} and does not move",
-            )
-        motion = f"{o.speed}{_toward(o.heading)}"
-        return self.pick(
-            f"the {o.object} is {o.region}, moving {motion}",
-            f"the {o.object} is {o.region} and moves {motion}",
-            f"the {o.object} {o.region} is moving {motion}",
-        )
+        statement = "rests" if o.speed == "stationary" else "moves"
+        return self.say(statement, o=o, toward=_toward(o.heading))
 
-    def motion(self) -> list[str]:
+    def motion_analysis(self) -> list[str]:
         facts, ranked = self.facts, self.ranked
         parts = [self.meeting(m) for m in facts.courses[: self.detail.pairs] if m.when != "unseen"]
         on_course = {frozenset(m.objects) for m in facts.courses}
@@ -206,13 +197,7 @@ class _Writer:
         if not movers:
             parts.append("the objects remain where they are")
         elif any(o.extent == "stays" for o in ranked) and len(movers) <= self.detail.analysed:
-            parts.append(
-                self.pick(
-                    "the other objects remain where they are",
-                    "the other objects hardly move",
-                    "the rest of the scene stays as it is",
-                )
-            )
+            parts.append(self.say("others_stay"))
         elif any(o.extent == "stays" and o.speed == "stationary" for o in ranked):
             parts.append("the stationary objects remain where they are unless struck")
         if self.padded:
@@ -220,25 +205,19 @@ class _Writer:
         return parts
 
     def meeting(self, meeting: Meeting) -> str:
-        pair = _pair(meeting.objects)
-        if meeting.when is None:
-            return self.pick(f"{pair} will pass without contact", f"{pair} will not meet")
-        if meeting.when == "imminent":
-            return self.pick(f"contact between {pair} is imminent", f"{pair} are about to meet")
-        return self.pick(
-            f"{pair} will meet {meeting.when}", f"contact between {pair} comes {meeting.when}"
-        )
+        statement = {None: "never_meet", "imminent": "meet_at_once"}.get(meeting.when, "meet")
+        return self.say(statement, pair=_pair(meeting.objects), when=meeting.when)
 
     def travel(self, o: ObjectFacts, struck: bool) -> str:
         if o.leaves:
-            return self.pick(f"the {o.object} leaves the view", f"the {o.object} moves out of view")
-        if o.enters:
-            return f"the {o.object} enters the view {o.target_region}"
-        if o.speed in (None, "stationary"):
-            cause = "once struck, " if struck and o.speed else ""
+            statement = "leaves"
+        elif o.enters:
+            statement = "enters"
+        elif o.speed not in (None, "stationary"):
+            statement = "travels"
         else:
-            cause = self.pick("", f"moving {o.speed}, ", "given its speed, ")
-        return f"{cause}the {o.object} {o.extent}{_toward(o.travel)}"
+            statement = "changes_once_struck" if struck and o.speed else "changes"
+        return self.say(statement, o=o, toward=_toward(o.travel))
 
     def prediction(self) -> list[str]:
         close = self.facts.close[: self.detail.pairs]
@@ -253,34 +232,20 @@ class _Writer:
     def expected(self, o: ObjectFacts) -> str:
         if o.target_sight != "shown":
             return _unseen(o.object, "will be", o.target_sight, o.target_region)
-        if o.extent == "stays" and o.region == o.target_region:
-            return self.pick(
-                f"the {o.object} remains {o.target_region}",
-                f"the {o.object} stays {o.target_region}",
-            )
-        return self.pick(
-            f"the {o.object} will be {o.target_region}",
-            f"the {o.object} should be {o.target_region}",
-        )
+        remains = o.extent == "stays" and o.region == o.target_region
+        return self.say("remains" if remains else "will_be", o=o)
 
-    def candidate(self, candidate: CandidateFacts) -> str:
-        """Say where the key object is in a candidate, and then whether the candidate agrees."""
-        key = self.key
-        name, shows = f"candidate {candidate.letter}", f"shows the {key.object}"
+    def judgement(self, candidate: CandidateFacts) -> str:
+        """Where the candidate shows the key object, and whether the candidate agrees."""
         if candidate.agrees:
-            end = self.pick("", " with the prediction")
-            return f"{name} {shows} {key.target_region} and agrees{end}"
-        others = ", and shows other objects" * candidate.other_objects
-        difference = {d.object: d for d in candidate.differences}.get(key.object)
-        if difference is None:
+            return self.say("agrees", key=self.key)
+        d = {d.object: d for d in candidate.differences}.get(self.key.object)
+        if d is None:
             why = self.difference(candidate.differences[0])
-            return f"{name} {shows} {key.target_region} but {why}{others}"
-        if difference.kind == "displaced":
-            off = f"{difference.extent} off{_toward(difference.heading)}"
-            return f"{name} {shows} {key.target_region} but {off}{others}"
-        if difference.kind == "missing":
-            return f"{name} lacks the {key.object}{others}"
-        return f"{name} {shows} {difference.region}, not {key.target_region}{others}"
+            text = self.say("key_as_expected", key=self.key, why=why)
+        else:
+            text = self.say(f"key_{d.kind}", key=self.key, d=d, toward=_toward(d.heading))
+        return text + ", and shows other objects" * candidate.other_objects
 
     def match(self, candidate: CandidateFacts) -> str:
         name = f"Candidate {candidate.letter}"
@@ -292,26 +257,10 @@ class _Writer:
         return f"{name} does not match: it {' and '.join(why)}."
 
     def difference(self, d: Difference) -> str:
-        if d.kind == "missing":
-            return self.pick(f"does not show the {d.object}", f"lacks the {d.object}")
-        if d.kind == "extra":
-            return self.pick(
-                f"shows the {d.object}, which should not be seen",
-                f"shows the {d.object} by mistake",
-            )
-        if d.kind == "region":
-            expected = self.target_regions[d.object]
-            return self.pick(
-                f"shows the {d.object} {d.region}, not {expected}",
-                f"has the {d.object} {d.region} and not {expected}",
-            )
-        toward = _toward(d.heading)
-        return self.pick(
-            f"has the {d.object} {d.extent} off{toward}",
-            f"shows the {d.object} {d.extent} too far{toward}"
-            if toward
-            else f"has the {d.object} off",
-        )
+        without_heading = d.kind == "displaced" and not d.heading
+        statement = "displaced_without_heading" if without_heading else d.kind
+        expected = self.target_regions.get(d.object)
+        return self.say(statement, d=d, expected=expected, toward=_toward(d.heading))
 
     def outcome(self, answer: str | None) -> list[str]:
         close = self.facts.close[:1]
@@ -319,11 +268,5 @@ class _Writer:
         visible = [o for o in self.ranked if o.target_sight == "shown"]
         parts += [f"the {o.object} is {o.target_region}" for o in visible[: 2 - len(parts)]]
         if answer is not None:
-            parts.append(
-                self.pick(
-                    f"candidate {answer} shows this layout",
-                    f"this layout is that of candidate {answer}",
-                    f"only candidate {answer} agrees",
-                )
-            )
+            parts.append(self.say("answer", answer=answer))
         return parts or ["no object is in view"]

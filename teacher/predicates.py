@@ -1,15 +1,14 @@
 """Predicates: qualitative facts that a rationale may state, read from the oracle.
 
-Facts hold at the cut, an instant at or before the end of the prefix and clear of the next
-collision, and at the target. No fact contains a number; the thresholds stay in this file.
+Facts describe the scene at two frames: the target, and the cut, which is the end of the prefix or,
+if a collision follows shortly, an earlier frame. No fact contains a number.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
@@ -154,10 +153,6 @@ class Facts:
     contacts: tuple[Meeting, ...]
     close: tuple[Closeness, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Predicates(Facts):
@@ -253,8 +248,8 @@ def find_collision_courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
 
 
 def motion_start(scene: Scene, index: int, cut: int) -> int:
-    """The first of the COURSE_FRAMES frames up to the cut after which an object has no contact; the
-    cut itself if the object is hit there."""
+    """First of the frames up to the cut from which an object's heading follows: COURSE_FRAMES
+    frames, or fewer if the object is hit within them."""
     hits = [c.frame for c in scene.collisions if index in c.objects and c.frame <= cut]
     return max([cut - COURSE_FRAMES + 1, *hits])
 
@@ -375,14 +370,14 @@ def _candidate_facts(
     frame = candidate.frame
     in_target = {o.noun_phrase: i for i, o in enumerate(scene.objects)}
     in_candidate = {o.noun_phrase: i for i, o in enumerate(other.objects)}
-    large: list[tuple[float, Difference]] = []
-    small: list[tuple[bool, float, Difference]] = []
+    ranked: list[tuple[tuple[bool, bool, float], Difference]] = []
     for name in {**in_target, **in_candidate}:
         i, j = in_target.get(name), in_candidate.get(name)
         expected = i is not None and _sight(scene, target, i) == "shown"
         visible = j is not None and _sight(other, frame, j) == "shown"
         if expected != visible:
-            large.append((float(IMAGE_SIZE), Difference(name, "missing" if expected else "extra")))
+            difference = Difference(name, "missing" if expected else "extra")
+            ranked.append(((True, True, float(IMAGE_SIZE)), difference))
         elif i is not None and j is not None:
             shift = _position(other, frame, j) - _position(scene, target, i)
             distance = float(np.hypot(*shift))
@@ -394,14 +389,9 @@ def _candidate_facts(
                 heading = compass_direction(shift)
                 difference = Difference(name, "displaced", heading=heading, extent=extent)
                 bound = DISPLACED
-            if visible and distance >= bound:
-                large.append((distance, difference))
-            else:
-                small.append((visible, distance, difference))
-    large.sort(key=lambda pair: -pair[0])
-    if not large:
-        # Two candidates always differ: name the largest difference even if it is below the bounds.
-        large = [max(small, key=lambda entry: entry[:2])[1:]]
-    return CandidateFacts(
-        letter, False, set(in_target) != set(in_candidate), tuple(d for _, d in large)
-    )
+            ranked.append(((visible and distance >= bound, visible, distance), difference))
+    ranked.sort(key=lambda entry: entry[0], reverse=True)
+    # Two candidates always differ: name the largest difference even if it is below its bound.
+    differences = tuple(d for (clear, *_), d in ranked if clear) or (ranked[0][1],)
+    other_objects = in_target.keys() != in_candidate.keys()
+    return CandidateFacts(letter, False, other_objects, differences)

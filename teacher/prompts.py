@@ -6,6 +6,7 @@ The instructions come first and are the same for every item, so that prefix cach
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from importlib.resources import files
 
 from conf.schema import TeacherConfig
@@ -23,6 +24,6 @@ def build_messages(
 ) -> list[dict[str, str]]:
     """The chat messages that request an item's rationale."""
     system = SYSTEM.format(sections=", ".join(SECTIONS), low=cfg.min_words, high=cfg.max_words)
-    facts = json.dumps(predicates.to_dict(), separators=(",", ":"))
+    facts = json.dumps(asdict(predicates), separators=(",", ":"))
     user = f"Question: {item.question}\nFacts: {facts}\nAnswer to reach: {item.letter}"
     return [{"role": "system", "content": system}, {"role": "user", "content": user}]

@@ -20,14 +20,15 @@ from teacher.sections import SECTIONS
 DIGEST = "sha256"
 """Key of a line's checksum."""
 LINE_ERRORS = (ValueError, TypeError, KeyError, AttributeError)
-"""Errors of a line that is no intact rationale."""
+"""Errors that a damaged line raises when it is decoded."""
 
 
 class Journal:
     """An open rationales.jsonl with one response per line, safe against kills.
 
-    Opening waits while another process has the file open. A last line that a kill has cut off is
-    completed by its line break if it is whole, else removed, and its response is requested again.
+    Opening waits while another process has the file open. A kill may have cut off the last line: a
+    complete record gets the missing line break, and a partial one is removed, so that its response
+    is requested again.
 
     Attributes:
         rationales: The responses in the file when it was opened.

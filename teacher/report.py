@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,8 +29,6 @@ EXAMPLES = 3
 """Rejected responses that are quoted for each reason."""
 COMMON_WORDS = 20
 """Most frequent words that are listed."""
-BIN_WIDTH = 10
-"""Words per bar of the histogram of lengths."""
 IDLE_SECONDS = 60.0
 """Time without a response after which the servers count as idle."""
 OBJECT_NAME = re.compile(rf"\b(?:{'|'.join(COLORS)}) (?:{'|'.join(MATERIALS)}) \w+")
@@ -40,15 +39,15 @@ def summarize(
 ) -> Figures:
     """Figures of the responses to each item, which are in the order of their attempts.
 
-    `accepted` counts items; `fallback`, those of them that the built-in narrator wrote in the
-    teacher's place; `set_aside`, items without an accepted response; `too_short`, items without a
-    response, since their prefix is too short. `responses` and `accepted_responses` are the
-    teacher's, by attempt. `rejected` counts responses by kind of reason, the most frequent first,
-    and `examples` has items and details of some. `lengths` are words of each accepted rationale,
-    `words` the most frequent ones. `same_text` counts accepted rationales that repeat another one's
-    text, `same_but_names` those that do so up to the objects' names. `claims` are the supported,
-    contradicted and unknown ones, by kind. `hours` is the time in which servers were in use; times
-    their GPUs, it gives GPU hours.
+    Counts of items: `accepted`; `fallback`, those of them with a rationale of the built-in
+    narrator instead of the teacher's; `set_aside`, without an accepted response; `too_short`,
+    without any response because the prefix is too short. `responses` and `accepted_responses`
+    count the teacher's, by attempt. `rejected` counts responses by kind of reason, the most
+    frequent first, and `examples` has items and details of some. `lengths` are words of each
+    accepted rationale, `words` the most frequent ones. `same_text` counts accepted rationales that
+    repeat another one's text, `same_but_names` those that do so up to the objects' names. `claims`
+    are the supported, contradicted and unknown ones, by kind. `hours` is the time in which servers
+    were in use; multiplied by their number of GPUs, it gives GPU hours.
     """
     every = [r for item in items for r in responses.get(item.item_id, ())]
     accepted = select_accepted(items, responses)
@@ -56,7 +55,11 @@ def summarize(
     narrated = len({r.item_id for r in every})
     by_attempt = Counter(r.attempt for r in every if not r.fallback)
     accepted_by_attempt = Counter(r.attempt for r in every if r.accepted and not r.fallback)
-    rejections = _collect_rejections(every)
+    rejections: dict[str, list[tuple[str, str]]] = defaultdict(list)
+    for r in every:
+        for kind, detail in rejection_reasons(r).items():
+            rejections[kind].append((r.item_id, detail))
+    rejections = dict(sorted(rejections.items(), key=lambda pair: (-len(pair[1]), pair[0])))
     words = Counter(word for r in accepted for word in WORD.findall(r.text.lower()))
     claims: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3, int))
     for r in every:
@@ -96,20 +99,11 @@ def select_accepted(
     return [r for r in firsts if r is not None]
 
 
-def rejection_kinds(rationale: Rationale) -> set[str]:
-    """The kinds of reasons for which a response was rejected, without their details."""
-    return {reason.partition(":")[0] for reason in rationale.reasons}
-
-
-def _collect_rejections(responses: Iterable[Rationale]) -> dict[str, list[tuple[str, str]]]:
-    """Item and detail of each rejection by kind of reason, the most frequent kind first."""
-    details: dict[str, list[tuple[str, str]]] = defaultdict(list)
-    for response in responses:
-        # A response with several numbers counts once under "number".
-        for kind in rejection_kinds(response):
-            reason = next(r for r in response.reasons if r.partition(":")[0] == kind)
-            details[kind].append((response.item_id, reason.partition(":")[2].strip()))
-    return dict(sorted(details.items(), key=lambda pair: (-len(pair[1]), pair[0])))
+def rejection_reasons(rationale: Rationale) -> dict[str, str]:
+    """Each kind of reason for which a response was rejected, with its first detail: a response with
+    several numbers has one entry, "number"."""
+    reasons = (reason.partition(":") for reason in reversed(rationale.reasons))
+    return {kind: detail.strip() for kind, _, detail in reasons}
 
 
 def format_figures(figures: Figures) -> str:
@@ -158,12 +152,9 @@ def _format_table(table: pd.DataFrame) -> str:
 def _format_words(figures: Figures) -> str:
     lengths = figures["lengths"]
     low, median, high = np.percentile(lengths, [5, 50, 95])
-    bins = Counter(length // BIN_WIDTH * BIN_WIDTH for length in lengths)
-    widest = max(bins.values())
     lines = [
         f"words per rationale: {min(lengths)} to {max(lengths)}, mean {np.mean(lengths):.0f}, "
         f"median {median:.0f}, 5% to 95% {low:.0f} to {high:.0f}",
-        *(f"{k:>4} {'#' * round(50 * n / widest)} {n:,}" for k, n in sorted(bins.items())),
         f"vocabulary: {figures['distinct_words']:,} distinct words; most frequent: "
         + ", ".join(f"{word} {count:,}" for word, count in figures["words"].items()),
         f"duplicates: {figures['same_text']:,} accepted rationales repeat another one's text, "
@@ -206,18 +197,14 @@ def write_report(
         item = items[accepted[k].item_id]
         write_atomically(folder / "images" / f"{item.item_id}.png", draw_sheet([rows.make(item)]))
         predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
-        examples.append((accepted[k], json.dumps(predicates and predicates.to_dict(), indent=1)))
+        examples.append((accepted[k], json.dumps(predicates and asdict(predicates), indent=1)))
     template = (files("teacher") / "templates" / "report.html").read_text()
-    page = (
-        jinja2.Environment(autoescape=True)
-        .from_string(template)
-        .render(
-            teacher=accepted[0].teacher if accepted else "an unnamed teacher",
-            text=text,
-            accepted=len(accepted),
-            benchmark=store.name,
-            examples=examples,
-        )
+    page = jinja2.Template(template, autoescape=True).render(
+        teacher=accepted[0].teacher if accepted else "an unnamed teacher",
+        text=text,
+        accepted=len(accepted),
+        benchmark=store.name,
+        examples=examples,
     )
     write_text(folder / "report.html", page)
     return folder / "report.html"

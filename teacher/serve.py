@@ -36,7 +36,7 @@ STRICT_JSON = '{"backend": "xgrammar", "disable_any_whitespace": true}'
 def main(cfg: ServeCommand, run: Run) -> None:
     host, port = parse_address(cfg.teacher.urls[0])
     model = find_model(cfg)
-    python = find_python(cfg.environment)
+    python = Path(cfg.environment).absolute() / "bin" / "python"
     check_port(cfg.teacher.urls[0], host, port)
     gpus = count_gpus(python)
     arguments = [str(python), *vllm_arguments(cfg, model, host, port, gpus)]
@@ -69,32 +69,15 @@ def parse_address(url: str) -> tuple[str, int]:
 
 def check_port(url: str, host: str, port: int) -> None:
     """Raises UserError if the address is not this machine's or the port is in use."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM
-        )[0]
-        with socket.socket(family, kind, protocol) as listener:
-            # As servers do: a port is free although connections of the last server linger.
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(address)
+        socket.create_server((host, port), family=family).close()
     except OSError as error:
         raise UserError(
             f"cannot serve at teacher.url={url}: {error.strerror}. Choose a free port above 1023 "
             "and an address of this machine",
             code="address-unavailable",
         ) from error
-
-
-def find_python(environment: str) -> Path:
-    """The Python interpreter of an environment. Raises UserError if it does not exist."""
-    python = Path(environment).absolute() / "bin" / "python"
-    if not python.exists():
-        raise UserError(
-            f"environment={environment} is not a Python environment: create one with `make "
-            "vllm-env`, or name one that has vLLM",
-            code="missing-vllm",
-        )
-    return python
 
 
 def find_model(cfg: ServeCommand) -> str:
@@ -128,19 +111,18 @@ def find_model(cfg: ServeCommand) -> str:
 
 def count_gpus(python: Path) -> int:
     """Number of GPUs that vLLM can use. Raises UserError if the environment has no vLLM."""
-    result = subprocess.run(
-        [python, "-P", "-c", COUNT_GPUS],
-        capture_output=True,
-        text=True,
-        env=get_clean_environment(),
-    )
-    if result.returncode:
-        last = result.stderr.strip().splitlines()[-1:] or [f"status {result.returncode}"]
-        raise UserError(
-            f"{python.parent.parent} has no working vLLM ({last[0]}): create it again with "
-            "`make vllm-env`",
-            code="missing-vllm",
+    command, environment = [python, "-P", "-c", COUNT_GPUS], get_clean_environment()
+    try:
+        result = subprocess.run(
+            command, capture_output=True, text=True, env=environment, check=True
         )
+    except (OSError, subprocess.CalledProcessError) as error:
+        last = getattr(error, "stderr", "").strip().splitlines()[-1:] or [error]
+        raise UserError(
+            f"environment={python.parent.parent} has no working vLLM ({last[0]}): create it with "
+            "`make vllm-env`, or name one that has vLLM",
+            code="missing-vllm",
+        ) from error
     return int(result.stdout.splitlines()[-1])
 
 

@@ -1,11 +1,18 @@
-"""A small HTTP server on this machine with JSON requests and responses."""
+"""Ports of this machine, and a small HTTP server with JSON requests and responses."""
 
 from __future__ import annotations
 
 import json
+import socket
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
 
 
 class LocalServer(ThreadingHTTPServer):

@@ -16,6 +16,7 @@ import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -95,7 +96,7 @@ def is_contradicted(text: str, predicates: Predicates) -> bool:
 
 
 def parse_predicates(record: dict[str, Any]) -> Predicates:
-    """Rebuild predicates from the JSON form of their `to_dict`."""
+    """Rebuild predicates from their JSON form."""
     return TypeAdapter(Predicates).validate_python(record)
 
 
@@ -127,7 +128,7 @@ def is_motion_known(text: str, position: int, predicates: Predicates) -> bool:
 
 def replace_colors(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
     """Replace the colour of an object so that the name fits no object of the scene."""
-    known = str(predicates.to_dict())
+    known = str(asdict(predicates))
     for match in re.finditer(rf"\b({'|'.join(COLORS)})( (?:metal|rubber) \w+)", text):
         free = [color for color in COLORS if f"{color}{match[2]}" not in known]
         if free and not match[2].endswith("s"):

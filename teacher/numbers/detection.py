@@ -15,8 +15,13 @@ from collections.abc import Callable, Collection
 from functools import lru_cache
 from itertools import accumulate
 
-from teacher.numbers.lexicon import LEXICON
-from teacher.numbers.normalization import Spans, fold_character, normalize, normalize_word
+from teacher.numbers.normalization import (
+    LEXICON,
+    Spans,
+    fold_character,
+    normalize,
+    normalize_word,
+)
 
 Rule = Callable[["Prose", int], "tuple[int, int] | None"]
 
@@ -47,7 +52,7 @@ ARABIC = re.compile(
 )
 UNSPACED = re.compile(_any(map(normalize_word, LEXICON.unspaced)))
 MAX_LETTERS = 60
-"""Letters of a word that are examined."""
+"""Letters of a word after which the rest is ignored."""
 ASCII_WORD = re.compile(r"([A-Za-z]+)")
 # To `re`, Indic vowel signs are not letters, although they are parts of words.
 WORD = re.compile(r"((?:[^\W\d_]+|[\u0900-\u0dff]+)+)")
@@ -78,21 +83,17 @@ class Prose:
 
     def before(self, index: int, by: int = 1) -> str:
         """The word `by` words before, in lower case; "" across other marks than hyphens."""
-        return self._neighbor(index, -1, by)
+        return self.lower[index - by] if self._is_joined(index - by, index) else ""
 
     def after(self, index: int, by: int = 1) -> str:
         """The word `by` words after, in lower case; "" across other marks than hyphens."""
-        return self._neighbor(index, 1, by)
+        return self.lower[index + by] if self._is_joined(index, index + by) else ""
 
-    def _neighbor(self, index: int, step: int, by: int) -> str:
-        for _ in range(by):
-            gap = max(index, index + step)
-            if not 0 < gap < len(self.words):
-                return ""
-            if self.gaps[gap] != "-" and not self.gaps[gap].isspace():
-                return ""
-            index += step
-        return self.lower[index]
+    def _is_joined(self, first: int, last: int) -> bool:
+        """Whether only white space and hyphens separate the words from `first` to `last`."""
+        if first < 0 or last >= len(self.words):
+            return False
+        return all(gap == "-" or gap.isspace() for gap in self.gaps[first + 1 : last + 1])
 
     def opens_clause(self, index: int) -> bool:
         return index == 0 or bool(CLAUSE.search(self.gaps[index][-8:]))
@@ -232,18 +233,15 @@ def _is_pronoun(prose: Prose, index: int) -> bool:
         return True
     if following in COUNTABLE or rule_of(previous[:MAX_LETTERS]) is _always:
         return False
-    if following in LEXICON.modals or _describes(previous):
+    is_adjectival = len(previous) > 4 and previous.endswith(ADJECTIVAL)
+    if following in LEXICON.modals or previous in LEXICON.adjectives:
+        return True
+    if is_adjectival and previous not in LEXICON.not_adjectives:
         return True
     if not previous or previous in LEXICON.not_adjectives or previous in COUNTABLE:
         return False
     # An article before the previous word, as in "the opaque one".
     return prose.before(index, 2) in ("the", "a", "an", "each", "every", "its", "their")
-
-
-def _describes(word: str) -> bool:
-    if word in LEXICON.adjectives:
-        return True
-    return len(word) > 4 and word.endswith(ADJECTIVAL) and word not in LEXICON.not_adjectives
 
 
 def _first(prose: Prose, index: int) -> tuple[int, int] | None:
@@ -317,7 +315,7 @@ def _score(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _secondary(prose: Prose, index: int) -> tuple[int, int] | None:
-    """A number before an event, whose place in a series it gives."""
+    """A number before an event, as in "the secondary collision"."""
     return (index, index + 1) if prose.after(index) in LEXICON.events else None
 
 
@@ -336,7 +334,7 @@ def _letter(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _italian(prose: Prose, index: int) -> tuple[int, int] | None:
-    """ "Due" and "metà" are Italian beside Italian words."""
+    """ "Due" and "metà" are numbers before or after an Italian word."""
     if prose.after(index) in LEXICON.italian:
         return index, index + 1
     return (index - 1, index) if prose.before(index) in LEXICON.italian else None

@@ -12,25 +12,26 @@ import unicodedata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.resources import files
+from types import SimpleNamespace
 
-from teacher.numbers.lexicon import LEXICON
+import yaml
 
 Spans = list[tuple[int, int]]
 
+_LISTS = yaml.safe_load((files("teacher.numbers") / "lexicon.yaml").read_text(encoding="utf-8"))
+LEXICON = SimpleNamespace(
+    lookalikes=_LISTS.pop("lookalikes"),
+    **{name: dict.fromkeys(text.split()) for name, text in _LISTS.items()},
+)
+"""The word lists of lexicon.yaml, each as the keys of a dict: a set in the order of the file."""
+
 LOOKALIKES = {
-    **dict(zip("аеорсухіјѕԁԛԝвмтнкһѵʋɑɡıгпөш", "aeopcyxijsdqwbmthkhvvagirnow", strict=True)),
-    **dict(zip("АВЕКМНОРСТУХІЈЅԚԜѴ", "ABEKMHOPCTYXIJSQWV", strict=True)),
-    **dict(zip("οντωειυακχρη", "ovtweiuakxpn", strict=True)),
-    **dict(zip("ΑΒΕΖΗΙΚΜΝΟΡΤΥΧ", "ABEZHIKMNOPTYX", strict=True)),
-    **dict(zip("օոհսցⲟ", "onhugo", strict=True)),
-    **dict(zip("ᴀʙᴄᴅᴇꜰɢʜɪᴊᴋʟᴍɴᴏᴘʀꜱᴛᴜᴠᴡʏᴢ", "abcdefghijklmnoprstuvwyz", strict=True)),
-    **dict(zip("łøđħŧƒɛəʰ", "lodhtfeeh", strict=True)),
-    **{
-        chr(base + i): chr(65 + i)
-        for base in (0x1F130, 0x1F150, 0x1F170, 0x1F1E6)
-        for i in range(26)
-    },
+    chr(base + i): chr(65 + i) for base in (0x1F130, 0x1F150, 0x1F170, 0x1F1E6) for i in range(26)
 }
+"""The letter that a styled or foreign letter looks like."""
+for _letters, _plain in LEXICON.lookalikes.items():
+    LOOKALIKES |= zip(_letters, _plain, strict=True)
 PICTOGRAPHS = {
     *(chr(c) for c in range(0x1F550, 0x1F568)),  # clock faces
     *(chr(c) for c in range(0x2680, 0x2686)),  # dice
@@ -91,8 +92,8 @@ def normalize_word(word: str) -> str:
 
 
 def normalize(text: str) -> list[Reading]:
-    """The readings of a text: two if markup or an invisible character separates letters, which may
-    be of one word or of two."""
+    """The readings of a text. Markup or an invisible character between letters gives two: with a
+    space in its place, and without."""
     reading = Reading(text, range(len(text)), range(1, len(text) + 1))
     if text.isascii() and not DISGUISE.search(text):
         return [reading]

@@ -1,6 +1,7 @@
 """Load balancing over several servers.
 
-A server that is down, restarting or busy costs time but none of an item's attempts.
+While a server is down, restarting or busy, requests wait or go to another server; an item loses no
+attempt.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ PAUSE, LONGEST_PAUSE = 0.5, 10.0
 MAX_FAILURES = 4
 """Failures of a request, at servers that answer others, after which it is given up."""
 CANARY: Messages = [{"role": "user", "content": "Say hello."}]
-"""A prompt that any working server answers: it distinguishes a broken server from a prompt that
-cannot be answered."""
+"""A prompt that any working server answers. If a request fails and the canary succeeds, the fault
+is in the request; if both fail, in the server."""
 
 
 class NoResponseError(Exception):
@@ -53,10 +54,7 @@ class ServerPool:
     """
 
     def __init__(
-        self,
-        cfg: ServersConfig,
-        fields: RequestFields,
-        canary: Messages = CANARY,
+        self, cfg: ServersConfig, fields: RequestFields, canary: Messages = CANARY
     ) -> None:
         self.cfg, self.fields, self.canary = cfg, fields, canary
         self.servers = [Server(url, cfg) for url in dict.fromkeys(cfg.urls)]
@@ -67,15 +65,13 @@ class ServerPool:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await asyncio.gather(*(server.close() for server in self.servers))
+        await asyncio.gather(*(server.client.close() for server in self.servers))
 
     async def complete(self, messages: Messages, n: int = 1, **fields: object) -> list[Response]:
-        """Up to `n` responses to a prompt, however long servers have to be waited for.
+        """Up to `n` responses to a prompt, after waiting for a server if necessary.
 
         Args:
-            messages: The prompt.
-            n: Number of responses.
-            fields: Fields of this request only.
+            fields: Fields of this request only, in addition to those of every request.
 
         Raises:
             NoResponseError: Servers that answer the canary refuse this prompt or fail at it
@@ -131,12 +127,12 @@ class ServerPool:
         return min(available, key=lambda server: server.in_flight)
 
     def _pause(self, server: Server, error: RequestError) -> None:
-        """Send a server nothing for as long as its rate limit says, or for a time that grows."""
+        """Send a server nothing for the time in its rate limit, or for a random time that grows
+        with each pause in a row."""
         now = time.monotonic()
         # Requests that were in flight together fail together and count once.
         server.pauses += server.available_at <= now
-        seconds = error.seconds if isinstance(error, RateLimitedError) else None
-        pause = random_pause(server.pauses) if seconds is None else seconds
+        pause = random_pause(server.pauses) if error.pause is None else error.pause
         server.available_at = max(server.available_at, now + pause)
         server.problem = str(error)
         self.failing_since = self.failing_since or now

@@ -44,8 +44,7 @@ def parse_completion(completion: Any, n: int) -> list[Response]:
         raise ValueError("it has no choices")
     responses = []
     for k, choice in enumerate(choices):
-        message = choice.message
-        text = _clean(message.content)
+        message, text = choice.message, _clean(choice.message.content)
         reasoning = _clean(
             getattr(message, "reasoning_content", None) or getattr(message, "reasoning", None)
         )

@@ -18,8 +18,9 @@ Messages = list[dict[str, Any]]
 RequestFields = dict[str, Any]
 """Fields of a chat completion request; those outside OpenAI's API are in `extra_body`."""
 
-MALFORMED_RESPONSE_ERRORS = (AttributeError, IndexError, TypeError, ValueError)
-"""Errors that the openai client raises for a body that does not follow the API."""
+MALFORMED_REPLY_ERRORS = (AttributeError, IndexError, TypeError, ValueError)
+"""Errors that a body which does not follow the API raises in the openai client or while it is
+parsed."""
 RETRYABLE_STATUSES = (408, 409)
 """Client errors that a retry may resolve: request timeout and conflict."""
 API_KEY_VARIABLE = "OPENAI_API_KEY"
@@ -41,7 +42,11 @@ def authentication_error(url: str, error: openai.APIStatusError) -> UserError:
 
 
 class RequestError(Exception):
-    """A request that got no response."""
+    """A request that got no response; `pause` is the wait (s) that the server asks for, if any."""
+
+    def __init__(self, problem: str, pause: float | None = None) -> None:
+        super().__init__(problem)
+        self.pause = pause
 
 
 class MalformedReplyError(RequestError):
@@ -53,11 +58,7 @@ class RefusedError(RequestError):
 
 
 class RateLimitedError(RequestError):
-    """The server limits the request rate; `seconds` is the wait that it asks for, if any."""
-
-    def __init__(self, problem: str, seconds: float | None) -> None:
-        super().__init__(problem)
-        self.seconds = seconds
+    """The server limits the request rate."""
 
 
 class Server:
@@ -94,7 +95,10 @@ class Server:
         try:
             # The openai client's own timeout restarts with every byte that arrives.
             async with asyncio.timeout(cfg.timeout):
-                return await self._send(messages, n, fields)
+                completion = await self.client.chat.completions.create(
+                    model=cfg.model, messages=messages, n=n, **fields
+                )
+                return parse_completion(completion, n)
         except openai.NotFoundError as error:
             raise await self._unknown_model_error() from error
         except openai.AuthenticationError as error:
@@ -111,23 +115,13 @@ class Server:
             ) from error
         except openai.APIConnectionError as error:
             raise RequestError(str(error.__cause__ or error)) from error
-        except (openai.APIResponseValidationError, *MALFORMED_RESPONSE_ERRORS) as error:
+        except (openai.APIResponseValidationError, *MALFORMED_REPLY_ERRORS) as error:
             raise MalformedReplyError(f"{type(error).__name__}: {error}") from error
-
-    async def _send(self, messages: Messages, n: int, fields: RequestFields) -> list[Response]:
-        """Raises errors of the openai client and MALFORMED_RESPONSE_ERRORS."""
-        completion = await self.client.chat.completions.create(
-            model=self.cfg.model, messages=messages, n=n, **fields
-        )
-        return parse_completion(completion, n)
-
-    async def close(self) -> None:
-        await self.client.close()
 
     async def _unknown_model_error(self) -> UserError:
         try:
             served = ", ".join([m.id async for m in self.client.models.list()])
-        except (openai.OpenAIError, *MALFORMED_RESPONSE_ERRORS):
+        except (openai.OpenAIError, *MALFORMED_REPLY_ERRORS):
             served = "an unknown set of models"
         return UserError(
             f"{self.url} does not serve {self.cfg.GROUP}.model={self.cfg.model}; it serves "

@@ -1,7 +1,6 @@
 """Extracts the claims of a rationale with a closed vocabulary, and checks them.
 
-Ambiguous wording is never guessed: a claim is contradicted only if the predicates contradict every
-reading of it.
+An ambiguous claim is contradicted only if the predicates contradict every reading of it.
 """
 
 from __future__ import annotations
@@ -54,8 +53,8 @@ def _extract_answer(text: str, start: int, stop: int) -> list[Claim]:
 
 
 def _split_sentences(section: list[Tag]) -> list[list[Tag]]:
-    """Sentences, the longest of them split: the readers look ahead, so that their time is linear
-    only in sentences of bounded length."""
+    """Sentences of at most MAX_SENTENCE_TAGS tags. Readers look ahead to the end of a sentence, so
+    this bound keeps their time linear in the length of the text."""
     sentences: list[list[Tag]] = [[]]
     for tag in section:
         sentences[-1].append(tag)

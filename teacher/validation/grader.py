@@ -33,7 +33,8 @@ class RationaleGrader:
             "settings": self._hash_settings(),
             "seed": cfg.seed,
         }
-        """Fields of a record on which it depends whether a response is requested again."""
+        """Fields of a record. If one has another value in an earlier record, a new response is
+        requested."""
 
     def grade(
         self, response: Response, predicates: Predicates, item: SelectionItem, attempt: int

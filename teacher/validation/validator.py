@@ -1,4 +1,4 @@
-"""Validates rationales: sections, length, absence of numbers, truth of the claims, and answer."""
+"""Validates a rationale: its sections, length, claims and answer, and that it has no numbers."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from teacher.validation.claim_extraction import extract_claims
 VALIDATOR_VERSION = "4"
 SMALL_LETTER = re.compile(r"\b[Cc]andidates? [a-d]\b")
 WORD = re.compile(r"[^\W_]+(?:['’-][^\W_]+)*")
+"""A word; "top-left" is one word."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,9 @@ class Verdict:
 def validate_rationale(
     text: str, predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
 ) -> Verdict:
-    """Check a rationale against its item, and list everything that is wrong with it."""
+    """Check a rationale against its item, and collect every reason to reject it."""
     reasons = [f"number: {text[start:stop]!r}" for start, stop in find_numbers(text)]
-    words = count_words(text)
+    words = len(WORD.findall(text))
     if words < cfg.min_words:
         reasons.append("too short")
     if words > cfg.max_words:
@@ -58,11 +59,6 @@ def validate_rationale(
     claims = extract_claims(text, predicates)
     reasons += dict.fromkeys(f"contradicts: {c}" for c in claims if c.verdict == "contradicted")
     return Verdict(tuple(reasons), sections, answer, claims)
-
-
-def count_words(text: str) -> int:
-    """Number of words; "top-left" is one word."""
-    return len(WORD.findall(text))
 
 
 def _check_candidate_analysis(analysis: str) -> list[str]:

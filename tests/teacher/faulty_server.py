@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from socket import SO_LINGER, SOL_SOCKET
 from typing import Any
 
+from conf.schema import TeacherConfig
 from teacher.servers.pool import CANARY
 from tests.local import JsonHandler, LocalServer
 from tests.teacher.memory_store import MemoryStore, prompts_and_rationales
@@ -16,6 +17,13 @@ from tests.teacher.memory_store import MemoryStore, prompts_and_rationales
 Fault = int | bytes | str | dict[str, str]
 """A status, the bytes of a body, the headers of a rate limit (429), or a word of `spoil_text`,
 "hang" or "reset"."""
+
+
+def served(*servers: FaultyServer, **changes: Any) -> TeacherConfig:
+    """A teacher on these servers."""
+    settings = {"concurrency": 2, "unreachable_timeout": 5.0, "timeout": 1.0, **changes}
+    url = [server.url for server in servers]
+    return TeacherConfig(name="served", url=url, model="tiny", **settings)
 
 
 def spoil_text(fault: str, text: str) -> tuple[str, str]:

@@ -13,6 +13,7 @@ from teacher.narrate import ensure_rationales, narrate_store
 from teacher.rationale_log import Journal, read_rationales
 from teacher.sections import GRAMMAR, GRAMMAR_VERSION
 from tests.teacher import synthetic
+from tests.teacher.faulty_server import served
 from tests.user_errors import raises_user_error
 
 TEMPLATE = TeacherConfig(name="template")
@@ -21,11 +22,6 @@ NARRATED = [f"item-{k}" for k in range(13) if k != 5]
 
 def journal_path(store):
     return store.folder / "rationales.jsonl"
-
-
-def served(server, **changes):
-    settings = {"concurrency": 2, "unreachable_timeout": 5.0, "timeout": 1.0, **changes}
-    return TeacherConfig(name="served", url=server.url, model="tiny", **settings)
 
 
 def test_template_narrates_all_training_items_except_short_ones(store):
@@ -70,10 +66,12 @@ def test_journal_of_another_benchmark_is_refused(store):
         narrate_store(store, TEMPLATE)
 
 
-def test_responses_under_other_settings_are_ignored(store):
+def test_rejected_responses_set_items_aside_under_these_settings_only(store):
     first = narrate_store(store, TEMPLATE)
-    strict = TeacherConfig(name="template", min_words=240, max_words=250, attempts=1)
-    assert narrate_store(store, strict).rationales == []
+    strict = narrate_store(store, replace(TEMPLATE, min_words=240, attempts=2))
+    assert strict.rationales == []
+    assert (strict.figures["set_aside"], strict.figures["rejected"]) == (12, {"too short": 24})
+    assert [r.attempt for r in read_rationales(journal_path(store))[12:16]] == [0, 1, 0, 1]
     before = journal_path(store).read_bytes()
     assert narrate_store(store, TEMPLATE).rationales == first.rationales
     assert journal_path(store).read_bytes() == before
@@ -91,17 +89,6 @@ def test_second_process_waits_for_the_journal(store):
         assert other.is_alive()
     other.join(timeout=120)
     assert narrations[0].rationales == narrate_store(store, TEMPLATE).rationales
-
-
-def test_rejected_responses_are_recorded_and_items_set_aside(store):
-    cfg = TeacherConfig(name="template", min_words=240, max_words=250, attempts=2)
-    narration = narrate_store(store, cfg)
-    assert narration.rationales == []
-    assert (narration.figures["set_aside"], narration.figures["rejected"]) == (
-        12,
-        {"too short": 24},
-    )
-    assert [r.attempt for r in read_rationales(journal_path(store))[:4]] == [0, 1, 0, 1]
 
 
 def test_accepted_rationales_are_saved_as_parquet(store, start_server):
@@ -207,7 +194,8 @@ def test_item_without_response_is_set_aside(store, start_server, status):
         assert prompts.count(prompt) == 2
 
 
-def test_killed_served_run_requests_only_the_rest(store, start_server):
+def test_killed_run_requests_only_the_rest_and_a_finished_run_needs_no_server(store, start_server):
+    store.items = [item for item in store.items if item.item_id != "item-5"]
     server = start_server()
     narrate_store(store, served(server))
     lines = journal_path(store).read_bytes().splitlines(keepends=True)
@@ -216,12 +204,6 @@ def test_killed_served_run_requests_only_the_rest(store, start_server):
     narration = narrate_store(store, served(server))
     assert len(server.requests) == len(lines) - 7
     assert len(narration.rationales) == 12
-
-
-def test_finished_served_run_needs_no_server(store, start_server):
-    store.items = [item for item in store.items if item.item_id != "item-5"]
-    server = start_server()
-    narration = narrate_store(store, served(server))
     server.stop()
     before = journal_path(store).read_bytes()
     again = narrate_store(store, served(server))
@@ -255,15 +237,6 @@ def test_incompatible_server_is_reported(store, start_server, reply):
     with raises_user_error("incompatible-server", contains=server.url):
         narrate_store(store, served(server))
     assert read_rationales(journal_path(store)) == []
-
-
-def test_missing_server_is_reported(store, start_server):
-    server = start_server()
-    url = server.url
-    cfg = served(server, unreachable_timeout=0.2)
-    server.stop()
-    with raises_user_error("no-server", contains=url):
-        narrate_store(store, cfg)
 
 
 def test_fallback_is_marked_and_optional(store, start_server):

@@ -7,20 +7,13 @@ import time
 
 import pytest
 
-from conf.schema import TeacherConfig
 from teacher.narrate import narrate_store
 from teacher.server_narrator import request_fields
 from teacher.servers.pool import ServerPool
-from tests.teacher.faulty_server import FaultyServer, completion
+from tests.teacher.faulty_server import FaultyServer, completion, served
 from tests.user_errors import raises_user_error
 
 MESSAGES = [{"role": "user", "content": "Are you there?"}]
-
-
-def config(*servers, **changes):
-    settings = {"concurrency": 4, "unreachable_timeout": 5.0, "timeout": 2.0, **changes}
-    url = [server.url for server in servers]
-    return TeacherConfig(name="served", url=url, model="tiny", **settings)
 
 
 def complete(cfg, times=1, n=1, **fields):
@@ -35,48 +28,46 @@ def complete(cfg, times=1, n=1, **fields):
 def test_concurrency_limits_requests_in_flight(store, start_server):
     server = start_server()
     server.delay = 0.05
-    narrate_store(store, config(server, concurrency=3))
+    narrate_store(store, served(server, concurrency=3))
     assert server.most == 3
 
 
 def test_fields_of_one_request_override_the_pools(start_server):
     server = start_server()
-    complete(config(server, temperature=0.3), seed=7, temperature=0.6)
+    complete(served(server, temperature=0.3), seed=7, temperature=0.6)
     request = server.requests[0]
     assert (request["seed"], request["temperature"], request["top_p"]) == (7, 0.6, 0.8)
 
 
 def test_fewer_responses_than_requested_are_accepted(start_server):
     server = start_server(json.dumps(completion("Hello.", "stop", 2)).encode())
-    assert len(complete(config(server), n=4)[0]) == 2
+    assert len(complete(served(server), n=4)[0]) == 2
     assert server.requests[0]["n"] == 4
 
 
 def test_rate_limit_delays_the_next_request(start_server):
-    server = start_server({"Retry-After": "0.5"})
-    assert complete(config(server))[0][0].text == "Hello."
-    assert len(server.requests) == 2
-    assert server.times[1] - server.times[0] >= 0.5
-
-
-def test_rate_limit_without_a_time_is_retried(start_server):
-    server = start_server({}, {}, {"Retry-After": "soon"})
-    assert complete(config(server))[0][0].text == "Hello."
+    server = start_server({"Retry-After": "0.5"}, {}, {"Retry-After": "soon"})
+    assert complete(served(server))[0][0].text == "Hello."
     assert len(server.requests) == 4
+    assert server.times[1] - server.times[0] >= 0.5
 
 
 def test_other_server_answers_while_one_is_rate_limited(start_server):
     limited, other = start_server(), start_server()
     limited.always["*"] = {"Retry-After": "60"}
-    assert len(complete(config(limited, other, concurrency=8), times=8)) == 8
+    assert len(complete(served(limited, other, concurrency=8), times=8)) == 8
     assert len(other.requests) == 8
 
 
-def test_lasting_rate_limit_ends_in_an_error(start_server):
+def test_lasting_rate_limit_or_missing_server_ends_in_an_error(start_server):
     server = start_server()
+    cfg = served(server, unreachable_timeout=0.2)
     server.always["*"] = {"Retry-After": "60"}
     with raises_user_error("no-server", contains=(server.url, "429")):
-        complete(config(server, unreachable_timeout=0.2))
+        complete(cfg)
+    server.stop()
+    with raises_user_error("no-server", contains=cfg.url[0]):
+        complete(cfg)
 
 
 def test_least_busy_server_gets_the_next_request(start_server):
@@ -84,7 +75,7 @@ def test_least_busy_server_gets_the_next_request(start_server):
     slow.delay, fast.delay = 0.1, 0.005
 
     async def main():
-        async with ServerPool(config(slow, fast), {}) as pool:
+        async with ServerPool(served(slow, fast), {}) as pool:
 
             async def send_ten():
                 for _ in range(10):
@@ -103,7 +94,7 @@ def test_broken_server_does_not_affect_the_others(store, start_server, state):
     broken.always["*"] = 500
     if state == "stopped":
         broken.stop()
-    narration = narrate_store(store, config(broken, up))
+    narration = narrate_store(store, served(broken, up))
     assert len(narration.rationales) == 12
     assert narration.figures["rejected"] == {}
 
@@ -123,7 +114,7 @@ def test_restart_of_a_server_costs_no_attempt(store, start_server):
 
     thread = threading.Thread(target=restart)
     thread.start()
-    narration = narrate_store(store, config(server))
+    narration = narrate_store(store, served(server))
     thread.join()
     restarted[0].stop()
     assert len(narration.rationales) == 12
@@ -133,4 +124,4 @@ def test_restart_of_a_server_costs_no_attempt(store, start_server):
 
 def test_repeated_url_counts_once(start_server):
     server = start_server()
-    assert len(ServerPool(config(server, server), {}).servers) == 1
+    assert len(ServerPool(served(server, server), {}).servers) == 1

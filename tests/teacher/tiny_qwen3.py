@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-SPECIAL = ("<|endoftext|>", "<|im_start|>", "<|im_end|>")
 TEMPLATE = (
     "{%- for message in messages -%}"
     "{{ '<|im_start|>' + message.role + '\\n' + message.content + '<|im_end|>\\n' }}"
@@ -14,13 +13,16 @@ TEMPLATE = (
 )
 
 
-def save_tiny_qwen3(folder: Path, texts: Iterable[str], vocabulary: int = 1024) -> Path:
+def save_tiny_qwen3(folder: Path, texts: Iterable[str]) -> Path:
     """Save a model, and a tokenizer trained on `texts`, in the format that vLLM reads."""
     # Imported here, because few of the tests that import this file serve a model.
     import torch
     from transformers import Qwen3Config, Qwen3ForCausalLM
 
-    tokenizer = _tokenizer(texts, vocabulary)
+    from models.tiny_qwen3_vl import build_processor
+
+    tokenizer = build_processor(texts, vocabulary=1024, image_size=32).tokenizer
+    tokenizer.chat_template = TEMPLATE
     torch.manual_seed(0)
     config = Qwen3Config(
         vocab_size=len(tokenizer),
@@ -44,27 +46,3 @@ def save_tiny_qwen3(folder: Path, texts: Iterable[str], vocabulary: int = 1024) 
     model.save_pretrained(folder)
     tokenizer.save_pretrained(folder)
     return folder
-
-
-def _tokenizer(texts: Iterable[str], vocabulary: int):
-    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
-    from transformers import PreTrainedTokenizerFast
-
-    tokenizer = Tokenizer(models.BPE())
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
-    tokenizer.decoder = decoders.ByteLevel()
-    tokenizer.train_from_iterator(
-        texts,
-        trainers.BpeTrainer(
-            vocab_size=vocabulary,
-            special_tokens=list(SPECIAL),
-            initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
-            show_progress=False,
-        ),
-    )
-    return PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer,
-        eos_token="<|im_end|>",
-        pad_token="<|endoftext|>",
-        chat_template=TEMPLATE,
-    )
