@@ -116,8 +116,9 @@ def resolve_model(
     overrides: Sequence[str] = (),
     key: str = "model",
 ) -> tuple[Path | None, Any]:
-    """Return the folder that `cfg.model` names and the settings of its run; None and `cfg`, which
-    has those of a preset, if it names none.
+    """Return the folder that `cfg.model` names and the settings of its run.
+
+    If `cfg.model` is None, return None and `cfg` itself, which has the settings of a preset.
 
     Args:
         benchmark: What the model is to be evaluated on.

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+from torch import nn
 from transformers import PreTrainedModel, ProcessorMixin
 
 from conf.schema import (
@@ -86,6 +87,13 @@ def nf4_cfg(saved_base: str) -> StudentConfig:
         max_new_tokens=24,
         lora=LoraConfig(rank=4),
     )
+
+
+def randomize_adapters(model: nn.Module, std: float) -> None:
+    """Give LoRA an effect on the outputs: its B matrices start at zero."""
+    for name, weight in model.named_parameters():
+        if "lora_B" in name:
+            nn.init.normal_(weight, std=std)
 
 
 @pytest.fixture(scope="session")

@@ -98,7 +98,7 @@ def image_features(
     Args:
         group: Consecutive images that must be in one batch, such as a clip's frames.
     """
-    # A tower of any image size gets its patches from the processor's resizing.
+    # For a tower of any image size, the processor resizes images to whole patches.
     any_size = hasattr(image_processor, "max_num_patches")
     sizes = {} if any_size else {"do_resize": False, "do_center_crop": False}
     inputs = image_processor(list(pixels), return_tensors="pt", **sizes)

@@ -167,7 +167,7 @@ def request_fields(cfg: StudentConfig, mode: str, clip: Clip | None) -> RequestF
 
     Frames are neither sampled again nor resized, as with a local model.
     """
-    # Bounds of the pixels, as with a local model, which neither enlarge nor shrink a frame.
+    # With these bounds a frame is neither enlarged nor shrunk, as with a local model.
     most = 2 * cfg.image_size**2
     images = {"size": {"shortest_edge": 1, "longest_edge": most}}
     videos = {"size": {"shortest_edge": 1, "longest_edge": most * cfg.frames}}

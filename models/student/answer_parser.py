@@ -138,7 +138,7 @@ def parse_choice(raw: str, letters: str = LETTERS, cut: bool = False) -> ParsedA
         return ParsedAnswer(answer.letter, broken or answer.reason, record)
     if flag is Reason.CUT_OFF:
         return ParsedAnswer(None, flag)
-    # With "xx" at its end an incomplete last word is no letter.
+    # "xx" extends a last word that was cut off, so that it cannot be read as a letter.
     answer = _read_prose(f"{prose}xx" if cut else prose, letters)
     if cut and answer.reason is Reason.NO_ANSWER:
         return ParsedAnswer(None, Reason.CUT_OFF)

@@ -26,7 +26,7 @@ from models.loading import DTYPES
 ANSWER_TOKENS = 16
 """Most new tokens in answer mode: the answer line, and some more for a malformed one."""
 THOUGHT, OPENING = "<think>", 8
-"""The tag that opens a thought, and how many tokens at the end of a prompt may hold it."""
+"""The tag that opens a thought, and how many of a prompt's last tokens are searched for it."""
 
 
 def response_token_limit(mode: str, max_new_tokens: int, thinking: bool = False) -> int:

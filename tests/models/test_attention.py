@@ -62,12 +62,16 @@ def test_all_frames_at_once_equal_frames_one_by_one(lengths) -> None:
         ],
         dim=1,
     )
-    torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-5)
-    weight = torch.linspace(-1, 1, found.numel()).view_as(found)
-    ours = torch.autograd.grad((found * weight).sum(), (query, key, value))
-    theirs = torch.autograd.grad((expected * weight).sum(), (query, key, value))
-    for one, two in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(one, two, atol=1e-6, rtol=1e-5)
+    check_equal(found, expected, (query, key, value))
+
+
+def check_equal(ours: torch.Tensor, theirs: torch.Tensor, inputs: tuple) -> None:
+    """Compare two outputs and their gradients with respect to the inputs."""
+    torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-5)
+    weight = torch.linspace(-1, 1, ours.numel()).view_as(ours)
+    gradients = (torch.autograd.grad((out * weight).sum(), inputs) for out in (ours, theirs))
+    for one, two in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, two, atol=1e-5, rtol=1e-5)
 
 
 def causal(length: int, dtype: torch.dtype) -> torch.Tensor:
@@ -85,13 +89,7 @@ def test_products_equal_the_librarys_eager_attention() -> None:
         attend(layer, *inputs, mask, scaling=0.25)[0]
         for attend in (attend_by_products, eager_attention_forward)
     )
-    torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-5)
-    weight = torch.linspace(-1, 1, ours.numel()).view_as(ours)
-    for one, two in zip(
-        *(torch.autograd.grad((found * weight).sum(), inputs) for found in (ours, theirs)),
-        strict=True,
-    ):
-        torch.testing.assert_close(one, two, atol=1e-5, rtol=1e-5)
+    check_equal(ours, theirs, inputs)
 
 
 def test_products_in_bf16_err_no_more_than_fused_attention() -> None:
@@ -152,8 +150,7 @@ def test_attention_depends_on_precision_and_length(model) -> None:
 
 @pytest.mark.parametrize("precision", ["bf16", "fp32"])
 def test_padding_and_a_cache_change_nothing(samples, processor, model, precision) -> None:
-    """Rows of padding alone have a softmax too, and a model writes what it would write without a
-    cache."""
+    """Rows of padding stay finite, and a cache does not change the generated tokens."""
     choose_attention(model, precision, LENGTH)
     collate, reduced = Collator(processor, LENGTH), precision == "bf16"
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=reduced):

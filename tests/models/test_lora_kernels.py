@@ -15,6 +15,7 @@ from models import loading
 from models.lora_kernels import AddedInPlace, PatchProduct, fuse
 from models.student.collator import Collator
 from models.student.prompts import selection_sample
+from tests.tiny_models import randomize_adapters
 from train.student.trainer import token_mean
 
 KINDS = {
@@ -30,9 +31,7 @@ def student(request, nf4_cfg, micro_store, frames):
     cfg = replace(nf4_cfg, **KINDS[request.param])
     torch.manual_seed(0)
     model, processor = loading.load_student(cfg, "fp32", list)
-    for name, weight in model.named_parameters():
-        if "lora_B" in name:
-            nn.init.normal_(weight, std=0.1)
+    randomize_adapters(model, 0.1)
     items = micro_store.selection("train")[:2]
     samples = [selection_sample(i, "answer", "cot", frames, cfg.frames, "Answer: A") for i in items]
     batch = Collator(processor, 1500)(samples)
@@ -67,7 +66,7 @@ def test_loss_and_every_gradient_are_the_same(student) -> None:
         assert (computed[name] - gradient).norm() <= 1e-4 * gradient.norm(), name
 
 
-def test_rounding_to_bf16_is_no_larger(student) -> None:
+def test_fused_operations_round_no_more_in_bf16(student) -> None:
     model, batch, _ = student
     exact, _ = loss_and_gradients(model, batch)
 

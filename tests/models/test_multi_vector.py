@@ -22,6 +22,7 @@ from models.retriever.embedder import (
 )
 from models.retriever.multi_vector import find_scored_tokens
 from models.retriever.scored_tokens import ScoredTokens
+from tests.tiny_models import randomize_adapters
 from train.common.audit import audit_retriever
 
 FRAME_TOKENS = 9
@@ -34,10 +35,7 @@ def load(cfg, micro_store, folder, noise: float = 0.0) -> MultiVectorEncoder:
     model = load_retriever(
         cfg, "fp32", tokenizer_texts(micro_store.retrieval("train"), cfg), folder
     )
-    with torch.no_grad():
-        for name, weight in model.named_parameters():
-            if "lora_B" in name:
-                weight.normal_(std=noise)
+    randomize_adapters(model, noise)
     return model
 
 
@@ -138,15 +136,6 @@ def test_code_in_a_saved_folder_is_not_executed(micro_store, late_cfg, tmp_path)
     model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
     (tmp_path / "saved" / "scored_tokens.py").write_text("raise RuntimeError('this ran')")
     assert find_scored_tokens(load_trained(late_cfg, "fp32", tmp_path / "saved")).media_ids
-
-
-def test_vectors_are_finite_in_bf16(model, queries, frames) -> None:
-    images = [frame_input(queries[0].target, frames)]
-    (exact,) = model.encode_document(images)
-    with torch.autocast("cpu", torch.bfloat16):
-        (vectors,) = model.encode_document(images)
-    assert vectors.shape == exact.shape == (FRAME_TOKENS, 24)
-    assert vectors.isfinite().all()
 
 
 def test_the_audit_marks_scored_tokens(model, late_cfg, queries, frames) -> None:

@@ -66,9 +66,9 @@ def config_of(preset: str) -> dict[str, Any]:
 def base_of(
     preset: str, quantization: BitsAndBytesConfig | None, kind: Any = AutoModelForImageTextToText
 ) -> PreTrainedModel:
-    """A preset's base as `from_pretrained` has it before the weights come: in bf16, its linear
+    """A preset's base as `from_pretrained` builds it before it loads weights: in bf16, its linear
     layers replaced by the library's own quantizer."""
-    # Reading marks the dictionary, so each base gets one of its own.
+    # from_dict modifies the dictionary, so each base gets its own copy.
     config = Qwen3VLConfig.from_dict(config_of(preset))
     with torch.device("meta"):
         model = kind.from_config(config, dtype=torch.bfloat16)
@@ -238,8 +238,8 @@ def test_a_pattern_that_adapts_nothing_is_named(targets) -> None:
 def released_processor(
     source: ProcessorMixin, pixels: dict[str, dict[str, int]]
 ) -> Qwen3VLProcessor:
-    """The released models' processor with sizes of `pixels`, but for its tokenizer: that of
-    `source`, which never saw a rationale and needs more tokens for one."""
+    """The released models' processor with sizes of `pixels` and the tokenizer of `source`, which
+    was not trained on rationales and splits them into more tokens."""
 
     def sized(name: str) -> dict[str, Any]:
         return {"size": pixels[name]} if name in pixels else {}
@@ -273,7 +273,7 @@ def test_frames_come_at_320_px_and_at_their_true_times(
     assert encoded.input_ids.count(released.image_token_id) == 4 * 100
     shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, cfg.frames)
     assert len(shown) == cfg.frames
-    # Two frames share a patch in time, which stands at the mean of their times.
+    # A patch covers two frames; its timestamp is the mean of their times.
     times = [(a + b) / 2 / FPS for a, b in zip(shown[::2], shown[1::2], strict=True)]
     timestamps = re.findall(r"<(\d+\.\d) seconds>", released.tokenizer.decode(encoded.input_ids))
     assert timestamps == [f"{time:.1f}" for time in times]

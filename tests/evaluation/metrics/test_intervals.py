@@ -18,18 +18,6 @@ def test_wilson_is_its_formula(successes, n):
     assert (found.low, found.high) == pytest.approx((centre - half, centre + half), abs=1e-12)
 
 
-def test_bootstrap_resamples_whole_scenes():
-    rng = np.random.default_rng(0)
-    alone = rng.random(400)
-    spread = SceneBootstrap(np.arange(400), seed=1).mean(alone)
-    half = 1.96 * alone.std() / 20
-    assert spread == pytest.approx((alone.mean() - half, alone.mean() + half), abs=0.01)
-    # Twenty-five copies of 16 values hold no more information than the 16.
-    few, scenes = np.repeat(rng.random(16), 25), np.repeat(np.arange(16), 25)
-    low, high = SceneBootstrap(scenes, seed=1).mean(few)
-    assert high - low > 4 * (spread[1] - spread[0]) * 0.7
-
-
 @pytest.mark.parametrize("items", [1, 2, 40, 401])
 def test_resample_counts_give_the_intervals_of_plain_resampling(items):
     rng = np.random.default_rng(items)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import pytrec_eval
 
-from evaluation.metrics.ranking import count_above_and_equal, expected_hits, target_scores
+from evaluation.metrics.ranking import count_above_and_equal, target_scores
 from tests.evaluation.metrics.reference import count_ranks, matrix_metrics, ranking_metrics
 
 KS = (1, 2, 3, 10)
@@ -82,14 +82,6 @@ def test_nan_target_scores_are_misses_that_count():
 def test_scores_are_compared_in_fp32():
     scores = np.array([[0.5, 0.5 + 1e-12, 0.1]])
     assert matrix_metrics(scores, np.array([0]), [1])["tie_rate"] == 1
-
-
-def test_credit_of_four_candidates():
-    scores = np.array([[1, 0, 0, 0], [1, 1, 0, 0], [1, 1, 1, 1], [0, 1, 1, 0], [np.nan, 0, 0, 0]])
-    answer = np.zeros(5, int)
-    valid = ~np.isnan(target_scores(scores, answer))
-    credit = expected_hits(*count_ranks(scores, answer), valid, 1)
-    assert credit.tolist() == [1, 0.5, 0.25, 0, 0]
 
 
 def test_ranks_without_ties_are_those_of_an_independent_library():

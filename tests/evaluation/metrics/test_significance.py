@@ -58,7 +58,7 @@ def test_differences_are_those_of_the_accuracies(items) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_p_is_that_of_a_fair_coin(items, seed) -> None:
+def test_p_equals_the_exact_binomial_test(items, seed) -> None:
     left, right = random_credits(items, seed), random_credits(items, seed + 100, 0.3 + 0.1 * seed)
     for p in compare_runs(items, left, right, NAMES, seed=0):
         if p.of == "macro":

@@ -18,11 +18,8 @@ from conf.schema import (
 )
 from evaluation import report, select
 from evaluation.generators.response_log import ResponseLog
-from models import loading
-from models.retriever import embedder
 from models.trained_runs import check_unseen, resolve_model, trained_settings
 from tests.evaluation.models.conftest import (
-    RETRIEVER,
     STUDENT,
     check_resumed,
     finish,
@@ -154,18 +151,6 @@ def test_settings_that_a_trained_model_cannot_use_are_refused(
     for refused in ("matcher=clip", "matcher.retriever.image_size=64"):
         with raises_user_error("unused-setting", contains="matcher.train"):
             resolve_model(*resolve, (refused,), "matcher.model")
-
-
-def test_a_truncated_model_file_is_refused(trained_student, trained_retriever, tmp_path) -> None:
-    folder = shutil.copytree(trained_student / "student", tmp_path / "student")
-    weights = folder / "model.safetensors"
-    weights.write_bytes(weights.read_bytes()[:1000])
-    with raises_user_error("unloadable-model"):
-        loading.load_trained(STUDENT, "bf16", folder)
-    folder = shutil.copytree(trained_retriever / "retriever", tmp_path / "retriever")
-    (folder / "model.safetensors").write_bytes(b"{")
-    with raises_user_error("damaged-file"):
-        embedder.load_trained(RETRIEVER, "bf16", folder)
 
 
 def test_a_limit_spreads_over_the_families(micro_store) -> None:

@@ -29,7 +29,7 @@ from evaluation.embedders.joint_encoder import load_encoder
 from evaluation.metrics.ranking import query_metrics
 from evaluation.metrics.results import retrieval_results
 from evaluation.retrieval.exact_search import Ranks
-from evaluation.retrieval.standard_test import load_standard_test, rank_targets
+from evaluation.retrieval.standard_test import load_standard_test
 from evaluation.retrieval.text_matching import ROUTES, future_text, rank_by_text
 from tests.evaluation.metrics.reference import matrix_metrics
 from tests.evaluation.models import released
@@ -120,25 +120,6 @@ def test_texts_rank_by_their_scores_and_a_missing_text_is_a_miss(rank, store, ma
     assert row.mrr.value == pytest.approx(measures["mrr"][1:-1].sum() / len(queries))
     with raises_user_error("no-texts", contains="predict -> image"):
         rank("predict_image", [""] * len(queries))
-
-
-def test_repeating_the_question_ranks_as_an_unseen_prefix(rank, store, matcher) -> None:
-    queries, database = load_standard_test(store)
-    names = [f.name for f in database]
-    blind = replace(matcher, weights="blind")
-    blind.encoder.embed_clips = lambda clips: np.zeros((len(clips), 24), np.float32)
-    query_rows = blind.embed_queries(queries).rows([q.name for q in queries])
-    frame_rows = matcher.encoder.frames(database, matcher.frames)
-    target_rows = frame_rows[[names.index(q.target.name) for q in queries]]
-    direct = rank_targets(matcher.preset, query_rows, target_rows, [frame_rows])
-    found = rank("predict_image", [q.question for q in queries])
-    for a, b in zip(
-        retrieval_results("micro", "x", found, queries, 0),
-        retrieval_results("micro", "x", direct, queries, 0),
-        strict=True,
-    ):
-        assert (a.width, a.builder, a.queries) == (b.width, b.builder, b.queries)
-        assert a.mrr.value == pytest.approx(b.mrr.value, rel=0.01)
 
 
 def test_captions_match_by_their_words(rank, store) -> None:

@@ -12,7 +12,7 @@ from transformers import AutoModelForImageTextToText, AutoProcessor
 
 from conf.entry import Run
 from conf.runs import read_json_lines
-from conf.schema import ArchitectureConfig, LoraConfig, SelectCommand, ServerConfig, StudentConfig
+from conf.schema import LoraConfig, SelectCommand, ServerConfig, StudentConfig
 from data.render.frame_cache import FrameReader
 from evaluation import select
 from evaluation.generators.base import item_sample
@@ -22,14 +22,11 @@ from models import loading
 from models.student.answer_parser import Reason, parse_choice
 from models.student.collator import Collator, encode
 from tests.teacher.vllm_server import VllmServer
+from tests.tiny_models import SMALL, randomize_adapters
 from train.student import dataset
 
 pytestmark = pytest.mark.slow
 
-SMALL = ArchitectureConfig(
-    hidden=64, layers=2, heads=2, kv_heads=2, feed_forward=128,
-    vision_hidden=64, vision_layers=2, vision_heads=2, vision_feed_forward=128,
-)  # fmt: skip
 STUDENT = StudentConfig(
     name="small", architecture=SMALL, quantization="none", lora=LoraConfig(rank=0), image_size=96,
     max_length=1500, max_new_tokens=600,
@@ -61,10 +58,7 @@ def adapters(cfg, tmp_path_factory):
     torch.manual_seed(0)
     trained = replace(cfg, lora=LoraConfig(rank=4))
     model, processor = loading.load_student(trained, "fp32", list)
-    with torch.no_grad():
-        for name, weight in model.named_parameters():
-            if "lora_B" in name:
-                weight.normal_(std=0.2)
+    randomize_adapters(model, 0.2)
     loading.save_student(model, processor, folder, "fp32")
     return folder
 

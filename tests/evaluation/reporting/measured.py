@@ -116,8 +116,8 @@ def similarity_run(
     model: str | None = None,
     untrained: Sequence[float] = (0.5, 0.25, 0.125, 0),
 ) -> Path:
-    """A run of evaluation.similarity in which what is `untrained` gives every item's candidates
-    these scores; `model` is a run of train.contrastive, which always chooses the right one."""
+    """A run of evaluation.similarity. The untrained retriever gives the candidates of every item
+    the scores `untrained`; `model`, a run of train.contrastive, always chooses the target."""
     items = limit_items(store.selection("test"), limit, 0)
     settings = SimilarityCommand(
         benchmark=benchmark, retriever=RetrieverConfig(name=name), limit=limit,
@@ -143,7 +143,7 @@ def similarity_run(
 def retrieve_run(
     root: Path, store: Store, benchmark, name: str, frames: int = 60, kind: str = "retrieve"
 ) -> Path:
-    """A run of evaluation.retrieve of a trained retriever and of what it began from."""
+    """A run of evaluation.retrieve of a trained retriever and of its untrained base."""
     trained = ContrastiveCommand(benchmark=benchmark, retriever=RetrieverConfig(name="small"))
     finish(root / "contrastive" / name, trained)
     queries = store.standard_test()

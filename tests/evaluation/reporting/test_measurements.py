@@ -18,7 +18,7 @@ def change_first_row(report: Path, **row: object) -> None:
     report.write_text(json.dumps(content))
 
 
-def test_a_model_that_is_measured_twice_keeps_its_line(runs):
+def test_two_measurements_of_a_model_share_a_row(runs):
     # Another seed gives another interval.
     shutil.copytree(runs / "select" / "cot", runs / "select" / "again")
     macro = {"value": 1.0, "low": 0.9, "high": 1.0, "n": 8}
@@ -33,7 +33,7 @@ def test_a_model_that_is_measured_twice_keeps_its_line(runs):
         assert "cot, cot" in table
 
 
-def test_a_common_base_has_one_row_and_two_runs_have_names(runs, micro, micro_store, report):
+def test_an_untrained_base_of_two_runs_has_one_row(runs, micro, micro_store, report):
     retrieve_run(runs, micro_store, micro, "other")
     folder = report(runs=["retrieve/*"], items=1)
     table = read_table(folder, "distillation-retrieval-micro")

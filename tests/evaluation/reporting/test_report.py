@@ -261,13 +261,6 @@ def test_runs_of_different_items_are_refused(runs, micro, micro_store, report):
     assert report(runs=["select/few"], items=1)
 
 
-def test_retrievers_of_different_items_are_refused(runs, micro, micro_store, report):
-    similarity_run(runs, micro_store, micro, "few", limit=9)
-    with raises_user_error("different-items", contains="only in"):
-        report(runs=["select/base", "similarity/few"])
-    assert report(runs=["similarity/few"])
-
-
 def test_a_retriever_is_compared_with_its_untrained_base(runs, micro, micro_store, report):
     similarity_run(runs, micro_store, micro, "small", model="emb")
     # The untrained base was also measured alone: an equal row.

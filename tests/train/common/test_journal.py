@@ -182,7 +182,7 @@ def test_shares_of_parsed_and_right_answers(few_steps, processor, tmp_path) -> N
     assert answers.measure(Writer(processor, texts), "frame", samples, step=8) == {}
 
 
-def test_the_bar_has_the_latest_measures() -> None:
+def test_the_progress_bar_shows_the_latest_measures() -> None:
     bar = MetricsBar()
     bar.training_bar = tqdm(total=9, file=io.StringIO())
     logs = {"loss": 2.0, "train_loss": 9.0, "eval_runtime": 1.0}

@@ -254,7 +254,7 @@ def test_fsdp_without_effect_is_refused(settings, tmp_path, monkeypatch) -> None
 
 @pytest.mark.parametrize("count", [1, 2, 5, 8, 11, 64])
 @pytest.mark.parametrize(("micro_batch", "number"), [(1, 2), (2, 2), (4, 2), (2, 4), (1, 8)])
-def test_ranks_share_the_steps_of_one(count, micro_batch, number) -> None:
+def test_ranks_divide_each_step_of_a_single_rank(count, micro_batch, number) -> None:
     """accelerate gives the micro-batches of an order to the ranks in turn."""
     lengths = np.random.default_rng(0).integers(1, 1000, count).tolist()
     alone = list(LengthSampler(lengths, 8, 0))

@@ -103,7 +103,7 @@ def test_a_student_resumes_in_a_later_epoch(
 
 
 @pytest.mark.slow
-def test_a_token_weighs_the_same_however_a_batch_is_split(few_steps, tmp_path) -> None:
+def test_micro_batches_change_neither_loss_nor_gradient(few_steps, tmp_path) -> None:
     """The first step's loss and gradient of four unequal samples, at once and one by one."""
     first = []
     for micro_batch in (4, 1):
@@ -114,7 +114,7 @@ def test_a_token_weighs_the_same_however_a_batch_is_split(few_steps, tmp_path) -
     assert first[0]["grad_norm"] == pytest.approx(first[1]["grad_norm"], rel=1e-3)
 
 
-def test_other_folders_are_no_checkpoints(tmp_path, caplog) -> None:
+def test_only_numbered_folders_are_checkpoints(tmp_path, caplog) -> None:
     for name in ("checkpoint-best", "checkpoint-10-old", "checkpoint-"):
         (tmp_path / name).mkdir()
     assert newest_checkpoint(tmp_path) is None

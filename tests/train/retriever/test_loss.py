@@ -28,6 +28,7 @@ from models.retriever.embedder import (
     model_inputs,
     tokenizer_texts,
 )
+from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train.retriever.batches import batch_columns
 from train.retriever.inputs import RetrieverInputs
@@ -44,9 +45,7 @@ def load(cfg: RetrieverConfig, precision: str, micro_store, folder) -> Retriever
     torch.manual_seed(0)
     texts = tokenizer_texts(micro_store.retrieval("train"), cfg)
     model = load_retriever(cfg, precision, texts, folder)
-    for name, weight in model.named_parameters():
-        if "lora_B" in name:
-            weight.data.normal_(std=0.05)
+    randomize_adapters(model, 0.05)
     return model.train()
 
 

@@ -34,6 +34,7 @@ from models.student.prompts import selection_sample
 from models.trained_runs import run_title, trained_settings
 from teacher.narrate import ensure_rationales
 from tests.children import run_child
+from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train import export
 from train.common.merge import ModelOutputs, compare
@@ -61,10 +62,7 @@ def finished_run(settings: SftCommand, root: Path) -> Path:
     resolve_run(folder, "fp32", settings.student, data="0")
     torch.manual_seed(0)
     model, processor = loading.load_student(settings.student, settings.train.precision, list)
-    with torch.no_grad():
-        for name, weight in model.named_parameters():
-            if "lora_B" in name:
-                weight.normal_(std=0.05)
+    randomize_adapters(model, 0.05)
     loading.save_student(model, processor, folder / "student", settings.train.precision)
     (folder / "metrics.json").write_text(json.dumps(METRICS))
     return root

@@ -13,6 +13,7 @@ from conf.entry import Run
 from models.loading import load_student
 from models.student.collator import Collator
 from models.student.prompts import Clip, Sample, conversation, selection_sample
+from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train import sft
 from train.common.journal import read_journal
@@ -68,9 +69,7 @@ def test_loss_and_gradients_are_those_of_the_pixels(student, samples, share) -> 
     """Also if the cache has room for a share of the features only."""
     model, processor = student
     # Adapters start at zero, where many gradients vanish.
-    for name, weight in model.named_parameters():
-        if "lora_B" in name:
-            nn.init.normal_(weight, std=0.1)
+    randomize_adapters(model, 0.1)
     collator = TrainerCollator(Collator(processor, 1500), digests=True)
     whole = VisionCache(model, "fp32", PLENTY)
     plain = loss_and_gradients(model, collator, samples, None)
