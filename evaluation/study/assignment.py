@@ -11,18 +11,20 @@ import numpy as np
 from data.records import LETTERS, SelectionItem
 from data.tracks.quota import named_rng
 
-Order = tuple[int, ...]
-"""The index of the candidate at each letter."""
-
 
 @dataclass(frozen=True)
 class Assignment:
-    """An item of an annotator; among items that may come next, the lowest `rank` comes first."""
+    """An item of an annotator.
+
+    Attributes:
+        rank: Among items that may come next, the lowest rank comes first.
+        order: The index of the candidate at each letter.
+    """
 
     annotator: str
     item_id: str
     rank: int
-    order: Order
+    order: tuple[int, ...]
 
 
 def assign_items(

@@ -73,15 +73,18 @@ def load_retriever(
 
     Raises:
         UserError: The model is not on this machine and cannot be downloaded; it is not a Qwen3-VL,
-            has no vision tower or has the processor of another model; or it is a saved retriever
-            with another pooling than the last token, or with trained modules after its backbone.
+            has no vision tower or has the processor of another model; it is a saved retriever with
+            another pooling than the last token, or with trained modules after its backbone; or
+            `lora.targets` is an invalid pattern or matches no module that LoRA supports.
     """
     source = cfg.model
     if cfg.architecture is not None:
         source = str(folder)
         with main_first():
             if rank() == 0:
-                build_base(cfg, texts, folder)
+                processor = build_processor(texts, cfg.architecture.vocabulary, cfg.image_size)
+                build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
+                processor.save_pretrained(folder)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     with explain_unloadable("retriever", source):
         if is_sentence_transformer_model(source, revision=cfg.revision):
@@ -109,28 +112,17 @@ def load_retriever(
         model = SentenceTransformer(modules=[backbone, pooling, Normalize()], **options)
     # Training rows contain indices instead of texts, so a model card has no examples to show.
     model.model_card_data.generate_widget_examples = False
-    prepare_for_training(model, cfg, precision)
+    choose_attention(backbone.model, precision, cfg.max_length)
+    keep_differentiable(backbone)
+    if cfg.lora.rank:
+        backbone.requires_grad_(False)
+        with lora_config("retriever", cfg.lora) as config:
+            model.add_adapter(config)
+        for weight in backbone.parameters():
+            if weight.requires_grad:
+                # Updates of this size would vanish in bf16's rounding.
+                weight.data = weight.data.float()
     return model
-
-
-def prepare_for_training(model: Retriever, cfg: RetrieverConfig, precision: str) -> None:
-    """Set a loaded retriever's attention and, if the preset has adapters, freeze its backbone and
-    add them to the projections of the language tower.
-
-    Raises:
-        UserError: `lora.targets` is an invalid pattern, or matches no module that LoRA supports.
-    """
-    choose_attention(model[0].model, precision, cfg.max_length)
-    keep_differentiable(model[0])
-    if not cfg.lora.rank:
-        return
-    model[0].requires_grad_(False)
-    with lora_config("retriever", cfg.lora) as config:
-        model.add_adapter(config)
-    for weight in model[0].parameters():
-        if weight.requires_grad:
-            # Updates of this size would vanish in bf16's rounding.
-            weight.data = weight.data.float()
 
 
 def load_adapters(model: Retriever, folder: Path) -> None:
@@ -156,15 +148,6 @@ def load_head(model: Retriever, folder: Path) -> None:
         weights = folder / part["path"] / "model.safetensors"
         if weights.exists():
             model[part["idx"]].load_state_dict(load_file(weights))
-
-
-def build_base(cfg: RetrieverConfig, texts: list[str], folder: Path) -> None:
-    """Build a base with random weights from an architecture and its seed, and save it in
-    `folder`."""
-    assert cfg.architecture is not None
-    processor = build_processor(texts, cfg.architecture.vocabulary, cfg.image_size)
-    build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
-    processor.save_pretrained(folder)
 
 
 def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retriever:

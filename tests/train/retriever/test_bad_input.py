@@ -51,21 +51,22 @@ def assert_refused(
 
 
 def duplicated(rows: Rows) -> Rows:
-    return [*rows, next(r for r in rows if r["split"] == "train" and r["pool"] == "future")]
+    return [*rows, first_future(rows, "train")]
+
+
+def first_future(rows: Rows, split: str) -> dict:
+    return next(r for r in rows if r["split"] == split and r["pool"] == "future")
 
 
 def about_test_scene(rows: Rows) -> Rows:
-    test_scene = next(r["scene_id"] for r in rows if r["split"] == "test" and r["pool"] == "future")
-    (row, *_) = (r for r in rows if r["split"] == "train" and r["pool"] == "future")
-    return [{**r, "scene_id": test_scene} if r is row else r for r in rows]
+    first_future(rows, "train")["scene_id"] = first_future(rows, "test")["scene_id"]
+    return rows
 
 
-def ranking_test_frame(rows: Rows) -> Rows:
-    """A hard negative is a frame of a test scene."""
-    test_scene = next(r["scene_id"] for r in rows if r["split"] == "test" and r["pool"] == "future")
-    (row, *_) = (r for r in rows if r["split"] == "train" and r["pool"] == "future")
-    wrong = [{**row["hard_negatives"][0], "scene_id": test_scene}, *row["hard_negatives"][1:]]
-    return [{**r, "hard_negatives": wrong} if r is row else r for r in rows]
+def with_test_frame_as_negative(rows: Rows) -> Rows:
+    negative, *_ = first_future(rows, "train")["hard_negatives"]
+    negative["scene_id"] = first_future(rows, "test")["scene_id"]
+    return rows
 
 
 def with_one_negative(rows: Rows) -> Rows:
@@ -77,7 +78,7 @@ def with_one_negative(rows: Rows) -> Rows:
     [
         (duplicated, "duplicate-record", "retrieval.parquet"),
         (about_test_scene, "split-leak", "train split"),
-        (ranking_test_frame, "split-leak", "train split"),
+        (with_test_frame_as_negative, "split-leak", "train split"),
         (with_one_negative, "too-few-negatives", "train.hard_negatives=2"),
     ],
 )
