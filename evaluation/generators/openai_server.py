@@ -26,7 +26,7 @@ from models.trained_runs import product_folder, run_title
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from teacher.servers.responses import TRUNCATED, Response
 from teacher.servers.server import (
-    MALFORMED_RESPONSE_ERRORS,
+    MALFORMED_REPLY_ERRORS,
     Messages,
     RequestFields,
     authentication_error,
@@ -226,7 +226,7 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
                 models = {m.id: m.model_extra or {} for m in client.models.list()}
         except openai.AuthenticationError as error:
             raise authentication_error(url, error) from error
-        except (openai.OpenAIError, *MALFORMED_RESPONSE_ERRORS) as error:
+        except (openai.OpenAIError, *MALFORMED_REPLY_ERRORS) as error:
             problems.append(f"{url}: {error.__cause__ or error}")
             continue
         if server.model not in models:
