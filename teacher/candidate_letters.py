@@ -1,4 +1,4 @@
-"""Candidates' letters in a rationale, and the same rationale for permuted candidates."""
+"""Find the candidates' letters in a rationale, and relabel a rationale for permuted candidates."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ FOLLOWS_LETTER = re.compile(
     "and|or|nor|alone|also|too|then|still|never|always|only|itself|again|cannot|can|will|would"
     "|should|could|must|may|might|did|had|now|likewise|here|thus|therefore|instead|however|meanwhile"
 )
-"""Words before which an "A" at the start of a sentence is a letter and not the article. The same
-holds before verbs in -s and punctuation."""
+"""If one of these words follows an "A" at the start of a sentence, the "A" is a letter and not the
+article. The same holds if a verb that ends in "s" follows, or punctuation."""
 
 
 def find_letters(text: str) -> list[tuple[int, int]]:
-    """Spans of the letters that name candidates, in order; the article "A" is not one of them."""
+    """Return the spans of the letters that name candidates, in order, without the article "A"."""
     return [
         m.span() for m in LETTER.finditer(text) if m[0] != "A" or not _is_article(text, *m.span())
     ]
 
 
 def relabel_text(text: str, order: Sequence[int]) -> str:
-    """A valid rationale for the same candidates in another order.
+    """Return a rationale with its letters replaced for the same candidates in another order.
 
     Args:
         text: A rationale that passes the validator, for the old order.
-        order: For each new position of a candidate, its old position.
+        order: `order[new]` is the old position of the candidate at the position `new`.
     """
     letter_of = {LETTERS[old]: LETTERS[new] for new, old in enumerate(order)}
     pieces, end = [], 0
@@ -42,13 +42,14 @@ def relabel_text(text: str, order: Sequence[int]) -> str:
 
 
 def reorder_candidates(item: SelectionItem, order: Sequence[int]) -> SelectionItem:
-    """An item with its candidates in another order; see `relabel_text`."""
+    """Return an item with its candidates in another order; see `relabel_text`."""
     candidates = tuple(item.candidates[old] for old in order)
     return replace(item, candidates=candidates, answer=list(order).index(item.answer))
 
 
 def _is_article(text: str, start: int, stop: int) -> bool:
-    """Whether an "A" opens a sentence and a noun phrase, as in "A slowly moving cube"."""
+    """Return whether an "A" is the article of a noun phrase at the start of a sentence, as in "A
+    slowly moving cube"."""
     if not SENTENCE_START.search(text, max(0, start - 4), start):
         return False
     while following := NEXT_WORD.match(text, stop):

@@ -1,11 +1,11 @@
-"""Sections of a rationale's text, and the grammar of its form for constrained decoding."""
+"""Split a rationale into its sections, and constrain decoding to this form by a grammar."""
 
 from __future__ import annotations
 
 import re
 
 SECTIONS = ("Scene parse", "Motion analysis", "Prediction", "Candidate analysis", "Outcome")
-"""Headings of a rationale in order; the line "Answer: X" follows them."""
+"""Headings of a rationale's sections in order. The line "Answer: X" follows the last section."""
 HEADING = re.compile(rf"^({'|'.join(SECTIONS)}|Answer):[ \t]*", re.MULTILINE)
 
 GRAMMAR_VERSION = "2"
@@ -21,18 +21,19 @@ answer ::= "Answer: " [A-D]
 prose ::= (" " word [,;:.]?)* " " word "."
 word ::= [A-Za-z]+ (['-] [a-z]+)*
 """
-"""GBNF of texts with every section, every candidate's letter and an answer, and without digits and
-markup. Length, number words and claims are left to the validator."""
+"""GBNF grammar of a rationale. It requires all sections in order, all candidates' letters and an
+answer, and excludes digits and markup. The validator checks length, number words and claims."""
 
 
 def split_sections(text: str) -> list[tuple[str, int, int]]:
-    """Each heading with the start and stop of the text below it, in order."""
+    """Return (heading, start, stop) for each section, where `text[start:stop]` follows the heading.
+    "Answer" counts as a heading."""
     headings = list(HEADING.finditer(text))
     stops = [*(m.start() for m in headings[1:]), len(text)]
     return [(m[1], m.end(), stop) for m, stop in zip(headings, stops, strict=False)]
 
 
 def remove_section(text: str, section: str) -> str:
-    """The text without one section and its heading."""
-    body = rf"^{section}:.*?(?={HEADING.pattern}|\Z)"
-    return re.sub(body, "", text, count=1, flags=re.MULTILINE | re.DOTALL)
+    """Return `text` without the first section called `section`, and without its heading."""
+    pattern = rf"^{section}:.*?(?={HEADING.pattern}|\Z)"
+    return re.sub(pattern, "", text, count=1, flags=re.MULTILINE | re.DOTALL)

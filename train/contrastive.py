@@ -1,4 +1,5 @@
-"""Train a retriever: a Matryoshka loss over cached multiple-negatives ranking."""
+"""Train a retriever with a ranking loss over the other frames of a batch and hard negatives, summed
+over Matryoshka widths."""
 
 from __future__ import annotations
 
@@ -41,8 +42,8 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     keep_freed_memory()
     if is_sharded():
         raise UserError(
-            "FSDP does not shard a retriever: sentence-transformers reads each checkpoint as a "
-            "whole model; start without --use_fsdp (and with --multi_gpu, on CPUs too)",
+            "a retriever cannot be trained with FSDP: sentence-transformers reads each checkpoint "
+            "as a whole model; replace --use_fsdp by --multi_gpu, which works on CPUs too",
             code="unsupported-with-fsdp",
         )
     rank_batch = split_batch(cfg.train.batch)
@@ -60,8 +61,8 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
         precision, retriever = resolve_run(run.folder, cfg.train.precision, cfg.retriever, data)
     cfg = replace(cfg, retriever=retriever, train=replace(cfg.train, precision=precision))
 
-    log.info("loading retriever %s, to compute in %s", retriever.name, precision)
-    # Adapters are initialised before the trainer sets its seed.
+    log.info("loading retriever %s, computing in %s", retriever.name, precision)
+    # Seed the initialisation of the adapters; the trainer sets its seed later.
     set_seed(cfg.seed)
     texts = tokenizer_texts(store.retrieval("train"), retriever)
     with explain_load_errors("retriever"):
@@ -69,7 +70,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     fuse(model)
 
     trainer = build_trainer(cfg, run, store, model, training, validation, rank_batch, checkpoint)
-    memory_settings = "train.mini_batch, or retriever.image_size or retriever.frames"
+    memory_settings = "train.mini_batch, retriever.image_size or retriever.frames"
     best_step = run_training(trainer, run, checkpoint, memory_settings)
 
     if rank() == 0:

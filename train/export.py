@@ -1,12 +1,12 @@
 """Export a trained student or retriever: merged into its base, or its adapters alone.
 
     checkpoints/export_<product>/<run>/<format>/<product>/
-        config.json, model.safetensors         for the standard classes, or
-        adapter_config.json, adapter_model.safetensors      for peft
-        modules.json and the modules' folders, of a retriever
+        config.json, model.safetensors         bf16 and fp32: for the libraries' own classes
+        adapter_config.json, adapter_model.safetensors, resolved.yaml    adapter: for peft
+        modules.json and the modules' folders  of a retriever
         tokenizer and processor files
         README.md      the model card
-        config.yaml, run.json, metrics.json    from the training run; resolved.yaml with adapters
+        config.yaml, run.json, metrics.json    copied from the training run
         export.json    what was exported, and how far it differs from what was trained
 
 The folder is written under another name and renamed when it is complete.
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 RECORDS = ("config.yaml", "run.json", "metrics.json")
-"""Files of the training run that belong to its export."""
+"""Files that are copied from the training run to its export."""
 COMMANDS = {"student": SftCommand, "retriever": ContrastiveCommand}
 
 
@@ -44,15 +44,15 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
     from models.trained_runs import EXPORT, export_record
     from train.common.model_card import model_card
 
-    name, trained, settings = find_run(cfg.run, cfg.product, cfg.checkpoints)
-    saved, folder = trained / cfg.product, run.folder / cfg.product
+    name, run_folder, settings = find_run(cfg.run, cfg.product, cfg.checkpoints)
+    saved, folder = run_folder / cfg.product, run.folder / cfg.product
     weights = hash_file(saved / "adapter_model.safetensors")
     if folder.exists():
         record = export_record(folder)
         if record["weights"] != weights:
             raise UserError(
-                f"{folder} is an export of other adapters than {saved} holds now: delete it to "
-                "export these",
+                f"{folder} was exported from other adapters than those now in {saved}: delete "
+                f"{folder} and export again",
                 code="other-adapters",
             )
         log.info("%s is exported already; delete it to export again", folder)
@@ -61,7 +61,7 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
     with renamed_when_complete(folder) as partial:
         if cfg.format == "adapter":
             shutil.copytree(saved, partial, dirs_exist_ok=True)
-            if (resolved := trained / RESOLVED).exists():
+            if (resolved := run_folder / RESOLVED).exists():
                 shutil.copy(resolved, partial)
         elif cfg.product == "student":
             from train.student.merge import StudentMerge
@@ -71,9 +71,9 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
             from train.retriever.merge import RetrieverMerge
 
             measured = write_merged(RetrieverMerge(settings, saved), partial, cfg)
-        for record in RECORDS:
-            shutil.copy(trained / record, partial)
-        card = model_card(name, settings, trained, cfg.format, measured)
+        for file_name in RECORDS:
+            shutil.copy(run_folder / file_name, partial)
+        card = model_card(name, settings, run_folder, cfg.format, measured)
         card.save(partial / "README.md")
         record = {"run": name, "format": cfg.format, "weights": weights, "measured": measured}
         write_json(partial / EXPORT, record)
@@ -89,8 +89,8 @@ def find_run(
     """Return the name, the folder and the settings of the run to export.
 
     Raises:
-        UserError: No run has this name, it is not finished, it trained the whole model, its
-            adapters are missing, or its base has changed.
+        UserError: The run does not exist, is not finished or trained the whole model, its adapters
+            are missing, or its base has changed.
     """
     from models.resolved import check_base
     from models.trained_runs import trained_settings
@@ -118,10 +118,11 @@ def find_run(
 def write_merged(
     merge: StudentMerge | RetrieverMerge, folder: Path, cfg: ExportModelCommand
 ) -> dict[str, float]:
-    """Write a merged model, and return the differences of its outputs from the trained model's.
+    """Write a merged model, and return how its outputs differ from the trained model's: relative
+    differences, and the fraction of equal choices. Empty with `verify=false`.
 
     Raises:
-        UserError: They differ too much, or the benchmark with the held-out items is missing.
+        UserError: The outputs differ too much, or the benchmark or its rationales are missing.
     """
     from train.common.merge import compare
 
@@ -139,9 +140,9 @@ def write_merged(
         # The negation also refuses NaN.
         if name.endswith("_difference") and not value <= merge.max_difference:
             raise UserError(
-                f"the {name.replace('_', ' ')} of the merged {cfg.product} is {value:.3g} of its "
-                f"size, more than {merge.max_difference}; nothing was exported. Try format=fp32 or "
-                "format=adapter",
+                f"the relative {name.replace('_', ' ')} between the merged and the trained "
+                f"{cfg.product} is {value:.3g}, above the limit of {merge.max_difference}; nothing "
+                "was exported. Try format=fp32 or format=adapter",
                 code="merge-difference",
             )
     return measured

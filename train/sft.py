@@ -1,4 +1,7 @@
-"""Train a student on rationales or answers: LoRA over a frozen, quantised base."""
+"""Train a student on rationales or answers, by default with LoRA over a frozen 4-bit base.
+
+`+exp=base` trains the whole tiny base on descriptions instead.
+"""
 
 from __future__ import annotations
 
@@ -40,15 +43,15 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from train.student.run import build_trainer
 
     compat.keep_freed_memory()
-    # Before the benchmark is built, which may take long.
+    # Check the batch now, because building the benchmark may take long.
     distributed.split_batch(cfg.train.batch, cfg.train.micro_batch)
     checkpoint = newest_checkpoint(run.folder)
 
     # The main rank builds and narrates what is missing; then every rank reads it from the disk.
     with distributed.main_first():
         store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
-        without = cfg.train.regime in WITHOUT_RATIONALES
-        rationales = [] if without else ensure_rationales(store, cfg.teacher)
+        needs_none = cfg.train.regime in WITHOUT_RATIONALES
+        rationales = [] if needs_none else ensure_rationales(store, cfg.teacher)
     training, validation = load_datasets(cfg, store, rationales)
 
     data = data_digest(store.identity, training.texts)
@@ -56,8 +59,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         precision, student = resolve_run(run.folder, cfg.train.precision, cfg.student, data)
     cfg = replace(cfg, student=student, train=replace(cfg.train, precision=precision))
 
-    log.info("loading student %s, to compute in %s", student.name, precision)
-    # Adapters are initialised before the trainer sets its seed.
+    log.info("loading student %s, computing in %s", student.name, precision)
+    # Seed the initialisation of the adapters; the trainer sets its seed later.
     set_seed(cfg.seed)
     corpus = partial(tokenizer_corpus, store, rationales)
     with training_loop.explain_load_errors("student"):
@@ -69,14 +72,14 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         check_adapters(checkpoint, model, student.lora.rank, student.model)
 
     trainer = build_trainer(cfg, run, model, processor, training, validation, checkpoint)
-    memory_settings = "train.micro_batch, or student.image_size or student.frames"
+    memory_settings = "train.micro_batch, student.image_size or student.frames"
     best_step = training_loop.run_training(trainer, run, checkpoint, memory_settings)
 
     weights = training_loop.gather_weights(trainer)
     if rank() == 0:
-        # A base is written in bf16, as bases are released, whatever precision it was trained in.
-        written = "bf16" if cfg.train.regime == "describe" else precision
-        loading.save_student(model, processor, run.folder / "student", written, weights)
+        # A base is saved in bf16, whatever precision it was trained in: released bases are bf16.
+        saved_precision = "bf16" if cfg.train.regime == "describe" else precision
+        loading.save_student(model, processor, run.folder / "student", saved_precision, weights)
     log.info("the student is in %s", run.folder / "student")
     return run_metrics(run.folder, best_step)
 

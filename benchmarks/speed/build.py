@@ -1,12 +1,12 @@
-"""The time and memory of building a benchmark without frames, by number of scenes.
+"""Measure the time and memory of building benchmarks, without their frames.
 
     python -m benchmarks.speed.build 100 1000 10000
 
 For each number of scenes, the dynapix preset is built with proportional quotas in three stages:
 scenes with their oracle, items and queries, databases. Prints the seconds of each stage, scenes per
-second and worker, and the peak memory (GiB) of all processes together. The benchmarks are built in
-FOLDER (store/growth). An interrupted build resumes there, so only an uninterrupted one is measured
-correctly.
+second per worker, and the largest sum of the resident memory of all processes (GiB). The benchmarks
+are built below `--folder` (store/growth). An interrupted build resumes; its measurements then cover
+only the remaining work.
 """
 
 from __future__ import annotations
@@ -34,11 +34,13 @@ from data.tracks.shortfalls import summarize_store
 
 PAPER_SCENES = 10_000
 STAGES = ("make_scenes", "make_items_and_queries", "make_databases")
-"""Functions of `data.build` that run the stages."""
+"""Names of the functions of `data.build` that run the stages. `measure` replaces them by timed
+versions."""
 
 
 def scale_preset(scenes: int) -> BenchmarkConfig:
-    """The dynapix preset for another number of scenes, with proportional quotas and databases."""
+    """Return the dynapix preset for another number of scenes. Quotas, the standard test and the
+    databases change in proportion."""
     cfg = compose("data.build", BuildCommand, ["benchmark=dynapix"]).benchmark
     cfg.name, cfg.scenes, share = f"growth-{scenes}", scenes, scenes / PAPER_SCENES
 
@@ -55,27 +57,28 @@ def scale_preset(scenes: int) -> BenchmarkConfig:
     return cfg
 
 
-def watch_memory(row: dict[str, float]) -> None:
-    """Keep the largest memory of this process and its children in `row`."""
-    own = psutil.Process()
-    while True:
+def watch_memory(row: dict[str, float], finished: threading.Event) -> None:
+    """Keep the largest summed memory of this process and its children in `row`, until `finished` is
+    set."""
+    parent = psutil.Process()
+    while not finished.wait(0.5):
         total = 0
-        for process in (own, *own.children(recursive=True)):
+        for process in (parent, *parent.children(recursive=True)):
             with suppress(psutil.NoSuchProcess):
                 total += process.memory_info().rss
         row["peak GiB"] = max(row["peak GiB"], total / 2**30)
-        time.sleep(0.5)
 
 
 def measure(scenes: int, folder: Path, workers: int) -> dict[str, float]:
-    """Build a benchmark, print its records, and return the measurements."""
+    """Build a benchmark, print how many records it has, and return the measurements."""
     cfg = scale_preset(scenes)
     if (folder / cfg.name).exists():
         raise SystemExit(
-            f"error: {folder / cfg.name} is already built: delete it to build it again"
+            f"error: {folder / cfg.name} exists, so its build cannot be measured: delete it first"
         )
     row = {"scenes": scenes, "peak GiB": 0.0}
-    threading.Thread(target=watch_memory, args=[row], daemon=True).start()
+    finished = threading.Event()
+    threading.Thread(target=watch_memory, args=[row, finished], daemon=True).start()
 
     def timed(name: str) -> Callable[..., Any]:
         stage = getattr(build, name)
@@ -90,6 +93,7 @@ def measure(scenes: int, folder: Path, workers: int) -> dict[str, float]:
 
     with patch.multiple(build, **{name: timed(name) for name in STAGES}):
         build.build(cfg, folder / cfg.name, Workers(workers), strict=True)
+    finished.set()
     store = open_store(folder / cfg.name)
     print(summarize_store(store))
     row["counterfactual"] = len(list(store.folder.glob("scenes/*-without-*.npz")))

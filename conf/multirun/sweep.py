@@ -1,4 +1,4 @@
-"""Runs the jobs of a sweep that are not finished, and prints their table."""
+"""Run the unfinished jobs of a sweep, and print the table of all its jobs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 LAUNCHERS = ("process", "submitit_local", "submitit_slurm")
 PARENT_ONLY = ("hydra.mode", "hydra.sweep", "hydra.launcher", "hydra/sweeper", "hydra/launcher")
-"""Hydra overrides that are not passed on to the jobs."""
+"""Beginnings of Hydra overrides that only the sweep itself uses. Jobs do not get these."""
 
 
 def run_sweep(command: str, schema: type, overrides: list[str]) -> None:
@@ -49,16 +49,16 @@ def run_sweep(command: str, schema: type, overrides: list[str]) -> None:
 
 
 class Sweep:
-    """The jobs of a sweep or a search, in numbered folders below the sweep's own.
+    """The jobs of a sweep or a search. Job N runs in folder N below the sweep's folder.
 
     Raises:
         SettingsError: The settings of a job are invalid.
 
     Attributes:
         hydra: Hydra's settings.
-        overrides: The swept and the fixed overrides of the jobs, by key.
-        jobs: The overrides of each job. A search chooses its own jobs; for it, these are jobs
-            that contain every value at least once, to check all values before the start.
+        overrides: The parsed overrides, swept and fixed ones, by key.
+        jobs: The overrides of each job. A search chooses its jobs while it runs, and uses these
+            only to check all listed values, and the ends of intervals, before it starts.
     """
 
     def __init__(self, command: str, schema: type, overrides: list[str]) -> None:
@@ -111,10 +111,10 @@ class Sweep:
         if len(jobs) > 1:
             log.info("sweep %s: %d jobs", self.folder, len(jobs))
         if first == 0:
-            # Jobs of an earlier, longer sweep are not part of this sweep's table.
+            # Remove the records of an earlier, longer sweep, which the table would show.
             for number in [old["job"] for old in read_jobs(self.folder) if old["job"] >= len(jobs)]:
                 (self.folder / str(number) / JOB_FILE).unlink()
-        unfinished = [job for job in jobs if not self._is_finished(job)]
+        unfinished = [job for job in jobs if not self._skip_if_finished(job)]
         launcher = instantiate(self.hydra.launcher, _convert_="all")
         with closing(launcher.run(unfinished)) as ended:
             for job, succeeded in ended:
@@ -129,8 +129,8 @@ class Sweep:
         command = [sys.executable, "-m", self.command, *overrides, run, *passed_on]
         return Job(self.folder / str(number), f"#{number} {title}", overrides, command)
 
-    def _is_finished(self, job: Job) -> bool:
-        """Whether the job has run to its end before, with the settings of this sweep."""
+    def _skip_if_finished(self, job: Job) -> bool:
+        """Return whether the job was completed earlier with the same settings; if so, record it."""
         if not (job.folder / "metrics.json").exists():
             return False
         settings = compose(self.command, self.schema, job.overrides)
@@ -142,7 +142,8 @@ class Sweep:
 
 
 def list_values(override: Override) -> list[str]:
-    """The override with each value of a sweep, or with both ends of an interval."""
+    """Return "key=value" for each swept value or for both ends of an interval; for another
+    override, return the override alone."""
     key = override.get_key_element()
     if override.is_interval_sweep():
         interval = override.value()

@@ -21,13 +21,13 @@ ROUTES = ("cot_text", "predict_caption", "predict_image")
 
 @dataclass
 class ItemsCommand(CommandConfig):
-    """Settings of the commands that measure selection items."""
+    """Settings of the commands that measure models on selection items."""
 
     limit: int | None = setting(None, least=1)
     """Maximum number of test items, spread evenly over the families; null uses all."""
     suite: str | None = setting(None, ("matched_anchor", None))
-    """matched_anchor measures the pairs of items that differ only in the question's anchor (event
-    or time); null measures the benchmark's standard items."""
+    """matched_anchor uses pairs of items that differ only in how the question names the target's
+    moment: by an event or by a time. null uses the benchmark's standard items."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         if self.suite == "matched_anchor" and self.limit == 1:
@@ -42,15 +42,15 @@ class GenerationCommand(CommandConfig):
     student: StudentConfig = MISSING
     server: ServerConfig = field(default_factory=ServerConfig)
     train: SftTrainConfig = field(default_factory=SftTrainConfig)
-    """The preset's training recipe. A base uses only its precision and, in evaluation.select, its
-    regime's prompt."""
+    """Training settings of the preset. For a base, only the precision is used and, in
+    evaluation.select, the regime, which determines the prompt."""
     model: str | None = None
-    """Run folder of train.sft or folder that train.export wrote, with its own student and recipe;
-    null measures the student's base."""
+    """Folder of a run of train.sft or of an export. Its saved settings replace `student` and
+    `train`. null measures the base that `student` names."""
     batch: int = setting(16, least=1)
-    """Items, queries or frames per forward pass."""
+    """Number of items, queries or frames that are generated for together; not used with servers."""
     seed: int = setting(0, least=0)
-    """Seed of every sample: of items, of responses and of the bootstrap."""
+    """Seed for sampling items and responses, and for the bootstrap."""
 
 
 @dataclass
@@ -58,11 +58,11 @@ class SelectCommand(GenerationCommand, ItemsCommand):
     modes: list[str] | None = None
     """Response modes to measure: reasoning (rationale, then answer), answer (only the answer),
     record (structured record) and constrained (record, with decoding constrained to its JSON
-    schema). null uses the modes that the student was trained in; for a base, record and
+    schema). null uses the modes that the student was trained in and, for a base, record and
     constrained."""
     control: str | None = setting(None, ("candidate_only", "shuffled_prefix", None))
-    """candidate_only leaves out the prefix, shuffled_prefix shuffles its frames; each control is
-    measured in addition to the unchanged items. null measures only the unchanged items."""
+    """candidate_only leaves out the prefix, shuffled_prefix shuffles its frames. The unchanged
+    items are measured too. null measures only the unchanged items."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)
@@ -71,16 +71,17 @@ class SelectCommand(GenerationCommand, ItemsCommand):
 
 @dataclass
 class EmbedderConfig(Settings):
-    """A retriever to measure, or the frozen encoder that matches texts to the database."""
+    """A retriever to measure or, in evaluation.two_stage, to match generated texts to the
+    database."""
 
     retriever: RetrieverConfig = MISSING
     train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
-    """The preset's training recipe, of which only the precision is used."""
+    """Training settings of the preset, of which only the precision is used."""
     model: str | None = None
-    """Run folder of train.contrastive or folder that train.export wrote, with its own retriever and
-    recipe; null uses the preset's released model."""
+    """Folder of a run of train.contrastive or of an export. Its saved settings replace `retriever`
+    and `train`. null uses the model that `retriever` names, without training."""
     batch: int = setting(64, least=1)
-    """Queries, prefixes, texts or frames per forward pass."""
+    """Number of queries, prefixes, texts or frames that are embedded together."""
 
 
 @dataclass
@@ -89,7 +90,7 @@ class EmbeddingCommand(EmbedderConfig, CommandConfig):
 
     benchmark: BenchmarkConfig = MISSING
     seed: int = setting(0, least=0)
-    """Seed of every sample, including the bootstrap's."""
+    """Seed for sampling items and for the bootstrap."""
 
 
 @dataclass
@@ -105,11 +106,11 @@ class SimilarityCommand(ItemsCommand, EmbeddingCommand):
 @dataclass
 class ReportCommand(CommandConfig):
     runs: list[str] | None = None
-    """Run folders below `checkpoints`, or patterns of them, such as [select/cot,retrieve/*]; null
+    """Run folders below `checkpoints`, or glob patterns, such as [select/cot,retrieve/*]; null
     reports every finished run."""
     items: int = setting(120, least=0)
-    """Maximum number of items of a benchmark on the page, spread over the subtypes and over right
-    and wrong answers."""
+    """Maximum number of items shown per benchmark, spread over the subtypes and over correct and
+    wrong answers."""
     seed: int = setting(0, least=0)
     """Seed of the sample of these items."""
 
@@ -126,9 +127,9 @@ class TwoStageCommand(GenerationCommand):
     matcher: EmbedderConfig = field(default_factory=EmbedderConfig)
     routes: list[str] | None = None
     """Routes to measure: cot_text (the future state in a rationale, matched to frames),
-    predict_caption (a description of the future frame, matched to the same model's descriptions of
-    the database's frames) and predict_image (that description, matched to frames). null uses
-    cot_text for a student, and all three for a base."""
+    predict_caption (a description of the future frame, matched to the same model's captions of the
+    database's frames) and predict_image (a description of the future frame, matched to frames).
+    null uses cot_text for a student, and all three for a base."""
 
     def find_problems(self, group: str) -> list[str]:
         return check_choices("routes", self.routes, ROUTES)
@@ -146,7 +147,7 @@ class StudyCommand(CommandConfig):
     """Practice items from the training split, which each annotator answers first, with feedback and
     without a score."""
     rest_every: int = setting(20, least=1)
-    """Items after which an annotator is offered a break."""
+    """Number of items between two breaks."""
     seed: int = setting(0, least=0)
     """Seed of the sample of items and of each annotator's order of items and candidates."""
     host: str = "127.0.0.1"
@@ -165,7 +166,7 @@ class StudyCommand(CommandConfig):
 
     def find_problems(self, group: str) -> Iterator[str]:
         if not self.items or (self.items.isdecimal() and int(self.items) == 0):
-            yield f"items={self.items} selects no item: give a number or a file"
+            yield f"items={self.items} selects no item: give a number above 0, or a file"
         if not 0 < self.port < 65536:
             yield f"port={self.port} is not a port: give a number from 1 to 65535"
         example = "such as https://study.example.org"

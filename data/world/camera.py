@@ -1,4 +1,4 @@
-"""A pinhole camera, and the view of scenes: camera, floor and light."""
+"""A pinhole camera, and the view of a scene: its camera, floor colour and light."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera that looks at the origin, with z up; the defaults fit CLEVRER's release."""
+    """A pinhole camera that looks at the origin of the world, whose z axis points up. The defaults
+    approximate the camera of the CLEVRER dataset."""
 
     width: int = 480
     height: int = 320
     focal: float = 525.0
+    """Focal length, px."""
     eye: tuple[float, float, float] = (4.3301, 0.0, 2.5)
+    """Position of the camera in the world."""
 
     @cached_property
     def axes(self) -> np.ndarray:
@@ -26,17 +29,18 @@ class Camera:
         return np.stack([right, np.cross(forward, right), forward])
 
     def sized(self, width: int, height: int) -> Camera:
-        """This camera at another resolution."""
+        """Return this camera at another resolution, with the same horizontal field of view."""
         return replace(self, width=width, height=height, focal=self.focal * width / self.width)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project world points (..., 3) to px (..., 2) and depths (...) along the optical axis."""
+        """Return the pixel coordinates (..., 2) of world points (..., 3), and their depths (...)
+        along the optical axis."""
         local = (points - np.asarray(self.eye)) @ self.axes.T
         depth = local[..., 2]
-        # A point behind the camera has no image; its projection stays finite and far outside.
-        safe = np.maximum(depth, 1e-3)
+        # Points behind the camera get finite coordinates.
+        clamped = np.maximum(depth, 1e-3)
         centre = np.array([self.width / 2, self.height / 2])
-        return centre + self.focal * local[..., :2] / safe[..., None], depth
+        return centre + self.focal * local[..., :2] / clamped[..., None], depth
 
     def rays(self, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """(P, 3) world directions through the centres of P pixels, not normalised."""
@@ -50,11 +54,11 @@ class View:
     """The camera, floor colour and light of scenes."""
 
     camera: Camera = Camera()
-    """Its eye must lie in the x-z plane."""
+    """`eye` must lie in the x-z plane: the floor is shaded by image rows."""
     floor: tuple[float, float, float] = (158.0, 156.0, 152.0)
-    """RGB colour of the fully lit floor, 0 to 255."""
+    """RGB colour of the floor at brightness 1, 0 to 255."""
     light: tuple[float, float, float] = (3.0, 3.0, 6.0)
-    """Position of the lamp."""
+    """Direction towards the light. Blender's scenes have lamps of their own."""
 
 
 STANDARD_VIEW = View()

@@ -1,4 +1,4 @@
-"""VLM2Vec: adapters over Qwen2-VL that make one embedding of a clip or an image and a text."""
+"""VLM2Vec: Qwen2-VL with adapters, which embeds a clip or an image together with a text."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ TEMPLATE = (
     "{%- endfor -%}"
     "{{ parts.media + parts.texts | join(' ') }}"
 )
-"""The training format: no roles; the medium's bare token, the instruction, the text."""
+"""Format of VLM2Vec's training: the placeholder token of the image or video, the instruction and
+the text, without roles or start and end tokens."""
 
 
 def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer:
-    """Load VLM2Vec, whose embedding is the normalised state of the last token."""
+    """Load VLM2Vec, whose embedding is the L2-normalised last hidden state of the last token."""
     origin = {"revision": preset.revision, "trust_remote_code": preset.trust_remote_code}
     with reading_model(preset.model):
         backbone = Transformer(
@@ -44,7 +45,7 @@ def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer
     if config.model_type != "qwen2_vl":
         raise UserError(
             f"retriever.model={preset.model} ({config.model_type}) is not a VLM2Vec over Qwen2-VL: "
-            "set VLM2Vec/VLM2Vec-V2.0, or another retriever.encoder",
+            "set retriever.model=VLM2Vec/VLM2Vec-V2.0, or another retriever.encoder",
             code="wrong-model-type",
         )
     check_processor("retriever", preset.model, config, backbone.processor)
@@ -58,10 +59,11 @@ def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer
 
 
 def use_text_positions(module: Any, args: tuple[dict[str, Any]]) -> None:
-    """A forward pre-hook that numbers a medium's positions like those of text.
+    """Give the tokens of images and videos sequential positions, as those of text; a forward
+    pre-hook.
 
-    The model was trained without a medium's start token, and so without spatial positions; newer
-    versions of transformers would assign some.
+    VLM2Vec was trained without vision start tokens, so its images and videos had no spatial
+    positions. Newer versions of transformers would assign spatial positions.
     """
     (features,) = args
     if "mm_token_type_ids" in features:

@@ -15,7 +15,7 @@ from models.precision import resolve_precision
 from models.student.generation import response_token_limit
 from models.student.prompts import Sample, instruction, selection_sample
 
-INPUTS = 1
+PROMPT_VERSION = 1
 """Version of the prompt layout. Increment it when the layout changes, so that earlier responses are
 not reused."""
 
@@ -25,7 +25,8 @@ class Generator(Protocol):
 
     Attributes:
         name: Name of the model in tables.
-        revision: Values that identify the weights. Responses are reused only for an equal revision.
+        revision: Values that identify the weights. Stored responses are reused only if the revision
+            is equal.
     """
 
     name: str
@@ -34,8 +35,8 @@ class Generator(Protocol):
     def respond(
         self, mode: str, sample_of: SampleOf, subjects: list[Subject], save: SaveResponses
     ) -> None:
-        """Respond to the prompt `sample_of(subject)` of each subject, and save responses as they
-        finish.
+        """Respond to the prompt `sample_of(subject)` of each item, query or frame, and pass
+        finished responses to `save`.
 
         Raises:
             UserError: Memory runs out, no server responds, or a subject gets no response.
@@ -51,11 +52,11 @@ def open_generator(
 
     Args:
         folder: The run or export of a trained student; None for a base.
-        trained: The settings of that run; for a base, those of the command.
+        trained: The settings of the student's run; for a base, `cfg`.
 
     Raises:
         UserError: The base is not the one that the student was trained on, no server responds, or
-            `server.model` is not the model that `cfg` selects.
+            the servers do not serve `server.model`, or serve different models under this name.
     """
     if cfg.server.url is not None:
         from evaluation.generators.openai_server import ServedModel
@@ -67,7 +68,8 @@ def open_generator(
 
 
 def item_instruction(mode: str, regime: str) -> str:
-    """Return the instruction of a selection item in a mode, for a training regime."""
+    """Return the instruction that ends a prompt in `mode`. `regime` is the training regime, which
+    determines the requested sections of a rationale."""
     return record_instruction() if mode in RECORD_MODES else instruction(mode, regime)
 
 
@@ -79,7 +81,7 @@ def item_sample(
     mode: str,
     item: SelectionItem,
 ) -> Sample:
-    """Return the prompt of a selection item in a mode, for a training regime."""
+    """Return the prompt for `item` in `mode`, with the instruction of the training regime."""
     text = item_instruction(mode, regime)
     return selection_sample(item, mode, regime, frames, cfg.frames, control=control, text=text)
 
@@ -93,7 +95,8 @@ def response_settings(
     benchmark: str,
     control: str | None,
 ) -> dict[str, Any]:
-    """Return everything except the subject that a response in a mode depends on."""
+    """Return all settings that determine a response in `mode`, apart from the item, query or frame
+    itself."""
     sampling: dict[str, Any] = {
         "max_new_tokens": response_token_limit(mode, student.max_new_tokens, student.thinking),
         "thinking": student.thinking,
@@ -106,7 +109,7 @@ def response_settings(
         "benchmark": benchmark,
         "control": control,
         "prompt": item_instruction(mode, regime),
-        "inputs": INPUTS,
+        "inputs": PROMPT_VERSION,
         "frames": student.frames,
         "image_size": student.image_size,
         "schema": schema() if mode == "constrained" else None,

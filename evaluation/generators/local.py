@@ -23,7 +23,12 @@ from models.fingerprints import model_id, pin_revisions, processor_digest, weigh
 from models.memory import explain_out_of_memory
 from models.resolved import check_base
 from models.student.collator import Collator
-from models.student.generation import THOUGHT, generate, response_token_limit, sampling_processors
+from models.student.generation import (
+    THOUGHT_TAG,
+    generate,
+    response_token_limit,
+    sampling_processors,
+)
 from models.trained_runs import product_folder, run_title
 
 
@@ -92,7 +97,7 @@ class LocalModel:
                 texts = generate(model, processor, inputs, limit, self._precision, steps)
             if grammar is not None:
                 # A response that is a record from its first token on holds no thought.
-                texts = [replace(t, text=t.text.removeprefix(THOUGHT)) for t in texts]
+                texts = [replace(t, text=t.text.removeprefix(THOUGHT_TAG)) for t in texts]
             save(list(zip(group, texts, strict=True)))
 
 

@@ -20,7 +20,7 @@ from conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageComm
 from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
 from evaluation.generators.response_schema import schema
 from models.fingerprints import processor_digest, weights_digest
-from models.student.generation import THOUGHT, GeneratedText, response_token_limit
+from models.student.generation import THOUGHT_TAG, GeneratedText, response_token_limit
 from models.student.prompts import Clip, Sample
 from models.trained_runs import product_folder, run_title
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
@@ -204,9 +204,9 @@ def restore_thought(response: Response, starts_in_thought: bool) -> GeneratedTex
     """
     text = response.text
     if response.reasoning:
-        text = f"{THOUGHT}{response.reasoning}" + (f"</think>{text}" if text else "")
-    elif starts_in_thought and THOUGHT not in text:
-        text = f"{THOUGHT}{text}"
+        text = f"{THOUGHT_TAG}{response.reasoning}" + (f"</think>{text}" if text else "")
+    elif starts_in_thought and THOUGHT_TAG not in text:
+        text = f"{THOUGHT_TAG}{text}"
     return GeneratedText(text, response.flaw == TRUNCATED)
 
 

@@ -23,9 +23,9 @@ from models.student.prompts import Sample
 Subject = SelectionItem | RetrievalQuery | FrameRef
 """The item, query or frame that a response is about."""
 SampleOf = Callable[[Subject], Sample]
-"""Builds the prompt about a subject."""
+"""Returns the prompt for a subject."""
 SaveResponses = Callable[[list[tuple[Subject, GeneratedText]]], None]
-"""Saves the responses of a batch as soon as it is finished."""
+"""Saves finished responses: those of a batch, or a single one of a server."""
 Respond = Callable[[list[Subject], SaveResponses], None]
 """Generates and saves the responses to subjects."""
 
@@ -35,7 +35,7 @@ RECORD_MODES = ("record", "constrained")
 
 @dataclass(frozen=True)
 class ModelResponse:
-    """A response in a mode.
+    """A model's response to a subject, generated in one mode.
 
     Attributes:
         item_id: Name of the item, query or frame.
@@ -54,7 +54,8 @@ class Answer(ModelResponse):
 
     Attributes:
         letter: The chosen letter; None if the response cannot be parsed.
-        reason: Why the letter is None.
+        reason: Why the response could not be parsed; None if it was.
+        right: Whether `letter` is the letter of the target.
         valid: Whether the structured record is valid; None in modes without a record.
     """
 
@@ -70,7 +71,8 @@ class Answer(ModelResponse):
 
 
 def score_response(subject: Subject, mode: str, generated: GeneratedText) -> ModelResponse:
-    """Return a response; one to an item is parsed, and its letter compared with the item's."""
+    """Return a response. If the subject is an item, parse the letter and compare it with the
+    correct one."""
     text, cut = generated.text, generated.cut
     if not isinstance(subject, SelectionItem):
         return ModelResponse(subject.name, mode, text, cut)
@@ -82,19 +84,22 @@ def score_response(subject: Subject, mode: str, generated: GeneratedText) -> Mod
 
 
 class ResponseLog:
-    """Responses in a file of JSON lines, each with the key (hash) of the settings of its mode.
+    """A JSON Lines file of responses. Each response has the hash of its mode's settings, its key.
 
-    `settings` has, by mode, all that a response depends on: the model's revision, the benchmark,
-    the prompt, the sampling and the seed. One line of the file records them with their key.
-    Responses under other keys stay in the file and are not used. A response's text is parsed and
-    scored again when it is read.
+    One line per mode records the settings and their key. Responses with other keys stay in the file
+    and are not used. The text of a response is parsed and scored again when it is read.
+
+    Args:
+        settings: For each mode, all that its responses depend on except the subject; see
+            `evaluation.generators.base.response_settings`.
+        subjects: Subjects whose responses are read.
     """
 
     def __init__(
         self, path: Path, settings: dict[str, dict[str, Any]], subjects: Sequence[Subject]
     ) -> None:
         self._path = path
-        self.keys = {mode: settings_key([mode, of_mode]) for mode, of_mode in settings.items()}
+        self.keys = {mode: settings_key([mode, values]) for mode, values in settings.items()}
         self._subject_of = {subject.name: subject for subject in subjects}
         rows = list(read_json_lines(path)) if path.exists() else []
         self.responses = self._score(rows)
@@ -104,12 +109,13 @@ class ResponseLog:
             for mode, key in self.keys.items()
             if key not in recorded
         ]
-        # A kill may have left an incomplete last line: end it.
-        torn = path.exists() and path.read_bytes()[-1:] not in (b"", b"\n")
-        self._write([*([""] if torn else []), *map(json.dumps, headers)])
+        # If the process was killed, the last line may be incomplete: terminate that line.
+        is_incomplete = path.exists() and path.read_bytes()[-1:] not in (b"", b"\n")
+        self._write([*([""] if is_incomplete else []), *map(json.dumps, headers)])
 
     def add_from(self, others: Iterable[Path]) -> int:
-        """Add the responses of other logs under the same keys, and return their number."""
+        """Copy missing responses from other logs if their keys match. Return how many were
+        copied."""
         before = len(self.responses)
         for path in others:
             found = self._score(read_json_lines(path))
@@ -117,7 +123,8 @@ class ResponseLog:
         return len(self.responses) - before
 
     def _score(self, rows: Iterable[dict[str, Any]]) -> dict[tuple[str, str], ModelResponse]:
-        """Score the responses under this log's keys; a damaged one counts as missing."""
+        """Return the scored responses to this log's subjects with this log's keys, by (subject,
+        mode). Damaged rows are skipped."""
         responses = {}
         for row in rows:
             try:
@@ -144,7 +151,8 @@ class ResponseLog:
 def collect_responses(
     subjects: Sequence[Subject], mode: str, respond: Respond, log: ResponseLog, unit: str = "item"
 ) -> list[ModelResponse]:
-    """Return the response to each subject in `mode`, and generate those that the log lacks."""
+    """Generate the responses that are missing from the log, and return the response to each
+    subject. `unit` is the unit of the progress bar."""
     missing = [s for s in subjects if (s.name, mode) not in log.responses]
     done = len(subjects) - len(missing)
     with tqdm(total=len(subjects), initial=done, desc=mode, unit=unit) as bar:

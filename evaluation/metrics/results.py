@@ -20,19 +20,20 @@ if TYPE_CHECKING:
 RECALLS = (1, 10, 50)
 """Cut-offs of the reported recalls."""
 COMPARED = (*(f"recall@{k}" for k in RECALLS), "mrr")
-"""Measures by which retrievers are compared."""
+"""Measures of the differences between retrievers."""
 MEASURES = (*COMPARED, "median_rank", "tie_rate")
 UNTRAINED = "untrained"
-"""Prefix of the names of retrievers without adapters."""
+"""Prefix of the names of Qwen3-VL retrievers that this project has not trained."""
 SIMILARITY = "similarity"
-"""The mode of a retriever that chooses the nearest candidate."""
+"""Mode of the results of `evaluation.similarity`: a retriever chooses the nearest candidate."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy of each family that has items, their plain mean (macro) and that of all items."""
+    """Accuracy of each family that has items, the mean over these families (`macro`) and the
+    accuracy over all items (`micro`)."""
 
     families: dict[str, Interval]
     macro: float
@@ -44,7 +45,8 @@ def accuracy_by_group(groups: Sequence[str], credits: Sequence[float]) -> dict[s
 
     Args:
         groups: One name per item, such as its family, subtype or horizon.
-        credits: One credit per item: a bool, or the 1/m of a tie among m candidates.
+        credits: One credit per item, 0 to 1: 1 if correct, 1/m if the target and m - 1 other
+            candidates have the highest score.
     """
     groups, credits = np.asarray(groups, str), np.asarray(credits, float)
     return {str(g): mean_with_wilson(credits[groups == g]) for g in np.unique(groups)}
@@ -60,18 +62,19 @@ def accuracy_by_family(families: Sequence[str], credits: Sequence[float]) -> Acc
 
 @dataclass(frozen=True)
 class SelectionResult:
-    """Accuracy of one model on the selection items of one benchmark, in shares.
+    """Accuracy of one model on the selection items of one benchmark, as fractions from 0 to 1.
 
     Answers that cannot be parsed count as wrong.
 
     Attributes:
-        mode: How the model was prompted, such as answer or reasoning, or similarity.
-        parse_rate: Share of parsed answers; None for a retriever.
+        mode: Response mode, such as "reasoning"; `SIMILARITY` for a retriever.
+        parse_rate: Fraction of the responses in which a letter was found; None for a retriever.
         n: Number of items.
         macro_interval: 95% interval of `macro`, bootstrapped over scenes.
-        horizons: Accuracy by horizon, nearest first: such as "8 frames" in the window family, and
-            "1 s" in the time family.
-        suite, control: As in `SelectCommand`; None for the benchmark's own items, unchanged.
+        horizons: Accuracy by horizon (time from the prefix to the target), shortest first. Keys
+            are such as "8 frames" (window family) and "1 s" (time family).
+        suite: The suite of the items; None for the standard items.
+        control: The control; None for unchanged items.
     """
 
     benchmark: str
@@ -93,7 +96,7 @@ class SelectionResult:
 
     @property
     def key(self) -> str:
-        """The key of its details in the report: the name of a retriever, or else the variant."""
+        """Key of this result's details in the report: `name` for a retriever, else `variant`."""
         return self.name if self.mode == SIMILARITY else self.variant
 
     @property
@@ -113,12 +116,13 @@ class SelectionReport:
     """report.json of evaluation.select and evaluation.similarity.
 
     Attributes:
-        build: Identity of the benchmark's build.
-        controls: Comparisons of controls with the unchanged items, and of matched-anchor pairs.
-        subtypes, readings, positions, calibration: Details by `SelectionResult.key`; `readings`
-            counts parsed answers and the reasons why others could not be parsed.
-        asked: (mode, control, key of the lines in answers.jsonl) of each variant; empty for
-            retrievers.
+        build: Hash that identifies the benchmark's build.
+        controls: Comparisons of the unchanged items with each control, and of the event question
+            with the time question of matched-anchor pairs.
+        subtypes, readings, positions, calibration: Details by `SelectionResult.key`. `readings`
+            counts parsed answers, valid records, and the reasons why responses could not be parsed.
+        asked: The mode, the control, and the `key` of the lines in answers.jsonl, for each variant;
+            empty for retrievers.
     """
 
     build: str
@@ -133,15 +137,14 @@ class SelectionReport:
 
 @dataclass(frozen=True)
 class RetrievalResult:
-    """Measures of one retriever at one width, with intervals bootstrapped over scenes.
-
-    Results that differ only in their time are equal.
+    """Measures of one retriever, or of a two-stage pipeline, at one width, with intervals
+    bootstrapped over scenes. Comparisons of results ignore `seconds`.
 
     Attributes:
-        width: Embedding width; None for a pipeline without widths.
-        builder: The queries' builder; None for all queries.
+        width: Embedding width.
+        builder: Number of the queries' builder; None for the queries of all builders.
         bytes: Size of the searched vectors at this width.
-        seconds: Time to rank for all queries, at all widths together.
+        seconds: Total time to rank the database for all queries at all widths.
     """
 
     benchmark: str
@@ -165,13 +168,13 @@ class RetrievalResult:
 
     @property
     def measures(self) -> dict[str, Interval]:
-        """The measures by the names of `evaluation.metrics.ranking`."""
+        """The measures by name, as `query_metrics` names them, such as "recall@1"."""
         return {name: getattr(self, name.replace("@", "_")) for name in MEASURES}
 
 
 @dataclass(frozen=True)
 class RetrieverDifference:
-    """Mean differences between two retrievers, left less right, over the same queries."""
+    """Mean differences between two retrievers, left minus right, over the same queries."""
 
     left: str
     right: str
@@ -189,7 +192,7 @@ class RetrievalReport:
 
 
 def from_json(kind: type[T], value: Any) -> T:
-    """Return parsed JSON as an object of a type, such as a dataclass of dataclasses.
+    """Convert parsed JSON to an instance of `kind`, such as a nested dataclass.
 
     Raises:
         ValueError: The value does not fit the type.
@@ -202,10 +205,8 @@ def from_json(kind: type[T], value: Any) -> T:
 def retrieval_results(
     benchmark: str, name: str, ranks: Ranks, queries: Sequence[RetrievalQuery], seed: int
 ) -> list[RetrievalResult]:
-    """Return one result per width, widest first, over all queries, and then the same per builder.
-
-    `seed` is that of the scene resampling for the intervals.
-    """
+    """Return one result per width, widest first, over all queries; then one per width for each
+    builder. `seed` is the seed of the bootstrap over scenes."""
     results = []
     for builder in (None, *sorted({q.builder for q in queries if q.builder})):
         indices = [k for k, q in enumerate(queries) if builder in (None, q.builder)]
@@ -224,10 +225,8 @@ def retrieval_results(
 def compare_retrievers(
     ranked: Mapping[str, Ranks], queries: Sequence[RetrievalQuery], seed: int
 ) -> list[RetrieverDifference]:
-    """Compare the first retriever with each other one, at every width.
-
-    `seed` is that of the scene resampling for the intervals.
-    """
+    """Compare the first retriever with each of the others, at every width. `seed` is the seed of
+    the bootstrap over scenes."""
     (left, first), *others = ranked.items()
     scenes = SceneBootstrap([q.scene_id for q in queries], seed)
     compared = []

@@ -1,7 +1,7 @@
 """A study's database: one SQLite file with its items, media, annotators and answers.
 
-Every change is one transaction that is on disk before the client is answered, so that the file is
-consistent at any time. One server writes; an export may read at the same time.
+Each change is one transaction, so the file is always consistent. A change is on the disk before the
+server replies to the browser. One server writes; an export may read at the same time.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 DATABASE = "study.sqlite"
 VERSION = 1
 MEDIA_PER_ITEM = 5
+"""The prefix and four candidates."""
 
 SCHEMA = """
 CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
@@ -62,9 +63,13 @@ def create(
     links: dict[str, str],
     assignments: Sequence[Assignment],
 ) -> sqlite3.Connection:
-    """Create a study without media. `links` are those of the annotators, by name; `assignments`
-    cover the items and the practice items."""
-    # SQLite gives its side files the mode of the database.
+    """Create a study without media.
+
+    Args:
+        links: The token in the personal link of each annotator, by name.
+        assignments: One for each annotator and item, practice items included.
+    """
+    # Only the owner may read the votes. SQLite's other files get the permissions of this one.
     path.touch(mode=0o600)
     path.chmod(0o600)
     db = _connect(path)
@@ -91,10 +96,10 @@ def create(
 
 
 def open_study(path: Path) -> sqlite3.Connection | None:
-    """Return the database of a study; None if there is none yet, or its creation was killed.
+    """Return the database of a study; None if it does not exist, or its creation was interrupted.
 
     Raises:
-        UserError: The database is damaged or of another version.
+        UserError: The database is damaged, locked, unreadable or of another version.
     """
     if not path.exists():
         return None
@@ -105,12 +110,19 @@ def open_study(path: Path) -> sqlite3.Connection | None:
         version = db.execute("PRAGMA user_version").fetchone()[0]
         if version != VERSION:
             raise UserError(
-                f"{path} has the format {version} of another release, this one reads {VERSION}: "
-                "resume it in that release, or start another study with run=NAME",
+                f"{path} has version {version}, but this release of DynaPix reads version "
+                f"{VERSION}: resume the study with the release that created it, or start another "
+                "study with run=NAME",
                 code="unknown-version",
             )
         if (damage := db.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
             raise sqlite3.DatabaseError(damage)
+    except sqlite3.OperationalError as error:
+        raise UserError(
+            f"{path} cannot be read ({error}): check its permissions, and that no other program "
+            "uses it",
+            code="unreadable-file",
+        ) from error
     except sqlite3.DatabaseError as error:
         raise UserError(
             f"{path} is damaged ({error}): delete its folder, or start another study with run=NAME",
@@ -121,7 +133,8 @@ def open_study(path: Path) -> sqlite3.Connection | None:
 
 @contextmanager
 def transaction(db: sqlite3.Connection, read_only: bool = False) -> Iterator[None]:
-    """Run the block completely or not at all. Read-only transactions do not block writers."""
+    """Commit the changes of the block at its end, or roll all of them back on an exception. A
+    read-only transaction does not block writers."""
     db.execute("BEGIN" if read_only else "BEGIN IMMEDIATE")
     try:
         yield
@@ -132,18 +145,18 @@ def transaction(db: sqlite3.Connection, read_only: bool = False) -> Iterator[Non
 
 
 def read_about(db: sqlite3.Connection) -> dict[str, str]:
-    """Return the name (`benchmark`) and the `identity` of the study's benchmark."""
+    """Return the name of the study's benchmark as `benchmark`, and its digest as `identity`."""
     return dict(tuple(row) for row in db.execute("SELECT key, value FROM about"))
 
 
 def item_ids(db: sqlite3.Connection, practice: bool) -> list[str]:
-    """Return the ids of the items or of the practice items, in the order of their choice."""
+    """Return the ids of the items or of the practice items, in the order of the study."""
     query = "SELECT item_id FROM item WHERE practice = ? ORDER BY place"
     return [row["item_id"] for row in db.execute(query, (practice,))]
 
 
 def items_without_media(db: sqlite3.Connection) -> list[str]:
-    """Return the ids of the items that lack a medium."""
+    """Return the ids of the items, practice included, that do not have all their media."""
     query = """
         SELECT item_id FROM item LEFT JOIN medium USING (item_id)
         GROUP BY item_id HAVING count(slot) <> ? ORDER BY place
@@ -158,13 +171,14 @@ def add_media(db: sqlite3.Connection, item_id: str, media: Sequence[Medium]) -> 
 
 
 def read_votes(db: sqlite3.Connection) -> pd.DataFrame:
-    """Return the votes in the order of their times, without practice: one row per annotator and
-    item.
+    """Return one row per annotator and answered item, without practice, ordered by the time of the
+    answer.
 
     `answer` and `choice` are the indices of the correct and the chosen candidate in the benchmark's
     order; `letter` is the chosen letter on the page, and `right` whether the choice is correct.
-    `seconds` (the server's clock) and `client_seconds` (the browser's) are measured from the moment
-    when the page was completely visible, the last one of `loads`. `answered` is in UTC.
+    `seconds` (the server's clock) and `client_seconds` (the browser's) start when all media of the
+    page are loaded; if it was loaded several times (`loads`), at the last time. `answered` is an
+    ISO 8601 time in UTC.
     """
     import pandas as pd
 

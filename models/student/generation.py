@@ -1,7 +1,7 @@
 """Generate text with a model that is loaded in this process.
 
-Tokens are sampled with one seed per response: a response then depends on its seed only, not on the
-other responses of its batch or on where a killed command resumed.
+Tokens are sampled with one seed per response, so that the sample does not depend on the other
+responses of its batch, or on where a killed command resumed.
 """
 
 from __future__ import annotations
@@ -24,19 +24,22 @@ from conf.schema import StudentConfig
 from models.loading import DTYPES
 
 ANSWER_TOKENS = 16
-"""Most new tokens in answer mode: the answer line, and some more for a malformed one."""
-THOUGHT, OPENING = "<think>", 8
-"""The tag that opens a thought, and how many of a prompt's last tokens are searched for it."""
+"""Maximum number of new tokens in answer mode: enough for the answer line, even a malformed one."""
+THOUGHT_TAG = "<think>"
+"""Opens a thought. A prompt may end with it."""
+TAG_SEARCH_TOKENS = 8
+"""Number of a prompt's last tokens that are searched for the tag."""
 
 
 def response_token_limit(mode: str, max_new_tokens: int, thinking: bool = False) -> int:
-    """Return how many tokens a response may have: few in answer mode without a thought."""
+    """Return the maximum number of new tokens: `ANSWER_TOKENS` in answer mode without thinking,
+    else `max_new_tokens`."""
     return ANSWER_TOKENS if mode == "answer" and not thinking else max_new_tokens
 
 
 @dataclass(frozen=True)
 class GeneratedText:
-    """A model's text, and whether generation stopped before its end."""
+    """A model's text, and whether the token limit cut it."""
 
     text: str
     cut: bool = False
@@ -48,56 +51,58 @@ def generate(
     inputs: dict,
     limit: int,
     precision: str,
-    steps: LogitsProcessorList | None = None,
+    processors: LogitsProcessorList | None = None,
 ) -> list[GeneratedText]:
     """Generate a response to each of a batch of left-padded prompts.
 
-    Decoding is greedy, on the logits that `steps` return.
+    Each new token has the largest logit after `processors` are applied; with those of
+    `sampling_processors` it is a sample.
 
     Args:
-        inputs: What `Collator` returns for samples without responses.
-        limit: Most new tokens of a response.
+        inputs: What `Collator` returns for samples without responses, all in one mode.
+        limit: Maximum number of new tokens of a response.
         precision: bf16 or fp32.
 
     Returns:
-        The texts; one whose prompt opens a thought begins with the opening tag.
+        The texts. If the prompts end with `THOUGHT_TAG`, the texts begin with it.
     """
     device = next(model.parameters()).device
     inputs = {name: value.to(device) for name, value in inputs.items() if name != "labels"}
     autocast = torch.autocast(device.type, DTYPES[precision], enabled=precision == "bf16")
-    # Inference mode would leave tensors in the model that cannot be trained on.
+    # Not torch.inference_mode: tensors that the model keeps could not be used in training later.
     with torch.no_grad(), autocast:
         ids = model.generate(
             **inputs,
             max_new_tokens=limit,
             do_sample=False,
             use_cache=True,
-            logits_processor=steps,
+            logits_processor=processors,
         )
     prompt, new = ids[:, : inputs["input_ids"].shape[1]], ids[:, inputs["input_ids"].shape[1] :]
     tokenizer = processor.tokenizer
-    opened = tokenizer.decode(prompt[0, -OPENING:]).rstrip().endswith(THOUGHT)
+    prompt_end = tokenizer.decode(prompt[0, -TAG_SEARCH_TOKENS:]).rstrip()
+    start = THOUGHT_TAG if prompt_end.endswith(THOUGHT_TAG) else ""
     texts = tokenizer.batch_decode(new, skip_special_tokens=True)
     ends = torch.tensor([tokenizer.eos_token_id, tokenizer.pad_token_id], device=new.device)
     ended = torch.isin(new, ends).any(dim=1) | (new.shape[1] < limit)
     return [
-        GeneratedText(f"{THOUGHT * opened}{text}", not end)
+        GeneratedText(start + text, not end)
         for text, end in zip(texts, ended.tolist(), strict=True)
     ]
 
 
 def sampling_processors(cfg: StudentConfig, seeds: Sequence[int]) -> LogitsProcessorList:
-    """Return logits processors that make greedy decoding sample, each row with its own seed; none
-    at temperature 0."""
-    steps = LogitsProcessorList()
+    """Return logits processors that turn greedy decoding into sampling, with one seed per row. The
+    list is empty at temperature 0."""
+    processors = LogitsProcessorList()
     if cfg.temperature:
-        steps.append(TemperatureLogitsWarper(float(cfg.temperature)))
+        processors.append(TemperatureLogitsWarper(float(cfg.temperature)))
         if cfg.top_k:
-            steps.append(TopKLogitsWarper(cfg.top_k))
+            processors.append(TopKLogitsWarper(cfg.top_k))
         if cfg.top_p < 1:
-            steps.append(TopPLogitsWarper(float(cfg.top_p)))
-        steps.append(GumbelNoise(seeds))
-    return steps
+            processors.append(TopPLogitsWarper(float(cfg.top_p)))
+        processors.append(GumbelNoise(seeds))
+    return processors
 
 
 class GumbelNoise(LogitsProcessor):

@@ -1,5 +1,5 @@
-"""Splits a section of a rationale into tags: noun phrases, regions and phrases of the
-vocabulary."""
+"""Split a section of a rationale into tags: noun phrases of objects, regions, phrases of
+phrases.yaml, candidates' letters and punctuation."""
 
 from __future__ import annotations
 
@@ -38,9 +38,10 @@ QUALITIES = STILL_WORDS | {
 """Adjectives allowed before an object's colour."""
 CANDIDATES = frozenset(LETTERS)
 EVENTS = {"pair", "collision", "contact", "course", "slight", "short", "layout", "scene", "motion"}
-"""Nouns and adjectives, besides those of an object, before which "A" is an article."""
+"""Nouns and adjectives that do not describe objects; an "A" that one of them follows is an
+article."""
 LISTED = {"candidate", "candidates", "image", "images", "option", "options", "layout", "answer"}
-"""Words that get no tag, and after which "A" is a candidate."""
+"""Words without a tag. An "A" that follows one of them is a candidate's letter."""
 PUNCTUATION = {
     **dict.fromkeys(".!?", "stop"),
     **dict.fromkeys(",()—–", "comma"),
@@ -84,7 +85,7 @@ class Tag(NamedTuple):
 BOUNDARIES = {"comma", "semicolon", "and", "break", "stop"}
 """Tags that may end a clause."""
 END = Tag("stop", "", 0, 0, "")
-"""Stands for every tag outside a sentence."""
+"""The tag at every index outside a sentence."""
 
 
 class Sentence:
@@ -102,21 +103,23 @@ class Sentence:
         return iter(self.tags)
 
     def skip(self, index: int, skipped: Container[str], step: int = 1) -> int:
-        """The index of the first tag from `index` on that is not in `skipped`."""
+        """Return the index of the first tag that is not in `skipped`, from `index` on in the
+        direction of `step`; an index outside the sentence if there is none."""
         while 0 <= index < len(self.tags) and self.tags[index].tag in skipped:
             index += step
         return index
 
     def find(self, index: int, wanted: Container[str], step: int = 1) -> int:
-        """The index of the first tag from `index` on that is in `wanted`; outside if there is
-        none."""
+        """Return the index of the first tag that is in `wanted`, from `index` on in the direction
+        of `step`; an index outside the sentence if there is none."""
         while 0 <= index < len(self.tags) and self.tags[index].tag not in wanted:
             index += step
         return index
 
 
 def find_tags(text: str, start: int, stop: int) -> list[Tag]:
-    """The tags of text[start:stop] in order. Words outside the vocabulary are tagged "word"."""
+    """Return the tags of text[start:stop] in order. Articles and `LISTED` words are left out; other
+    words without a meaning here get the tag "word"."""
     words, raw, spans = _split_words(text, start, stop)
     found: list[Tag] = []
     i = 0
@@ -132,8 +135,8 @@ def find_tags(text: str, start: int, stop: int) -> list[Tag]:
 def _split_words(
     text: str, start: int, stop: int
 ) -> tuple[list[str], list[str], list[tuple[int, int]]]:
-    """The words in lower case with "" behind the last, the words as written, and their spans.
-    "Doesn't" becomes "does" and "not"; other endings behind an apostrophe are dropped."""
+    """Return the words in lower case, followed by "", the words as written, and their spans.
+    "Doesn't" becomes "does" and "not"; other suffixes after an apostrophe are dropped."""
     words, raw, spans = [], [], []
     for match in WORD.finditer(text, start, stop):
         whole = match[0]
@@ -151,11 +154,11 @@ def _split_words(
 
 
 Found = tuple[str, str | Noun, int]
-"""A tag, its value, and the index of the word behind it."""
+"""A tag, its value, and the index of the next word."""
 
 
 def _tag_at(words: list[str], raw: list[str], i: int) -> Found:
-    """The tag that begins at word i."""
+    """Return the tag that begins at word i."""
     word = words[i]
     if word in PUNCTUATION:
         return PUNCTUATION[word], word, i + 1
@@ -174,15 +177,14 @@ def _tag_at(words: list[str], raw: list[str], i: int) -> Found:
 
 
 def _is_article(words: list[str], letter: str, i: int) -> bool:
-    """Whether an "A" is an article. In doubt it is a candidate, unlike in
-    `teacher.candidate_letters`: a letter taken for an article would assign the following claims to
-    another candidate."""
+    """Return whether an "A" is an article. An unclear "A" is a candidate's letter: if a letter were
+    taken for an article, the next claims would be about another candidate."""
     described = words[i + 1] in ADJECTIVES or words[i + 1] in EVENTS
     return letter == "A" and described and not (i > 0 and words[i - 1] in LISTED)
 
 
 def _find_noun(words: list[str], i: int) -> Found | None:
-    """A noun phrase for an object from word i on: "the stationary red cube"."""
+    """Return the noun phrase for an object that begins at word i, as "the stationary red cube"."""
     still = others = False
     while words[i] in ARTICLES or words[i] in QUALITIES:
         still |= words[i] in STILL_WORDS
@@ -201,12 +203,12 @@ def _find_noun(words: list[str], i: int) -> Found | None:
 
 
 def _find_region(words: list[str], i: int) -> Found | None:
-    """A region from word i on: "near the top-left", "to the upper left corner", "the center"."""
+    """Return the region that begins at word i: "near the top-left", "to the upper left corner"."""
     begin, way = i, "region"
     while words[i] in AT:
         way = WAYS.get(words[i], way)
         i += 1
-    prepared = i > begin
+    has_preposition = i > begin
     begin = i
     while words[i] in REGION_FILLERS:
         i += 1
@@ -230,7 +232,7 @@ def _find_region(words: list[str], i: int) -> Found | None:
     if words[i - 1] == "right" and noun in RIGHT_ONES:
         # "In the right place" is not a region.
         return None
-    if i == begin or not (named or corner or (prepared and (definite or middle))):
+    if i == begin or not (named or corner or (has_preposition and (definite or middle))):
         return None
     i += named
     if words[i] == "of":

@@ -1,4 +1,4 @@
-"""Merge a retriever into its base."""
+"""Merge the adapters of a trained retriever into its base."""
 
 from __future__ import annotations
 
@@ -23,30 +23,32 @@ from train.common.merge import ModelOutputs, open_benchmark
 from train.retriever.batches import split_queries
 
 MAX_QUERIES = 64
-"""Held-out queries that are compared, against the targets of all of them."""
+"""Maximum number of held-out queries. Each is scored against the targets of all these queries."""
 BATCH = 8
 
-Items = tuple[list[RetrievalQuery], FrameReader]
+HeldOut = tuple[list[RetrievalQuery], FrameReader]
 
 
 @dataclass(frozen=True)
 class RetrieverMerge:
-    """Compares embeddings of queries, relative to their size, and scores, relative to a query's
-    score with itself, because scores may all be close to zero.
+    """Merges a retriever, and computes its outputs before and after.
+
+    Differences of scores are relative to the score of a query with itself, because scores may all
+    be close to zero.
 
     Attributes:
-        settings: Of the training run.
+        settings: The settings of the training run.
         saved: The folder of the trained adapters.
     """
 
     settings: ContrastiveCommand
     saved: Path
     max_difference = 0.1
-    """Rounding to bf16 moves embeddings by 0.03 of their size where the adapters of a small
-    retriever weigh as much as its base."""
+    """Largest accepted relative difference. Rounding to bf16 causes up to 0.03 in small retrievers,
+    whose adapters change as much as their base gives."""
 
-    def held_out(self, root: Path, workers: int) -> Items:
-        """Return queries that measured the run, and the frames of its benchmark."""
+    def held_out(self, root: Path, workers: int) -> HeldOut:
+        """Return validation queries of the run, and a reader of the benchmark's frames."""
         settings, train = self.settings, self.settings.train
         store = open_benchmark(settings.benchmark, root, workers)
         _, queries = split_queries(
@@ -54,11 +56,12 @@ class RetrieverMerge:
         )
         return queries[:MAX_QUERIES], FrameReader(store, settings.retriever.image_size)
 
-    def trained_outputs(self, items: Items) -> ModelOutputs:
+    def trained_outputs(self, items: HeldOut) -> ModelOutputs:
         """Return the outputs of the adapters over their base."""
         settings = self.settings
         model = load_trained(settings.retriever, settings.train.precision, self.saved)
-        # Some CPUs round 4-bit products differently once the weights are packed for inference.
+        # Keep the 4-bit weights as trained: some CPUs round products of repacked weights
+        # differently, which would add to the measured difference.
         compat.keep_differentiable(model)
         return self._outputs(model, items)
 
@@ -73,20 +76,20 @@ class RetrieverMerge:
         load_head(model, self.saved)
         model.save_pretrained(str(folder), create_model_card=False)
 
-    def merged_outputs(self, folder: Path, items: Items) -> ModelOutputs:
+    def merged_outputs(self, folder: Path, items: HeldOut) -> ModelOutputs:
         """Return the outputs of the merged model in a folder."""
         return self._outputs(load_merged(folder, self.settings.retriever), items)
 
-    def _outputs(self, model: Retriever, items: Items) -> ModelOutputs:
+    def _outputs(self, model: Retriever, items: HeldOut) -> ModelOutputs:
         preset, (queries, frames) = self.settings.retriever, items
         targets = list(dict.fromkeys(q.target for q in queries))
-        rows, documents = (
-            pad_sequence(embed(model, some, frames, preset, BATCH), batch_first=True)
-            for some in (queries, targets)
+        embedded, documents = (
+            pad_sequence(embed(model, inputs, frames, preset, BATCH), batch_first=True)
+            for inputs in (queries, targets)
         )
-        scores = model.similarity(rows, documents)
+        scores = model.similarity(embedded, documents)
         return ModelOutputs(
-            values={"query": [rows], "score": [scores]},
+            values={"query": [embedded], "score": [scores]},
             choices={"best_frame": scores.argmax(dim=1).tolist()},
-            scales={"score": [model.similarity(rows, rows).diagonal()]},
+            scales={"score": [model.similarity(embedded, embedded).diagonal()]},
         )

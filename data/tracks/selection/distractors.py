@@ -17,15 +17,16 @@ from data.world.displacement import (
 )
 
 BUILDERS_VERSION = "5"
-"""Version of the item and query builders: changes whenever the same scenes would give others."""
+"""Version of the item and query builders. Increase it when a change makes the same scenes yield
+other items or queries."""
 
 Pool = tuple[Iterable[Candidate], int]
-"""Possible distractors, best first, and how many of them to use at most."""
+"""Possible distractors, best first, and the maximum number of them to use."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """The inclusive prefix of an item, its target frame, and the frame of its event, if any."""
+    """Frame indices of an item: its prefix (`stop` included), its target, and its event, if any."""
 
     start: int
     stop: int
@@ -33,7 +34,7 @@ class Timing:
     event: int | None = None
 
     def outside_prefix(self, frames: Iterable[int]) -> list[int]:
-        """The given frames outside the prefix; a model could recognise a frame that it has seen."""
+        """Return the frames that are outside the prefix: a model could recognise the others."""
         return [int(f) for f in frames if not self.start <= f <= self.stop]
 
 
@@ -42,7 +43,7 @@ class Family:
     """How the items of a family are made.
 
     Attributes:
-        cells: Construction cells by subtype.
+        cells: How to construct the items of each subtype.
         timings: Returns the timings that items of a subtype can have in a scene.
         make_item: Makes the item of a subtype at one of these timings, or returns None.
     """
@@ -57,11 +58,11 @@ class DistractorPicker:
     """Makes items whose candidates differ visibly from each other.
 
     Attributes:
-        min_displacement: Minimum displacement of some object between two candidates, px at
-            336 x 336.
+        min_displacement: Between any two candidates, at least one object must move by this many px
+            at 336 x 336.
         scene_ids: Scenes of the split; cross-scene distractors come from these.
         scene_of: Loads a scene by its id.
-        dropped: Number of targets that had too few such distractors.
+        dropped: Number of timings for which fewer than three distractors were found.
     """
 
     min_displacement: float
@@ -84,15 +85,17 @@ class DistractorPicker:
         """Make an item from the first distractors of each pool that differ by `min_displacement`.
 
         Args:
-            about: Indices of the objects that must differ; any object by default.
+            about: Indices of objects, of which at least one must move between two frames of the
+                scene; None for all objects. Frames of other scenes may differ in any object.
             fields: The question and the construction axes that apply.
 
         Returns:
             An item whose first candidate is the target (`data.tracks.quota.fill_quota` shuffles
-            them), or None where the pools have fewer than three such distractors.
+            them), or None if fewer than three candidates differ enough.
         """
         chosen = [Candidate(scene.scene_id, timing.target)]
         for k, (pool, count) in enumerate(pools):
+            # Stop if the remaining pools cannot complete the item.
             if len(chosen) + sum(most for _, most in pools[k:]) < 4:
                 break
             fitting = (
@@ -102,7 +105,7 @@ class DistractorPicker:
                     self._displacement(candidate, c, about) >= self.min_displacement for c in chosen
                 )
             )
-            # Lazy: each candidate is compared with those that were chosen before it.
+            # `fitting` is lazy, so each candidate is also compared with those of this loop.
             for candidate in islice(fitting, min(count, 4 - len(chosen))):
                 chosen.append(candidate)
         if len(chosen) < 4:
@@ -126,7 +129,8 @@ class DistractorPicker:
         )
 
     def sample_scenes(self, scene: Scene, rng: np.random.Generator, count: int) -> list[Scene]:
-        """Sample other scenes of the split, sorted by how many objects they share with `scene`."""
+        """Sample about `count` other scenes of the split. Scenes that share more objects with
+        `scene` come first."""
         names = rng.choice(self.scene_ids, min(count + 1, len(self.scene_ids)), replace=False)
         scenes = [self.scene_of(str(name)) for name in names if name != scene.scene_id]
         return sorted(scenes, key=lambda s: -len({*scene.objects} & {*s.objects}))
@@ -143,10 +147,10 @@ class DistractorPicker:
 def balance_in_time(
     pool: Iterable[Candidate], target: int, rng: np.random.Generator
 ) -> tuple[Pool, Pool, Pool]:
-    """Divide a scene's pool so that a random number of distractors, 0 to 3, precede the target.
+    """Return frames before the target, of which 0 to 3 (a random number) are used, frames after it
+    for the rest, and all frames, in case too few of the others differ enough.
 
-    Otherwise the order of the candidates in time would reveal the answer. The last pool is used
-    where the other two have too few frames.
+    Otherwise the order of the candidates in time would reveal the answer.
     """
     pool = list(pool)
     earlier = int(rng.integers(4))
@@ -156,14 +160,15 @@ def balance_in_time(
 
 
 def visible_objects(scene: Scene, timing: Timing) -> tuple[int, ...]:
-    """Indices of the objects on screen in a prefix.
+    """Return the indices of the objects that are on screen in at least one frame of the prefix.
 
-    Only these may distinguish candidates, because the entry of another object is unpredictable.
+    Within a scene only these may distinguish candidates: a model cannot predict that another object
+    enters.
     """
     on_screen = on_screen_positions(scene)[1][timing.start : timing.stop + 1]
     return tuple(np.flatnonzero(on_screen.any(axis=0)).tolist())
 
 
 def scene_candidates(scene: Scene, frames: Iterable[int], source: str) -> Iterator[Candidate]:
-    """Frames of a scene as candidates of one source."""
+    """Yield frames of a scene as candidates of one source."""
     return (Candidate(scene.scene_id, int(frame), source) for frame in frames)

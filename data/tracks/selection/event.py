@@ -1,7 +1,8 @@
 """The event family: which frame shows the scene at, or just after, a collision.
 
-Framing *future*: the prefix ends `gap` frames before the collision and the target is the event
-frame. Framing *contact*: the prefix ends at the collision and the target is `gap` frames later.
+Framing *future*: the prefix ends `gap` frames before the collision, and the target is the frame of
+the collision. Framing *contact*: the prefix ends at the collision, and the target is `gap` frames
+later.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ from data.world.displacement import object_match_scores
 from data.world.events import collision_frames
 
 QUESTION = "Which image is closest to the correct future state of the whole scene?"
-PREFIX_STEP = 20
-"""Frames from the prefix's start to its end."""
+PREFIX_SPAN = 20
+"""Difference between the last and the first frame index of a prefix."""
 TAIL = 10
-"""Least number of frames between the target and the clip's end."""
+"""Minimum number of frames after the target."""
 OFFSETS = (16, 32, 48)
 """Offsets of same-scene distractors from the target, in frames on either side."""
 CROSS_SCENES = 24
-"""Other scenes sampled for cross-scene distractors."""
+"""Number of scenes to sample for cross-scene distractors."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +55,14 @@ CELLS = {
 
 
 def timings(subtype: str, scene: Scene) -> list[Timing]:
-    """The scene's collisions that leave room for prefix and target, in order."""
+    """Return a timing for each collision that leaves room for the prefix, the target and
+    `TAIL`."""
     cell = CELLS[subtype]
     lead = cell.gap if cell.framing == "future" else 0
     return [
-        Timing(stop - PREFIX_STEP, stop, stop + cell.gap, event)
+        Timing(stop - PREFIX_SPAN, stop, stop + cell.gap, event)
         for event in collision_frames(scene)
-        if (stop := event - lead) >= PREFIX_STEP and stop + cell.gap <= scene.frames - 1 - TAIL
+        if (stop := event - lead) >= PREFIX_SPAN and stop + cell.gap <= scene.frames - 1 - TAIL
     ]
 
 
@@ -91,7 +93,8 @@ def make_item(
 def _wrong_frames(
     cell: EventCell, scene: Scene, timing: Timing, rng: np.random.Generator
 ) -> Iterable[int]:
-    """Frames at fixed offsets from the target in random order, or the most similar ones first."""
+    """Return frames outside the prefix: for same_offset those at `OFFSETS` from the target in
+    random order, else all frames, the most similar to the target first."""
     target = timing.target
     if cell.distractors == "same_offset":
         pool = [f for o in OFFSETS for f in (target - o, target + o) if 0 <= f < scene.frames]

@@ -1,4 +1,4 @@
-"""The time family: which frame shows the scene one or two seconds after the observation ends."""
+"""The time family: which frame shows the scene one or two seconds after the prefix ends."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from data.tracks.selection.distractors import (
 )
 
 CELLS = {"in_1s": 1, "in_2s": 2}
-"""Seconds from the observation's end to the target, by subtype."""
+"""Seconds between the prefix and the target, by subtype."""
 
 
 def spell_seconds(count: int) -> str:
@@ -30,7 +30,7 @@ def question(seconds: int) -> str:
 
 
 def timings(subtype: str, scene: Scene) -> list[Timing]:
-    """The prefix is the scene's first second."""
+    """Return the single timing of a scene, whose prefix is the first second."""
     return [Timing(0, SELECTION_SECOND - 1, SELECTION_SECOND * (1 + CELLS[subtype]))]
 
 
@@ -39,7 +39,7 @@ def make_item(
 ) -> SelectionItem | None:
     """Make an item whose distractors are other frames after the prefix.
 
-    The question and the subtype state the whole seconds from the prefix's end to the target.
+    The question and the subtype state the seconds from the prefix to the target, rounded down.
     """
     horizon = timing.target - timing.stop
     seconds = horizon // SELECTION_SECOND

@@ -1,9 +1,10 @@
-"""The window family: which frame shows the scene a short horizon after the observation.
+"""The window family: which frame shows the scene a short horizon after the prefix.
 
-A cell has a group (future events), a family, a horizon in frames and a difficulty. The family names
-the objects that an item is about (A: the whole scene, B: the pair of the next collision, C: the
-object that moves most). Hard items take the distractors most similar to the target, easy ones a
-random part of the less similar half. Similarity and displacement count those objects alone.
+A cell has a group (of events, see `window_group`), a window family, a horizon in frames and a
+difficulty. The window family selects the objects that an item is about, among the objects on screen
+in the prefix (A: all, B: the pair of the next collision, C: the object that moves most). Similarity
+and the minimum displacement are computed for these objects only. Distractors of hard items are the
+frames most similar to the target; those of easy items are random frames of the less similar half.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ CELLS = {
 
 
 def timings(subtype: str, scene: Scene) -> list[Timing]:
-    """Every window of the cell's horizon, whatever its group."""
+    """Return all timings with the horizon of the cell. `make_item` rejects other groups."""
     horizon = CELLS[subtype].horizon
     stops = range(PREFIX_FRAMES - 1, scene.frames - horizon)
     return [Timing(stop - PREFIX_FRAMES + 1, stop, stop + horizon) for stop in stops]
@@ -55,8 +56,8 @@ def timings(subtype: str, scene: Scene) -> list[Timing]:
 def make_item(
     subtype: str, scene: Scene, timing: Timing, rng: np.random.Generator, picker: DistractorPicker
 ) -> SelectionItem | None:
-    """Make an item at a window; None if the window is of another group, or if its prefix shows none
-    of the objects that the item is about."""
+    """Make an item at a timing; None if the timing has another group, or if none of the objects
+    that the item is about is on screen in the prefix."""
     cell = CELLS[subtype]
     if window_group(scene, timing.start, timing.stop, cell.horizon) != cell.group:
         return None
@@ -69,8 +70,7 @@ def make_item(
     frames = np.array(timing.outside_prefix(similar[similar != timing.target]))
     source = "same_near"
     if cell.difficulty == "easy":
-        # A random order, because the most different frames are neighbours of each other, which
-        # would make the target the odd one out.
+        # Shuffle: the most different frames are consecutive, so the target would stand out.
         frames, source = rng.permutation(frames[len(frames) // 2 :]), "same_far"
     return picker.make_item(
         scene,
@@ -86,9 +86,9 @@ def make_item(
 
 
 def subject_objects(cell: WindowCell, scene: Scene, timing: Timing) -> tuple[int, ...] | None:
-    """Indices of the objects that an item is about.
+    """Return the indices of the objects that an item is about; None for all objects.
 
-    None stands for the whole scene; the tuple is empty where the window has no such object.
+    The tuple is empty if no collision follows (B) or no object on screen moves (C).
     """
     stop, target = timing.stop, timing.target
     if cell.window_family == "A":

@@ -49,7 +49,13 @@ def test_a_damaged_study_is_refused(path, content) -> None:
         storage.open_study(path)
 
 
-def test_only_the_owner_can_read_a_study_and_its_side_files(tmp_path) -> None:
+def test_an_unreadable_study_is_not_called_damaged(tmp_path) -> None:
+    (tmp_path / storage.DATABASE).mkdir()
+    with raises_user_error("unreadable-file"):
+        storage.open_study(tmp_path / storage.DATABASE)
+
+
+def test_only_the_owner_can_read_the_files_of_a_study(tmp_path) -> None:
     before = os.umask(0)
     try:
         db = storage.create(tmp_path / storage.DATABASE, {}, [], [], {"A1": "link"}, [])
