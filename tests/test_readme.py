@@ -1,4 +1,5 @@
-"""The commands in README.md and docs/ compose and name runs that other commands there produce."""
+"""The commands in README.md and docs/ have valid settings, and other commands there produce the
+runs that they name."""
 
 from __future__ import annotations
 
@@ -29,7 +30,7 @@ def run_folder(command: str, overrides: list[str]) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("command", "overrides"), COMMANDS, ids=lambda v: str(v).replace("/", "-"))
-def test_a_command_composes(command: str, overrides: list[str]) -> None:
+def test_settings_of_a_documented_command_are_valid(command: str, overrides: list[str]) -> None:
     check = Sweep if "-m" in overrides else preflight
     settings = [o.replace("=RUN", "=checkpoints/sft/exp-cot") for o in overrides if o != "-m"]
     if command in SCHEMAS:
@@ -51,7 +52,7 @@ def test_named_runs_are_produced_by_other_commands() -> None:
     assert named <= produced
 
 
-def test_links_of_the_pages_exist() -> None:
+def test_link_targets_exist() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name}: {target}"

@@ -1,4 +1,4 @@
-"""Loaded students equal their presets, or an error says why not."""
+"""Loading a student gives the model of its preset, or an error that says what is wrong."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_only_the_language_tower_is_quantised_and_adapted(nf4_cfg) -> None:
     assert {p.dtype for p in trained} == {torch.float32}
 
 
-def test_an_evaluation_changes_no_gradient(nf4_cfg, micro_store, frames) -> None:
+def test_gradients_are_unchanged_after_an_evaluation(nf4_cfg, micro_store, frames) -> None:
     """On some CPUs bitsandbytes repacks 4-bit weights when it evaluates, and then passes no
     gradient on."""
     model, processor = loading.load_student(nf4_cfg, "bf16", list)
@@ -84,7 +84,7 @@ def test_a_saved_student_gives_the_same_logits(nf4_cfg, micro_store, frames, tmp
 
 
 @pytest.mark.parametrize("preset", ["qwen3_vl_8b", "qwen3_vl_2b"])
-def test_a_missing_model_is_named_with_advice(preset, monkeypatch, tmp_path) -> None:
+def test_an_error_names_a_model_that_cannot_be_loaded(preset, monkeypatch, tmp_path) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     cfg = compose("train.sft", SftCommand, [f"student={preset}"]).student

@@ -97,7 +97,7 @@ def test_flags_for_frames_and_adapter(tmp_path):
     ("available", "gpus", "used"),
     [(1, None, 1), (3, None, 2), (4, None, 4), (7, None, 4), (8, None, 8), (4, 1, 1)],
 )
-def test_model_is_sharded_over_a_power_of_two_or_the_given_gpus(available, gpus, used):
+def test_gpu_count_is_as_given_or_the_largest_power_of_two(available, gpus, used):
     arguments = flags(available, gpus=gpus)
     assert arguments[arguments.index("--tensor-parallel-size") + 1] == str(used)
 
@@ -148,7 +148,8 @@ def test_several_urls_are_refused():
 
 
 def ends(pid):
-    """Whether a process ends soon; a zombie has ended, and some machines never reap it."""
+    """Return whether a process ends within 5 s. A zombie has ended: the first process of a
+    container may never reap it."""
     for _ in range(100):
         try:
             if psutil.Process(pid).status() == psutil.STATUS_ZOMBIE:
@@ -180,7 +181,7 @@ def test_vllm_enforces_the_grammar_of_rationales(server, tmp_path):
 
 
 @pytest.mark.slow
-def test_kills_neither_lose_nor_repeat_a_response(server, tmp_path):
+def test_a_killed_server_or_client_loses_and_repeats_no_response(server, tmp_path):
     store = make_store(tmp_path, ITEMS + 2)
     path = tmp_path / "rationales.jsonl"
     client = narrate_in_process(tmp_path, server.url)

@@ -1,4 +1,4 @@
-"""A real vLLM server, started by `python -m teacher.serve`, to be killed and stopped."""
+"""A real vLLM server, started by `python -m teacher.serve`, which tests can kill and stop."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class VllmServer:
         return True
 
     def kill(self) -> None:
-        """Kill vLLM with all its processes, as a restart of the machine does."""
+        """Kill vLLM and all its processes, as if the machine went down."""
         os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
 

@@ -22,7 +22,7 @@ def sheets(micro_store: Store) -> list:
     return list(draw_sheets(micro_store, examples=1, seed=0))
 
 
-def test_every_cell_and_builder_has_a_sheet(micro_store, sheets) -> None:
+def test_every_subtype_builder_and_control_has_a_sheet(micro_store, sheets) -> None:
     files = [s.file for s in sheets]
     assert len(files) == len(set(files))
     expected = {f"{i.family}-{i.subtype}.png" for i in micro_store.selection()}
@@ -39,7 +39,7 @@ def test_the_seed_determines_the_sheets(micro_store, sheets) -> None:
     assert other != same
 
 
-def test_an_item_row_has_its_candidates_answer_and_displacements(micro_store) -> None:
+def test_an_item_row_shows_candidates_target_and_displacements(micro_store) -> None:
     rows, frames = SheetRows(micro_store), FrameReader(micro_store)
     for item in micro_store.selection("test")[::7]:
         row = rows.make(item)
@@ -55,7 +55,9 @@ def test_an_item_row_has_its_candidates_answer_and_displacements(micro_store) ->
         assert "None" not in row.heading
 
 
-def test_a_counterfactual_row_shows_one_moment_with_and_without_the_object(micro_store) -> None:
+def test_a_counterfactual_row_shows_the_same_frame_with_and_without_the_removed_object(
+    micro_store,
+) -> None:
     rows, frames = SheetRows(micro_store), FrameReader(micro_store)
     for query in micro_store.retrieval(pool="counterfactual"):
         factual, target, *wrong = rows.make(query).candidates
@@ -66,7 +68,7 @@ def test_a_counterfactual_row_shows_one_moment_with_and_without_the_object(micro
         assert (factual.is_answer, target.is_answer) == (False, True)
 
 
-def test_the_page_links_every_sheet_once_and_nothing_else(micro_store, sheets) -> None:
+def test_the_page_links_its_sections_and_every_sheet_once(micro_store, sheets) -> None:
     page = render_page(micro_store, sheets)
     found = {name: re.findall(f' {name}="([^"]*)"', page) for name in ("href", "id", "src")}
     assert found["src"] == [s.file for s in sheets]

@@ -1,4 +1,5 @@
-"""CLEVRER's release is read as published, and other files are refused."""
+"""Files in the published layout of CLEVRER are read; damaged, missing and other files are
+refused."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ def test_a_scene_has_the_values_of_its_annotation(tmp_path: Path) -> None:
     assert (scene.visible_fraction[:, 0] == 1).sum() < 128
 
 
-def test_angles_are_rotations_about_fixed_axes_x_first(tmp_path: Path) -> None:
+def test_orientation_is_read_as_extrinsic_xyz_angles(tmp_path: Path) -> None:
     path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
     turn = rotation_matrix(clevrer.read_scene(path, tmp_path, "test").quaternions[0, 0])
     x, y, z = (Rotation.from_rotvec(a * np.eye(3)[k]) for k, a in enumerate((0.3, -0.5, 1.1)))
@@ -86,7 +87,7 @@ def test_a_broken_annotation_is_refused(tmp_path: Path) -> None:
             clevrer.read_scene(path, tmp_path, "test")
 
 
-def test_an_incomplete_video_is_refused(tmp_path: Path) -> None:
+def test_an_incomplete_damaged_or_missing_video_is_refused(tmp_path: Path) -> None:
     path, video = write_clevrer_scene(tmp_path, clevrer_annotation(), video_frames=120)
     with raises_user_error("invalid-record", contains=("video_00000.mp4", "120")):
         clevrer.read_scene(path, tmp_path, "test")
@@ -100,7 +101,7 @@ def test_an_incomplete_video_is_refused(tmp_path: Path) -> None:
         clevrer.read_scene(path, tmp_path, "test")
 
 
-def test_scenes_are_listed_in_order_and_once(tmp_path: Path) -> None:
+def test_scenes_are_listed_in_order_and_duplicates_are_refused(tmp_path: Path) -> None:
     with raises_user_error("empty-release", contains="annotation_train/"):
         clevrer.list_scenes(tmp_path)
     for index in (1200, 3, 10):

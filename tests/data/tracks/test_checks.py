@@ -1,4 +1,4 @@
-"""Test queries that do not fit their database or their split are refused by name."""
+"""`check_test` refuses missing, repeated, unanswerable and leaking test queries, and names one."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ def tied_scores(queries=40, frames=30, levels=6, seed=0):
 
 
 def enumerated(row, target, ks):
-    """Means of one query's metrics over every order that ties can fall in."""
+    """Return the metrics of one query, averaged over every order of the tied frames."""
     orders = [
         sorted(range(len(row)), key=lambda i, order=order: (-row[i], order[i]))
         for order in permutations(range(len(row)))
@@ -27,7 +27,7 @@ def enumerated(row, target, ks):
     return {**recalls, "mrr": (1 / ranks).mean(), "median_rank": ranks.mean()}
 
 
-def test_ties_are_the_mean_over_every_order():
+def test_metrics_with_ties_are_averaged_over_all_orders():
     rng = np.random.default_rng(0)
     for _ in range(12):
         row, target = rng.integers(3, size=6), int(rng.integers(6))
@@ -36,7 +36,7 @@ def test_ties_are_the_mean_over_every_order():
             assert metrics[key] == pytest.approx(value)
 
 
-def test_a_constant_scorer_gets_chance():
+def test_constant_scores_give_chance_accuracy():
     metrics = matrix_metrics(np.zeros((5, 200)), np.arange(5), KS)
     for k in KS:
         assert metrics[f"recall@{k}"] == pytest.approx(k / 200)
@@ -55,7 +55,7 @@ def test_order_of_frames_and_queries_does_not_matter():
 
 
 @pytest.mark.parametrize("block", [1, 7, 30])
-def test_blocks_of_frames_and_queries_equal_the_whole(block):
+def test_blockwise_metrics_equal_those_of_the_whole_matrix(block):
     scores, target = tied_scores()
     scores[3, 4] = scores[5, target[5]] = np.nan
     own = target_scores(scores, target)
@@ -70,7 +70,7 @@ def test_blocks_of_frames_and_queries_equal_the_whole(block):
     assert by_frame == by_query == matrix_metrics(scores, target, KS)
 
 
-def test_nan_target_scores_are_misses_that_count():
+def test_queries_with_nan_target_scores_count_as_misses():
     scores = np.array([[3.0, 2, 1], [np.nan, 2, 1], [np.nan, 2, 3], [np.nan, 2, np.nan]])
     metrics = matrix_metrics(scores, np.array([0, 0, 0, 1]), [1, 3])
     expected = {"recall@1": 0.5, "recall@3": 0.5, "mrr": 0.5, "median_rank": 2, "tie_rate": 0}
@@ -84,7 +84,7 @@ def test_scores_are_compared_in_fp32():
     assert matrix_metrics(scores, np.array([0]), [1])["tie_rate"] == 1
 
 
-def test_ranks_without_ties_are_those_of_an_independent_library():
+def test_metrics_without_ties_match_pytrec_eval():
     rng = np.random.default_rng(5)
     scores = rng.permuted(np.tile(np.arange(120.0), (40, 1)), axis=1)
     target = rng.integers(120, size=40)

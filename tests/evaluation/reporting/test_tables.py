@@ -1,4 +1,4 @@
-"""The tables and figures of single evaluations."""
+"""Results, tables and figures of one evaluation command."""
 
 import json
 from dataclasses import asdict, replace
@@ -77,7 +77,7 @@ def retrievals(ranks, queries) -> list[RetrievalResult]:
     return [row for n in names for row in retrieval_results("tiny", n, ranks, queries, seed=0)]
 
 
-def test_retrieval_results_are_the_metrics_of_their_queries_with_intervals(ranks, queries):
+def test_retrieval_results_match_reference_metrics_and_intervals(ranks, queries):
     results = retrieval_results("tiny", "one", ranks, queries, seed=3)
     assert [(r.builder, r.width) for r in results] == [
         (builder, width) for builder in (None, 1, 2, 3, 4, 5, 6) for width in ranks.widths
@@ -102,7 +102,7 @@ def test_retrieval_results_are_the_metrics_of_their_queries_with_intervals(ranks
     assert results != retrieval_results("tiny", "one", ranks, queries, seed=4)
 
 
-def test_selection_results_hold_horizons_and_the_interval_of_macro(selection):
+def test_selection_results_have_accuracy_by_horizon_and_an_interval_of_macro(selection):
     assert list(selection.horizons) == ["8 frames", "16 frames", "1 s", "2 s"]
     for name, share in selection.horizons.items():
         family = "time" if name.endswith("s") and "frames" not in name else "window"
@@ -145,7 +145,7 @@ def test_differences_between_retrievers_are_paired_by_query():
     greater, found = rng.integers(40, size=(1, 60)), np.ones(60, bool)
     none = np.zeros_like(greater)
     one = Ranks((8,), greater, none, found, 41, vectors=41, seconds=0.5)
-    # Every target is one rank lower.
+    # Every target ranks one place worse.
     other = replace(one, greater=greater + 1)
     scenes = [SimpleNamespace(scene_id=f"s{k // 3}") for k in range(60)]
     (same,) = compare_retrievers({"one": one, "again": one}, scenes, 0)
@@ -175,7 +175,7 @@ def test_figures_are_written(selection, retrievals, tmp_path):
     assert len(list(tmp_path.iterdir())) == 5
 
 
-def test_a_dollar_sign_in_a_name_begins_no_formula(selection, tmp_path):
+def test_dollar_signs_in_labels_are_not_parsed_as_math(selection, tmp_path):
     name = r"run $\frac$"
     with matplotlib.rc_context({"svg.fonttype": "none"}):
         figures.accuracy_figure({name: selection.families}, tmp_path / "accuracy.svg")

@@ -73,7 +73,7 @@ def test_the_orders_of_four_annotators_are_a_latin_square(items, seed) -> None:
     assert max(wrong_letters.values()) < len(items) / 2
 
 
-def test_orders_depend_on_the_seed_the_items_and_the_annotator(items) -> None:
+def test_assignment_depends_on_the_seed_the_items_and_the_annotator(items) -> None:
     assignments = assign_items(items, NAMES, 0)
     assert assignments == assign_items(items, NAMES, 0)
     assert assignments != assign_items(items, NAMES, 1)
@@ -98,7 +98,7 @@ def new_study(folder: Path, items: list[SelectionItem], names: list[str]) -> sql
     return storage.create(folder / storage.DATABASE, {}, items, [], links, assignments)
 
 
-def test_families_and_depth_stay_even_if_annotators_stop_early(items, tmp_path) -> None:
+def test_families_and_votes_are_balanced_if_annotators_stop_early(items, tmp_path) -> None:
     names = NAMES[:3]
     db = new_study(tmp_path, items, names)
     total = Counter(i.family for i in items)
@@ -128,7 +128,7 @@ def test_the_earliest_prefix_of_a_scene_comes_first(tmp_path) -> None:
     assert [i for i in order if i != "i3"] == ["i1", "i2", "i0"]
 
 
-def test_sampled_items_are_even_and_share_scenes_only_if_they_must() -> None:
+def test_sampled_items_are_balanced_and_avoid_shared_scenes() -> None:
     pool = [item(k, FAMILIES[k % 3], scene=k // 2) for k in range(60)]
     sampled = sample_items(pool, 20, 0, "items")
     assert sorted(Counter(i.family for i in sampled).values()) == [6, 7, 7]
@@ -140,7 +140,7 @@ def test_sampled_items_are_even_and_share_scenes_only_if_they_must() -> None:
         sample_items(pool, 61, 0, "practice")
 
 
-def test_a_file_names_items_plainly_or_in_json(micro_store, tmp_path) -> None:
+def test_an_items_file_has_plain_ids_or_json(micro_store, tmp_path) -> None:
     first, second, *_ = [i.item_id for i in micro_store.selection("test")]
     file = tmp_path / "items.txt"
     file.write_text(f'{second}\n\n{{"item_id": "{first}", "note": 2}}\n')
